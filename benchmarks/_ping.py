@@ -1,19 +1,18 @@
-"""A bare UDP ping through a bare relay: the one-way latency of plain Python without noack.
+"""A bare UDP ping through a bare relay: the one-way latency of C (``ping.c``) or Python alone.
 
-Three minimal processes: a sender that sleeps until each datagram is due, a relay with two sockets,
-and a receiver. Relay and receiver block in ``recv``; the receiver reads the clock right after it. A
-datagram shorter than a ping ends the next process.
+Three minimal processes: a sender that sleeps until each datagram is due, a relay, and a receiver.
+Relay and receiver block in ``recv``; the receiver reads the clock right after it. An empty datagram
+ends the next process. Both programs have the same arguments, output and real-time settings, which
+are those of a run; this module is the one in Python.
 """
 
-import argparse
-import contextlib
-import json
+import os
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,13 +20,10 @@ import numpy as np
 from benchmarks._report import MeasurementError
 from noack.runtime.real_time_settings import realtime
 
-PING_BYTES = 80
-"""Size of a state update with four states."""
-FIFO_PRIORITY = 50
-PLACES = {"sender": 1, "relay": 2, "receiver": 3}
-"""Positions of sensor, emulator and controller along the loop."""
+PING_BYTES = 72
+PYTHON = (sys.executable, "-m", "benchmarks._ping")
+_FIFO_PRIORITY = 50
 _STAMP = struct.Struct("<q")
-_END = b"end"
 _SETTLE_S = 0.3
 
 
@@ -37,69 +33,49 @@ class Ping(NamedTuple):
     p50_us: float
     p99_us: float
     received: int
-    granted: dict[str, str]
+    refused: list[str]
+    """The real-time settings that were not permitted."""
 
 
-def ping(count: int, period_s: float, *, asked: bool) -> Ping:
-    """Send ``count`` datagrams, one every ``period_s``, through the relay.
+def ping(command: Sequence[str], count: int, period_s: float, *, asked: bool) -> Ping:
+    """Send ``count`` datagrams, one every ``period_s``, through the relay of a program.
 
     Args:
+        command: the program: that of ``ping.c``, or ``PYTHON``.
         count: number of datagrams.
         period_s: wall time between two datagrams.
         asked: whether the processes request real-time settings.
 
     Raises:
-        MeasurementError: a process failed.
+        MeasurementError: the program failed.
     """
-    flag = ("--realtime",) if asked else ()
-    with _process("receiver", *flag) as receiver, contextlib.ExitStack() as stack:
-        relay = stack.enter_context(_process("relay", "--to", _said(receiver), *flag))
-        sender = stack.enter_context(
-            _process(
-                "sender", "--to", _said(relay), "--count", str(count), "--period", str(period_s),
-                *flag,
-            )
+    numbers = (count, round(period_s * 1e9), _FIFO_PRIORITY if asked else 0)
+    try:
+        done = subprocess.run(
+            [*command, *map(str, numbers)], capture_output=True, timeout=count * period_s + 30,
+            check=True,
         )  # fmt: skip
-        try:
-            sender.wait(timeout=count * period_s + 30)
-            found = json.loads(_said(receiver))
-        except (subprocess.TimeoutExpired, ValueError, IndexError):
-            raise MeasurementError("the ping through the bare relay did not end") from None
-    latencies_ns, granted = found["latencies_ns"], found["granted"]
-    p50_us, p99_us = (float(quantile) / 1e3 for quantile in np.quantile(latencies_ns, [0.5, 0.99]))
-    return Ping(p50_us, p99_us, len(latencies_ns), granted)
+        latencies_us = np.frombuffer(done.stdout, "<i8") / 1e3
+        p50_us, p99_us = np.quantile(latencies_us, [0.5, 0.99]).tolist()
+    except (subprocess.SubprocessError, IndexError):
+        raise MeasurementError("the ping through the bare relay did not end") from None
+    refused = {line.partition(":")[0] for line in done.stderr.decode().splitlines()}
+    return Ping(p50_us, p99_us, len(latencies_us), sorted(refused))
 
 
-@contextlib.contextmanager
-def _process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "benchmarks._ping", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        except BaseException:
-            process.kill()
-            raise
-
-
-def _said(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def _receive(endpoint: socket.socket, granted: dict[str, str]) -> None:
+def _receive(endpoint: socket.socket) -> None:
     latencies_ns = []
-    while len(data := endpoint.recv(2048)) == PING_BYTES:
+    while data := endpoint.recv(2048):
         now_ns = time.monotonic_ns()
         latencies_ns.append(now_ns - _STAMP.unpack_from(data)[0])
-    print(json.dumps({"latencies_ns": latencies_ns, "granted": granted}), flush=True)
+    os.write(sys.stdout.fileno(), np.array(latencies_ns, "<i8").tobytes())
 
 
 def _relay(endpoint: socket.socket, out: socket.socket) -> None:
-    while True:
+    data = b"first"
+    while data:
         data = endpoint.recv(2048)
         out.send(data)
-        if len(data) != PING_BYTES:
-            return
 
 
 def _send(out: socket.socket, count: int, period_s: float) -> None:
@@ -109,34 +85,35 @@ def _send(out: socket.socket, count: int, period_s: float) -> None:
         time.sleep(max(begin_s + number * period_s - time.monotonic(), 0.0))
         out.send(_STAMP.pack(time.monotonic_ns()) + padding)
     time.sleep(_SETTLE_S)
-    out.send(_END)
+    out.send(b"")
 
 
 def main() -> None:
-    """Run one of the three processes."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("role", choices=["receiver", "relay", "sender"])
-    parser.add_argument("--to", type=int, default=0, help="port of the next process")
-    parser.add_argument("--count", type=int, default=0)
-    parser.add_argument("--period", type=float, default=0.002)
-    parser.add_argument("--realtime", action="store_true")
-    options = parser.parse_args()
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
-        realtime(options.realtime, FIFO_PRIORITY, PLACES[options.role]) as granted,
-    ):
+    """Run the three processes: ``_ping COUNT PERIOD_NS PRIORITY``."""
+    count, period_ns, priority = map(int, sys.argv[1:])
+    receiver, relay, relay_out, out = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(4))
+    for endpoint, sender in ((receiver, relay_out), (relay, out)):
         endpoint.bind(("127.0.0.1", 0))
-        if options.to:
-            out.connect(("127.0.0.1", options.to))
-        if options.role != "sender":
-            print(endpoint.getsockname()[1], flush=True)
-        if options.role == "receiver":
-            _receive(endpoint, granted)
-        elif options.role == "relay":
-            _relay(endpoint, out)
-        else:
-            _send(out, options.count, options.period)
+        sender.connect(endpoint.getsockname())
+    # The receiver first; a place is that of controller, emulator and sensor along the loop.
+    for place in (3, 2, 1):
+        if os.fork() > 0:
+            continue
+        with realtime(priority > 0, max(priority, 1), place) as granted:
+            for setting, answer in granted.items():
+                if answer.startswith("not permitted"):
+                    print(f"{setting}: {answer}", file=sys.stderr, flush=True)
+            if place == 3:
+                _receive(receiver)
+            elif place == 2:
+                _relay(relay, relay_out)
+            else:
+                _send(out, count, period_ns * 1e-9)
+        os._exit(0)
+    for _ in range(3):
+        _, status = os.wait()
+        if status != 0:
+            sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,13 @@
-"""Installs the programs that some benchmarks need, or names their packages."""
+"""Installs and compiles the programs that some benchmarks need, or says what is missing."""
 
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from pathlib import Path
+
+from benchmarks._report import MeasurementError
 
 PACKAGES: Mapping[str, str] = {"cc": "gcc libc6-dev", "cyclictest": "rt-tests", "socat": "socat"}
 """Debian packages by program."""
@@ -31,3 +34,19 @@ def provide(packages: Mapping[str, str] = PACKAGES) -> list[str]:
             file=sys.stderr,
         )
     return missing
+
+
+def compiled(source: str, into: Path, *options: str) -> Path:
+    """Compile a C file of this folder into another folder; return the path.
+
+    Raises:
+        MeasurementError: there is no C compiler, or it fails.
+    """
+    target = into / Path(source).stem
+    if shutil.which("cc") is None:
+        raise MeasurementError(f"{source} is written in C and cc is not installed")
+    command = ["cc", "-O2", *options, "-o", str(target), str(Path(__file__).with_name(source))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise MeasurementError(f"cc {source}: {done.stderr.strip()[:200]}")
+    return target

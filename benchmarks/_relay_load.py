@@ -6,10 +6,8 @@ that they do not depend on the time at which the sink is read.
 
 import ctypes
 import os
-import shutil
 import socket
 import struct
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks._programs import compiled
 from benchmarks._report import MeasurementError
 
 DATAGRAM_BYTES = 72
@@ -101,18 +100,9 @@ def built() -> Iterator[Built]:
     Raises:
         MeasurementError: there is no C compiler, or it fails.
     """
-    compiler = shutil.which("cc")
-    if compiler is None:
-        raise MeasurementError("the load is written in C and cc is not installed")
-    here = Path(__file__).parent
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        load, relay = Path(folder) / "load.so", Path(folder) / "relay"
-        for target, options in ((load, ("-shared", "-fPIC")), (relay, ())):
-            source = here / f"{target.stem}.c"
-            command = [compiler, "-O2", *options, "-o", str(target), str(source)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode != 0:
-                raise MeasurementError(f"cc {source.name}: {done.stderr.strip()[:200]}")
+        load = compiled("load.c", Path(folder), "-shared", "-fPIC")
+        relay = compiled("relay.c", Path(folder))
         library = ctypes.CDLL(str(load))
         for name, types in _SIGNATURES.items():
             getattr(library, name).argtypes = types

@@ -5,7 +5,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -57,26 +56,19 @@ def c_relay(built: Built, mode: Literal["", "segment", "paths"] = "") -> Kind:
     return Kind(names[mode], lambda to, _: [str(built.relay), str(to), *words])
 
 
-def socat(*, connected: bool = False) -> Kind | str:
-    """Return socat, forward only, with or without a connected socket; or why it is missing."""
+def socat() -> Kind | str:
+    """Return socat, forward only; or why it is missing."""
     program = shutil.which("socat")
     if program is None:
         return "socat is not installed (Debian: apt-get install socat)"
-    name, sends = ("socat, connected", "CONNECT") if connected else ("socat", "SENDTO")
     return Kind(
-        name,
+        "socat",
         lambda to, port: [
             program, "-u", "-b", "2048", f"UDP4-RECV:{port},rcvbuf=4194304",
-            f"UDP4-{sends}:{LOOPBACK}:{to}",
+            f"UDP4-SENDTO:{LOOPBACK}:{to}",
         ],
         says=None,
     )  # fmt: skip
-
-
-def asyncio_relay(delay_ms: float = 0.0) -> Kind:
-    """Return the relay of :mod:`benchmarks._relay_asyncio`."""
-    command = [sys.executable, "-m", "benchmarks._relay_asyncio", "--delay-ms", str(delay_ms)]
-    return Kind("asyncio relay", lambda to, _: [*command, str(to)])
 
 
 def our_relay(name: str, ours: Ours, *, lossy: bool = True) -> Kind:

@@ -2,7 +2,8 @@
 
 Each loop samples, computes and applies its input at the same rate. A step is one of the plant of
 one loop: with it come a measurement, a tick of the controller and an actuation. The CPU time is
-that of plant, sensor, emulator and controller while the loops run.
+that of plant, sensor, emulator and controller while the loops run. Their alternative is one loop
+alone, and that of their memory as many Pythons that import the libraries of each process.
 """
 
 import argparse
@@ -13,15 +14,17 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, say
-from benchmarks._stolen_time import StolenTime, began_s, worst_p99_us
+import psutil
+
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from benchmarks.soak.watch import Processes
 from cosim.record.run_directory import LATEST, LOOPS, SUMMARY_FILE, read_object
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 
@@ -64,6 +67,12 @@ _SINGLE_S = 60.0
 _FLAT_MIB = 32.0
 _BATCH = 50, 10.0
 """Loops, and seconds, of a run in virtual time."""
+_STEP_US, _MEMORY_MIB, _BATCH_PER_S, _END_SHARE = (
+    Goal("<=", 5), Goal("<=", 80), Goal(">=", 3000), Goal("<=", 0.1),
+)  # fmt: skip
+_LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
+"""By the rate of the loops, Hz."""
+_LIBRARIES = "import numpy, zenoh; print(); input()"
 
 
 class Load(NamedTuple):
@@ -72,6 +81,10 @@ class Load(NamedTuple):
     loops: int
     rate_hz: float
     horizon_s: float
+
+    def __str__(self) -> str:
+        plural = "s" if self.loops > 1 else ""
+        return f"{self.loops:,} loop{plural} at {self.rate_hz:g} Hz, {self.horizon_s:g} s"
 
     def step_us(self, measured: "Measured") -> float:
         """CPU time of the processes per loop and step."""
@@ -102,10 +115,6 @@ class Measured(NamedTuple):
     """By process, while the loops ran."""
     end_s: float
     """Wall time from the end of the loops to the end of the command."""
-    quiet_s: int
-    """Number of seconds of the run in which the hypervisor took nothing."""
-    quiet_p99_ms: Mapping[str, float]
-    """Lateness p99 in these seconds, of the worst loop, by process."""
 
 
 def run(load_: Load, folder: Path) -> Measured:
@@ -118,10 +127,9 @@ def run(load_: Load, folder: Path) -> Measured:
     path.write_text(scenario_of(load_))
     command = [sys.executable, "-m", "cosim.cli", "run", str(path), "--json", "--no-report",
                "--runs", str(folder)]  # fmt: skip
-    stolen = StolenTime()
     with (folder / "output").open("w+") as output:
         with subprocess.Popen(command, stdout=output, stderr=subprocess.DEVNULL) as process:
-            memory, cpu_s, end_s = _follow(process, folder / LATEST, stolen)
+            memory, cpu_s, end_s = _follow(process, folder / LATEST)
         output.seek(0)
         network = json.loads(output.read() or "{}")
     if process.returncode != 0:
@@ -129,13 +137,11 @@ def run(load_: Load, folder: Path) -> Measured:
         raise MeasurementError(f"{load_.loops} loops at {load_.rate_hz:g} Hz: {found}")
     directories = sorted((folder / LATEST / LOOPS).iterdir())
     loops = [read_object(directory / SUMMARY_FILE) for directory in directories]
-    quiet = stolen.quiet_seconds(began_s(folder / LATEST), load_.horizon_s)
-    late_ms = {role: worst_p99_us(folder / LATEST, role, quiet) * 1e-3 for role in WITH_DEADLINES}
-    return Measured(network, loops, memory, cpu_s, end_s, len(quiet), late_ms)
+    return Measured(network, loops, memory, cpu_s, end_s)
 
 
 def _follow(
-    process: subprocess.Popen[bytes], started: Path, stolen: StolenTime
+    process: subprocess.Popen[bytes], started: Path
 ) -> tuple[dict[str, list[float]], dict[str, float], float]:
     """Return memory and CPU time of a run's processes from its start, when a path exists."""
     processes = Processes(process.pid)
@@ -143,7 +149,6 @@ def _follow(
     first, last = dict[str, float](), dict[str, float]()
     ended_s = time.monotonic()
     while process.poll() is None:
-        stolen.sample()
         if started.exists():
             for role, one in processes.sample().items():
                 memory[role].append(one.uss_kib / _KIBI)
@@ -159,7 +164,7 @@ def _follow(
 def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
     """Return the figures of a run; ``single_us`` is the CPU time of a step of one loop alone."""
     loops, network = found.loops, found.network
-    nothing, period_ms = Goal("==", 0), 1e3 / load_.rate_hz
+    nothing, step_us = Goal("==", 0), load_.step_us(found)
     unequal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
     late = {
         role: max(one["lateness_us"][role]["p99"] for one in loops) * 1e-3
@@ -167,50 +172,86 @@ def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
     }
     loop_memory = {role: mib for role, mib in found.memory_mib.items() if role in LOOP_ROLES}
     growth = max(mib[-1] - mib[len(mib) // 2] for mib in loop_memory.values())
-    datagrams = network["network"]["datagrams"]
     rows = [
         Row("missing samples", sum(one["missing_samples"] for one in loops), "", goal=nothing),
         Row("unintended losses", sum(one["unintended_losses"] for one in loops), "", goal=nothing),
         Row("longest loss burst", max(one["longest_loss_burst"] for one in loops), "",
             goal=Goal("<=", CAP)),
-        Row("updates", datagrams / load_.horizon_s, "/s"),
+        Row("updates", network["network"]["datagrams"] / load_.horizon_s, "/s"),
         *(
-            Row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=Goal("<", period_ms))
+            Row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=_LATE_MS[load_.rate_hz])
             for role, late_ms in late.items()
-        ),
-        *(
-            Row(f"{role} lateness p99, worst loop, while no CPU time is stolen", late_ms, "ms",
-                goal=Goal("<", period_ms), note=f"{found.quiet_s} s of the run")
-            for role, late_ms in found.quiet_p99_ms.items()
-            if found.quiet_s
         ),
         Row("loops and network not replayed bit for bit", 1 + len(loops) - unequal, "",
             goal=nothing),
-        Row("CPU time per loop and step", load_.step_us(found), "µs", Peer("one loop", single_us),
+        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US,
             note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
+        Row("the same", step_us, "µs", Peer("one loop alone", single_us)),
         Row("growth of memory in the second half, worst process", growth, "MiB",
             goal=Goal("<", _FLAT_MIB),
             note=", ".join(
                 f"{role} {mib[len(mib) // 2]:.0f}–{mib[-1]:.0f}"
                 for role, mib in found.memory_mib.items()
             )),
-        Row("end of the run", found.end_s, "s", goal=Goal("<", load_.horizon_s)),
+        Row("end of the run", found.end_s, "s", Peer("the run", load_.horizon_s), _END_SHARE),
     ]  # fmt: skip
-    name = f"{load_.loops:,} loops at {load_.rate_hz:g} Hz, {load_.horizon_s:g} s"
-    return [replace(row, name=f"{name}: {row.name}") for row in rows]
+    return [replace(row, name=f"{load_}: {row.name}") for row in rows]
 
 
-def batch() -> Row:
-    """Return how many runs of a loop in virtual time are computed a second."""
+def memory(load_: Load, found: Measured) -> list[Row]:
+    """Return the private memory of the processes of one loop: the median over its run."""
+    used = {role: median(found.memory_mib[role]) for role in LOOP_ROLES}
+    name = f"{load_}: private memory of {', '.join(used)}"
+    note = ", ".join(f"{role} {mib:.0f}" for role, mib in used.items())
+    peer = Peer("as many Pythons that import numpy and zenoh", libraries_mib(len(used)))
+    total = sum(used.values())
+    return [
+        Row(name, total, "MiB", goal=_MEMORY_MIB, note=note),
+        Row("the same", total, "MiB", peer),
+    ]
+
+
+def libraries_mib(count: int) -> float:
+    """Return the private memory of so many Pythons at once that import the libraries."""
+    with ExitStack() as stack:
+        pythons = [
+            stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", _LIBRARIES],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                )
+            )
+            for _ in range(count)
+        ]  # fmt: skip
+        for python in pythons:
+            assert python.stdout is not None
+            python.stdout.readline()
+        used = [psutil.Process(python.pid).memory_full_info().uss for python in pythons]
+        for python in pythons:
+            python.kill()
+    return float(sum(used)) / _KIBI**2
+
+
+def batch(live_step_us: float) -> list[Row]:
+    """Return how many runs of a loop in virtual time are computed a second of CPU time.
+
+    ``live_step_us`` is the CPU time of a step of one of many loops that run live at the same rate.
+    """
     loops, horizon_s = _BATCH
+    load_ = Load(loops, 50.0, horizon_s)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fleet.toml"
-        path.write_text(scenario_of(Load(loops, 50.0, horizon_s)))
+        path.write_text(scenario_of(load_))
         scenario = load(path)
     begun_s = time.process_time()
     simulate_loops(scenario)
-    name = f"virtual time, runs of {horizon_s:g} s of {loops} loops at 50 Hz: loops × runs"
-    return Row(name, loops / (time.process_time() - begun_s), "/s of CPU")
+    per_s = loops / (time.process_time() - begun_s)
+    live = Peer("live, by CPU time", 1e6 / (live_step_us * horizon_s * load_.rate_hz))
+    name = f"{load_}, in virtual time: loops × runs"
+    return [
+        Row(name, per_s, "/s of CPU", goal=_BATCH_PER_S),
+        Row("the same", per_s, "/s of CPU", live),
+    ]
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -222,7 +263,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure both loads, and one loop at the rates of both."""
-    rows = [batch()]
+    rows = []
     for load_ in (
         Load(options.fleet_loops, 50.0, options.fleet_s),
         Load(20, 500.0, options.fleet_s),
@@ -230,10 +271,15 @@ def measure(options: argparse.Namespace) -> list[Row]:
         single = load_._replace(loops=1, horizon_s=min(load_.horizon_s, _SINGLE_S))
         measured = []
         for one in (single, load_):
-            say(f"{one.loops:,} loops at {one.rate_hz:g} Hz, {one.horizon_s:g} s")
+            say(str(one))
             with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
                 measured.append(run(one, Path(folder)))
-        rows += figures(load_, measured[1], single.step_us(measured[0]))
+        alone, together = measured
+        rows += figures(load_, together, single.step_us(alone))
+        if load_.rate_hz == 50.0:
+            rows += batch(load_.step_us(together))
+        else:
+            rows += memory(single, alone)
     return rows
 
 

@@ -1,26 +1,22 @@
-"""Effect of a flood on a run at speed 1: with and without a kernel socket for each peer.
+"""Effect of a flood on a run at speed 1, whose processes have a kernel socket for each peer.
 
 In the middle of a run of the paper's example, another process sends datagrams of another run to one
-port or to all: at five times the loop's rate, and as fast as possible. Without these
-sockets, traffic from the peer and from unknown sources shares a queue, as on other systems.
+port or to all: at five times the loop's rate, and as fast as possible.
 """
 
 import argparse
 import json
-import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks._faulted_run import STEPS, FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._flood import Flood
-from benchmarks._report import Benchmark, Figures, MeasurementError, Rounds, Row, say
+from benchmarks._report import Benchmark, Figures, Rounds, Row, say
 from benchmarks.soak.watch import udp_port
 from cosim.analysis.timing_statistics import lateness_us
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
@@ -33,8 +29,7 @@ FLOOD_S = 2.0
 MARGIN_S = 0.1
 """Omitted at both ends of a flood: its time in the run is known to this accuracy."""
 LOOP_HZ = 500.0
-WITH, WITHOUT = "with peer sockets", "without peer sockets"
-_WITHOUT_CODE = Path(__file__).parent / "_without_peer_sockets"
+OURS = "noack"
 
 
 class Case(NamedTuple):
@@ -81,7 +76,7 @@ def figures_of(run: FaultedRun[Flood]) -> Figures:
     }
 
 
-def flooded(case: Case, *, peer_sockets: bool) -> Figures:
+def flooded(case: Case) -> Figures:
     """Flood a run.
 
     Raises:
@@ -89,25 +84,8 @@ def flooded(case: Case, *, peer_sockets: bool) -> Figures:
     """
     settings = [f"horizon_s={HORIZON_S}"]
     settings += [] if case.asked else ["realtime.enabled=false"]
-    with _environment(peer_sockets):
-        run = faulted_run(case.name, settings, BEGIN_S, partial(_flood, case))
-    used = {report["channel"]["peer_sockets"] for report in run.record.reports.values()}
-    if used != {peer_sockets}:
-        raise MeasurementError(f"{case.name}: peer sockets {used}, expected {peer_sockets}")
+    run = faulted_run(case.name, settings, BEGIN_S, partial(_flood, case))
     return figures_of(run)
-
-
-@contextmanager
-def _environment(peer_sockets: bool) -> Iterator[None]:
-    before = os.environ.get("PYTHONPATH")
-    if not peer_sockets:
-        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(_WITHOUT_CODE), before]))
-    try:
-        yield
-    finally:
-        os.environ.pop("PYTHONPATH", None)
-        if before is not None:
-            os.environ["PYTHONPATH"] = before
 
 
 def _flood(case: Case, processes: Processes) -> Flood:
@@ -122,7 +100,7 @@ def _flood(case: Case, processes: Processes) -> Flood:
 
 
 def rows_of(case: Case, rounds: Rounds) -> list[Row]:
-    """Return a case's rows: with peer sockets, compared with those without."""
+    """Return a case's rows."""
     figures = (
         ("the flood", "datagrams/s", "rate_hz"),
         ("measurements missed", "", "missed"),
@@ -132,20 +110,19 @@ def rows_of(case: Case, rounds: Rounds) -> list[Row]:
         ("last late step after the end", "ms", "back_ms"),
     )
     return [
-        rounds.row(f"{case.name}: {figure}", unit, quantity, WITH, WITHOUT)
+        rounds.row(f"{case.name}: {figure}", unit, quantity, OURS)
         for figure, unit, quantity in figures
     ]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure each flood with and without peer sockets in turn."""
+    """Measure each flood."""
     rows = []
     for case in CASES:
         say(case.name)
         rounds = Rounds()
         for _ in range(ROUNDS):
-            for side in (WITH, WITHOUT):
-                rounds.add(side, flooded(case, peer_sockets=side == WITH))
+            rounds.add(OURS, flooded(case))
         rows += rows_of(case, rounds)
     return rows
 

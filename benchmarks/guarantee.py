@@ -1,24 +1,38 @@
 """The guarantee over very many decisions: violations, realised losses, and cost per decision.
 
-Each combination is decided by the core, a million datagrams per flow; a check that does
-not know the rules counts violations at the receiver. Costs alternate with those of the
-plain cap that allows as many consecutive losses; the plain cap's, with those of calls from Python.
+Each combination is decided by the core, a million datagrams per flow. A check that uses nothing of
+netem counts violations at the receiver: outcomes come from the times at which intact datagrams
+leave. Costs alternate with those of the plain cap that allows as many consecutive losses.
+
+A reordering network is compared without a cap, with a cap on drops only, and with the guarantee. A
+cap on drops only forces a datagram after m drops, and leaves the delays as they are, as the loss
+models of quic-network-simulator and Rattan do. Losses and delays are the same random numbers in all
+three. A datagram counts as lost if it is dropped, or if a later one arrives before it.
 """
 
 import argparse
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._loss_check import Limits, outcomes_of, violations
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
-from netem.link_machine import Link
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kept_loss import expected_loss
+
+Outcomes = NDArray[np.bool_]
+
+
+class Limits(NamedTuple):
+    """A guarantee in numbers."""
+
+    windows: tuple[tuple[int, int], ...]
+    """(m, K): at most m losses among K; a cap M − 1 is (M − 1, M)."""
+    recovery: int = 0
+
 
 DECISIONS = 100_000_000
 _BATCH = 1_000_000
@@ -33,6 +47,9 @@ COMBINATIONS: Mapping[str, Limits] = {
 EXPECTED = ("loss 50% mansd 4", "loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
             "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
 _ROUNDS = 30
+CAP = 3
+_LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
+_SPACING_NS = 2_000_000
 
 
 class Decider:
@@ -75,27 +92,31 @@ def expected_row(words: str, count: int) -> Row:
     return Row(f"{words}: error", error, "% of all", goal=Goal("<=", 0.1), note=note)
 
 
-def speed_row(words: str = "loss 50% mansd 4") -> Row:
-    """Return the decisions per second of the core, at once beside one by one from Python."""
-    say(f"speed of decisions, {words}")
-    decider, link, rounds = (
-        Decider(words),
-        Link(settings_of(words), 7, "relay", "forward"),
-        Rounds(),
-    )
+def outcomes_of(decisions: NDArray[Any]) -> Outcomes:
+    """Return (k,) whether each datagram of a flow is lost, from its decisions in order."""
+    numbers = np.arange(len(decisions))
+    times, leaving = [], []
+    for departure, bit in (("release_ns", "bit"), ("copy_ns", "copy_bit")):
+        intact = (decisions[departure] >= 0) & (decisions[bit] < 0)
+        times.append(decisions[departure][intact])
+        leaving.append(numbers[intact])
+    # Datagrams with equal release times leave in the order of arrival.
+    in_order = np.concatenate(leaving)[np.lexsort((np.concatenate(leaving), np.concatenate(times)))]
+    newest = np.maximum.accumulate(np.concatenate([[-1], in_order]))
+    lost = np.ones(len(decisions), bool)
+    lost[in_order[in_order > newest[:-1]]] = False
+    return lost
 
-    def decide_one_by_one() -> None:
-        for _ in range(_BATCH // 20):
-            link.decide(0, 72, 0)
 
-    sides = (("core", decider.decide, _BATCH), ("from Python", decide_one_by_one, _BATCH // 20))
-    for number in range(-1, 5):
-        for side, decide, count in sides:
-            begun_s = time.perf_counter()
-            decide()
-            if number >= 0:
-                rounds.add(side, {"per_s": count / (time.perf_counter() - begun_s)})
-    return rounds.row(f"{words}: decisions", "/s", "per_s", "core", "from Python", paired=True)
+def violations(lost: Outcomes, limits: Limits) -> int:
+    """Count the windows with too many losses, and the gaps between bursts that are too short."""
+    count = np.concatenate([[0], np.cumsum(lost)])
+    found = 0
+    for losses, window in limits.windows:
+        begin = np.maximum(np.arange(1, len(count)) - window, 0)
+        found += int(np.count_nonzero(count[1:] - count[begin] > losses))
+    gaps = np.diff(np.flatnonzero(lost)) - 1
+    return found + int(np.count_nonzero((gaps > 0) & (gaps < limits.recovery)))
 
 
 def plain_cap(words: str) -> str:
@@ -126,9 +147,44 @@ def cost_rows() -> list[Row]:
     ]  # fmt: skip
 
 
+def networks() -> dict[str, NDArray[Any]]:
+    """Return the decisions of the three networks."""
+    free = Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy()
+    drops = Decider(f"{_LOSS} mansd {CAP}", _SPACING_NS).decide()["release_ns"] < 0
+    unlost = Decider(_DELAY, _SPACING_NS).decide().copy()
+    unlost["release_ns"][drops] = -1
+    kept = Decider(f"{_LOSS} {_DELAY} mansd {CAP}", _SPACING_NS).decide().copy()
+    return {
+        "no cap": free,
+        f"cap {CAP} on drops only": unlost,
+        f"mansd {CAP}": kept,
+    }
+
+
+def network_rows() -> list[Row]:
+    """Return the losses at the receiver of each network."""
+    rows = []
+    for name, decisions in networks().items():
+        lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
+        ends = np.flatnonzero(np.concatenate([[True], ~lost, [True]]))
+        goal = Goal("<=", CAP) if name.startswith("mansd") else None
+        rows += [
+            Row(f"{name}: dropped", 100 * float(dropped.mean()), "%"),
+            Row(f"{name}: dropped or out of order", 100 * float(lost.mean()), "%"),
+            Row(f"{name}: longest loss burst", int(np.diff(ends).max()) - 1, "", goal=goal),
+        ]
+        if name.startswith("mansd"):
+            delay_ns = decisions["hold_back_ns"][decisions["hold_back_ns"] > 0]
+            rows.append(Row(f"{name}: held back", 100 * len(delay_ns) / len(lost), "%"))
+            rows.append(
+                Row(f"{name}: held back by, median", float(np.median(delay_ns)) / 1e6, "ms")
+            )
+    return rows
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure speed and costs, then violations, then loss rates."""
-    rows = [speed_row(), *cost_rows()]
+    """Measure costs and networks, then violations, then loss rates."""
+    rows = [*cost_rows(), *network_rows()]
     for words, limits in COMBINATIONS.items():
         rows += check_rows(f"loss 50% {words}", limits, DECISIONS)
         rows += check_rows(f"loss 30% {_REORDERING} {words}", limits, DECISIONS)

@@ -6,20 +6,25 @@ from collections.abc import Sequence
 from noack.runtime.signals import stoppable_imports
 
 with stoppable_imports():
-    from controller_node.controller import controller_of
-    from controller_node.controller_arrays import CONTROLLER_FLEET
+    from controller_node.controller import controllers_of
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
-    from noack.runtime.loop_machines import run_machines
+    from noack.runtime.live_driver import run_machines
+    from noack.runtime.process_life import RunProcess
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
-    return process_entry.main(
-        "controller",
-        lambda process: run_machines(process, controller_of, CONTROLLER_FLEET),
-        arguments,
+    return process_entry.main("controller", run_controllers, arguments)
+
+
+def run_controllers(process: RunProcess) -> None:
+    """Make the controller of each loop, and run them."""
+    numbered = process.loop_count is not None
+    machines = controllers_of(
+        process.loops, process.phases_ns, start=process.start, numbered=numbered
     )
+    run_machines(process, machines)
 
 
 if __name__ == "__main__":

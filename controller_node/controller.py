@@ -194,9 +194,7 @@ class Controller:
 
     def _set_point(self, controller: Any, setpoint: Setpoint | None) -> None:
         x_r, u_r = (None, None) if setpoint is None else setpoint
-        self._memory.fill(
-            controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r}
-        )
+        self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 
 
 def law_of(resolved: Scenario) -> ControlLaw:

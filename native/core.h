@@ -2,7 +2,9 @@
 #ifndef NOACK_CORE_H
 #define NOACK_CORE_H
 
+#include <stddef.h>
 #include <stdint.h>
+#include <string.h>
 
 #pragma GCC visibility push(default) /* what Python calls; all else is hidden */
 #include "noack.h"
@@ -75,9 +77,45 @@ int64_t queue_serve(
     const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t size_bytes);
 void queue_occupy(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
 
+/* clock.c: readings of a clock, and simulated times. */
+int64_t clock_ns(int clock);
+int64_t run_time_ns(const noack_clock *clock);
+int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
+
 /* guarantee.c */
 int counts_losses(const noack_link *link);
 int64_t make_stale(const noack_link *link, int64_t row, int64_t number, int64_t release_ns);
 void note_outcome(const noack_link *link, int64_t row, int64_t number, int lost);
+
+/* departures.c */
+
+/* The row of the record of a decision; data: the datagram, of decision->size_bytes. */
+noack_packet_row packet_row(
+    const noack_decision *decision, int64_t input, int64_t first_number, int64_t arrival_ns,
+    int64_t flow, const uint8_t *data);
+/* Whether a datagram, or its copy, is the first of both that is intact. */
+int is_first_intact(const noack_decision *decision, int copy);
+/* At equal times, datagrams leave in order of direction, then of arrival: put counts them. */
+int64_t departure_order(int64_t direction, int64_t put);
+/* The heap has room. */
+void heap_push(noack_heap_entry *heap, int64_t *count, noack_heap_entry entry);
+/* Remove the first entry. */
+void heap_pop(noack_heap_entry *heap, int64_t *count);
+
+/* Copy what a datagram has: its message may have few entries. */
+static inline void copy_datagram(noack_datagram *to, const noack_datagram *from) {
+    size_t entries = (size_t)from->message.entries;
+    memcpy(to, from, offsetof(noack_datagram, message.vector) + entries * sizeof(double));
+}
+
+/* wire.c: the header of a message's datagram; and the tests of an authentic datagram. */
+void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *header);
+int64_t wire_examine_message(
+    const noack_reception *reception, int64_t from_peer, const noack_message *message);
+
+/* link.c: decide as noack_link_decide does, by a recorded decision unless it is NULL. */
+void link_repeat(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
+    const noack_recorded *recorded, noack_decision *decision);
 
 #endif

@@ -87,12 +87,11 @@ static void repeat(const noack_recorded *recorded, noack_decision *decision) {
     }
 }
 
-/* The recorded decision for a packet; NULL: there is none. */
-static const noack_recorded *recorded_for(
-    const noack_link *link, const noack_flow *flow, int64_t packet) {
+/* The recorded decision for a flow's next packet; NULL: there is none. */
+static const noack_recorded *recorded_for(const noack_link *link, const noack_flow *flow) {
     if (flow->number >= link->recorded_flows)
         return NULL;
-    int64_t place = link->decisions_begin[flow->number] + packet;
+    int64_t place = link->decisions_begin[flow->number] + flow->packets;
     return place < link->decisions_begin[flow->number + 1] ? &link->decisions[place] : NULL;
 }
 
@@ -118,8 +117,9 @@ static void keep_limit(int64_t free, noack_decision *decision) {
 }
 
 /* A packet that must pass is exempt from everything that would lose it. */
-void noack_link_decide(
-    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision) {
+void link_repeat(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,
+    const noack_recorded *recorded, noack_decision *decision) {
     noack_flow *flow = &link->flows[row];
     *decision = (noack_decision){
         .fate = NOACK_DELIVERED,
@@ -135,7 +135,6 @@ void noack_link_decide(
     flow->packets++;
     link->counters.received++;
     link->counters.received_bytes += size_bytes;
-    const noack_recorded *recorded = recorded_for(link, flow, decision->packet);
     if (recorded != NULL) {
         repeat(recorded, decision);
     } else {
@@ -148,6 +147,12 @@ void noack_link_decide(
         keep_limit(link->limit - link->in_flight, decision);
     }
     noack_settle(link, row, decision);
+}
+
+void noack_link_decide(
+    noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns, noack_decision *decision) {
+    const noack_recorded *recorded = recorded_for(link, &link->flows[row]);
+    link_repeat(link, row, size_bytes, now_ns, recorded, decision);
 }
 
 void noack_link_decide_many(

@@ -396,7 +396,6 @@ typedef struct { /* e^(H dt) for the dt that occurred lately; loops with the sam
 
 typedef struct { /* the model between updates: dx/dt = H(x - x_r), x_r piecewise constant */
     noack_transitions *transitions;
-    int64_t moves;      /* 1: some x_r is not 0 */
     int64_t changes;    /* of x_r */
     int64_t *since_ns;  /* (changes,) ascending */
     int64_t *has_point; /* (changes + 1,) 0: x_r is 0 */
@@ -451,7 +450,7 @@ typedef struct { /* plant_server/plant.py makes it */
     double *x, *z;    /* (n,), (internal,) */
     double *u;        /* (m,) held since the last step */
     double *applied;  /* (sources,) the same, disturbed */
-    double *held;     /* (measure_every, m) the inputs since the last measurement */
+    double *held;     /* (measure_every, m) the inputs since the last measurement, if reported */
     double *inputs;   /* (N, m) of the newest actuation */
     double *x_c;      /* (n,) of it */
     int64_t newest_ns, newest_sequence;
@@ -472,10 +471,6 @@ typedef struct { /* Luenberger: the gain is given. Kalman: it follows from P */
     double *scratch; /* (3 n n + n p + p p + 2n + p,) */
 } noack_observer;
 
-typedef struct { /* an update that was sent and is not acknowledged */
-    int64_t sequence, t_ns;
-} noack_sent;
-
 typedef struct { /* sensor_node/sensor.py makes it */
     noack_machine machine;
     /* settings */
@@ -495,8 +490,8 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t events;      /* number of the next one */
     int64_t wait_ns;     /* time until which it waits for an acknowledgement; -1: it does not */
     int64_t sent_count, sent_places;
-    noack_sent *sent; /* (sent_places,) oldest first */
-    double *sent_x;   /* (sent_places, n) */
+    int64_t *sent;  /* (sent_places,) numbers of the updates not acknowledged, oldest first */
+    double *sent_x; /* (sent_places, n) */
     /* the question to the user's trigger, and its answer */
     double *x, *e_s;  /* (n,) the measured or estimated state; x_s - x */
     int64_t first;    /* 1: it starts at x first */
@@ -625,6 +620,132 @@ void noack_observer_predict(noack_observer *observer, int64_t n, int64_t m, cons
 void noack_observer_gain(noack_observer *observer, int64_t n);
 void noack_observer_correct(noack_observer *observer, int64_t n, const double *y);
 
+/* ---- The clock of a run ------------------------------------------------------------------------ */
+
+typedef struct { /* noack.core.clock: simulated time since the run's epoch */
+    int64_t epoch_ns; /* reading of the coordinator's monotonic clock at simulated time 0 */
+    double speed;     /* simulated time per time of that clock */
+    int64_t slew_ppb; /* 0: this host has that clock; else noack.core.slewed_clock: */
+    int64_t since_ns, begun_ns, target_ns;
+} noack_clock;
+
+/* The simulated time at a reading of this host's monotonic clock. */
+int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns);
+
+/* How long to wait on this host until simulated_ns has passed, or a little less, at any rate of the
+   clock. */
+int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns);
+
+/* ---- The wire format (docs/wire.md) ------------------------------------------------------------ */
+
+enum {
+    NOACK_HEADER_BYTES = 32,
+    NOACK_TAG_BYTES = 16,
+    NOACK_KEY_BYTES = 32,
+    NOACK_DATAGRAM_BYTES = 560 /* of 64 entries */
+};
+
+enum noack_examination { /* what a datagram is; first noack.protocol.wire_format.Rejection */
+    NOACK_BAD_LENGTH,
+    NOACK_BAD_VERSION,
+    NOACK_BAD_RUN,
+    NOACK_BAD_FLOW,
+    NOACK_BAD_LOOP,
+    NOACK_BAD_TAG,
+    NOACK_BAD_SOURCE,
+    NOACK_BAD_RANGE,
+    NOACK_STALE,
+    NOACK_NOT_FINITE,
+    NOACK_ACCEPTED,
+    NOACK_ENCRYPTED /* Python must open it */
+};
+
+typedef struct { /* what the datagrams of a run have in common */
+    int64_t run_id;    /* the bits of the unsigned number */
+    int64_t encrypted; /* 1: Python encrypts and decrypts the vectors, and makes the tags */
+    uint64_t keyed[8]; /* BLAKE2b's state after the key */
+} noack_wire;
+
+/* Set the key. */
+void noack_wire_key(noack_wire *wire, const uint8_t key[32]);
+
+/* The tag of at least one byte of content. */
+void noack_wire_tag(
+    const noack_wire *wire, int64_t size_bytes, const uint8_t *content, uint8_t tag[16]);
+
+/* Write the datagram of a message of at most 64 entries; return its size in bytes. If it is to be
+   encrypted, its vector is still readable, and its tag missing. */
+int64_t noack_wire_encode(const noack_wire *wire, const noack_message *message, uint8_t *datagram);
+
+/* The number in a header, not verified; -1: the datagram is too short. */
+int64_t noack_wire_loop(const uint8_t *datagram, int64_t size_bytes);
+int64_t noack_wire_flow(const uint8_t *datagram, int64_t size_bytes);
+
+/* Examine a datagram that may be one of a loop; return a noack_examination. opened: 1 if Python has
+   decrypted its vector in place. The message is complete if the datagram is accepted. */
+int64_t noack_wire_examine(
+    const noack_wire *wire, const noack_reception *reception, int64_t loop,
+    const uint8_t *datagram, int64_t size_bytes, int64_t from_peer, int64_t opened,
+    noack_message *message);
+
+/* Count a datagram as accepted or rejected. */
+void noack_wire_count(noack_reception *reception, int64_t found, const noack_message *message);
+
+/* ---- The live driver: waits, receives, drives the machines of a process, sends ------------------- */
+
+enum noack_driver_reason { /* why noack_drive returned; after what Python does, it is called again */
+    NOACK_DRIVEN,          /* the time has come, or a signal: housekeeping */
+    NOACK_DRIVER_ROWS,     /* a table of rows or notes must be emptied */
+    NOACK_DRIVER_QUESTION, /* a machine asks; question says what */
+    NOACK_DRIVER_OPEN,     /* decrypt the datagram in place; set opened */
+    NOACK_DRIVER_SEAL,     /* encrypt the datagram in place, and write its tag */
+    NOACK_DRIVER_NOTHING   /* within the driver only */
+};
+
+enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
+
+typedef struct { /* the other end of a flow */
+    int64_t name_bytes; /* 0: there is none */
+    uint8_t name[32];
+    int64_t received; /* datagrams from this address */
+} noack_peer;
+
+typedef struct { /* place 0 is the flow of every run, place 1 that of the acknowledgements */
+    noack_process *process;
+    noack_wire wire;
+    noack_clock clock;
+    int64_t spin_ns; /* time before a tick in which it does not sleep */
+    int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
+    int64_t receiver_count;
+    int64_t receivers[2]; /* sockets; the first is read first */
+    int64_t sender;       /* socket, not connected */
+    noack_peer sources[2], destinations[2];
+    int64_t foreign; /* datagrams from other addresses */
+    int64_t sent;
+    int64_t errors[256]; /* datagrams that could not be sent, by errno */
+    int64_t question;    /* a noack_question */
+    int64_t opened;      /* a noack_opened, of the datagram: */
+    uint8_t *datagram;
+    int64_t datagram_bytes;
+    void *scratch; /* noack_driver_scratch_bytes() bytes, which are 0 at first */
+} noack_driver;
+
+int64_t noack_driver_scratch_bytes(void);
+
+/* Return NULL, or what is wrong with the numbers of a driver; its process has been checked. */
+const char *noack_driver_check(const noack_driver *driver);
+
+/* Prepare the scratch. */
+void noack_driver_open(noack_driver *driver);
+
+/* Work until a time of the run, or until Python is needed; return a noack_driver_reason. After
+   until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
+int64_t noack_drive(noack_driver *driver, int64_t until_ns);
+
+/* Add a datagram as if it had just been received. The driver must have driven all others. */
+void noack_driver_add_datagram(
+    noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
+
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {
@@ -739,9 +860,8 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
-    int64_t epoch_ns; /* the monotonic clock at the relay's start */
-    int64_t unix_ns;  /* Unix time at the relay's start */
-    double speed;     /* simulated time per time of the monotonic clock */
+    noack_clock clock; /* its epoch is the relay's start */
+    int64_t unix_ns;   /* Unix time at the relay's start */
     int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
     int64_t read_ns;  /* the last reading of the clock; never decreases */
     int64_t change_ns; /* time from which other settings apply */
@@ -810,6 +930,192 @@ void noack_client_remove(noack_relay *relay, int64_t row);
 /* The bucket of a time in a histogram: 32 for each doubling. */
 int64_t noack_bucket_of(int64_t t_ns);
 
+/* A capture (pcapng). An interface is a side of a link. */
+
+enum { NOACK_CAPTURE_BYTES = 600 }; /* of a block, beside its payload, at most */
+
+/* Return NULL, or what is wrong with the events of a batch: all that noack_capture_blocks assumes.
+   data_bytes: size of the batch's payloads. */
+const char *noack_capture_check(
+    const noack_event *events, int64_t count, int64_t data_bytes, int64_t interfaces);
+
+/* Write the events' blocks into out, which has room for count NOACK_CAPTURE_BYTES and the payloads;
+   return their bytes. missing: (interfaces,) events that are missing before these, which the next
+   block states, and which are 0 then; written: (interfaces,) counts the blocks. */
+int64_t noack_capture_blocks(
+    const noack_event *events, int64_t count, const uint8_t *data, int64_t *missing,
+    int64_t *written, uint8_t *out);
+
+/* ---- The network of a run, without sockets ----------------------------------------------------- */
+
+typedef struct { /* a datagram in the network */
+    int64_t flow;       /* its direction times loops, and its loop */
+    int64_t size_bytes;
+    int64_t arrival_ns; /* at the socket; later than its handling: unknown */
+    int64_t bit;        /* the bit that the network has flipped; -1: none */
+    uint8_t head[32];   /* its first bytes */
+    noack_message message; /* what it carries, in a simulation */
+} noack_datagram;
+
+typedef struct { /* a delayed datagram or copy */
+    int64_t packet;
+    int64_t copy;
+    int64_t counts;  /* 1: it is the datagram's first intact copy */
+    int64_t delayed; /* 0: an overdue one was before it */
+    int64_t next;    /* next free place */
+    noack_datagram datagram;
+} noack_delayed;
+
+enum noack_channel_question { /* besides NOACK_ASK_CHANGE and NOACK_ROWS_FULL */
+    NOACK_ASK_OUTCOME = 16, /* the user's network: set outcome for the datagram in asked */
+    NOACK_ASK_PLACES        /* there is no room for more delayed datagrams */
+};
+
+typedef struct { /* both directions of the network of a run; each flow has the row of its loop */
+    int64_t loops;
+    int64_t directions;   /* 1 or 2 */
+    noack_link *links[2]; /* from the sensors; from the controllers */
+    int64_t is_scripted;  /* 1: Python decides for what comes from the sensors */
+    int64_t first_number; /* of the inputs, and of each flow's datagrams */
+    int64_t inputs;       /* number of the next input */
+    int64_t reached_ns;   /* arrival of the last datagram; -1: none */
+    int64_t change_ns;    /* time from which the first link has other settings; INT64_MAX: none */
+    int64_t answered;     /* 1: Python has decided for this datagram */
+    noack_recorded outcome;
+    noack_datagram asked;
+    int64_t asked_ns;
+    int64_t put; /* datagrams that have been delayed so far */
+    int64_t heap_count, places, free_place; /* free_place: -1: none */
+    noack_heap_entry *heap; /* (places,) */
+    noack_delayed *delayed; /* (places,) */
+    int64_t row_places, packet_count, release_count;
+    noack_packet_row *packets;   /* (row_places,) */
+    noack_release_row *releases; /* (row_places,) */
+    int64_t leaving_count; /* of the last input: what leaves at once */
+    noack_datagram leaving[2];
+} noack_channel;
+
+/* Return NULL, or what is wrong with the numbers of a channel: all that it assumes. */
+const char *noack_channel_check(const noack_channel *channel);
+
+/* Put the places from a number on into the list of free ones. */
+void noack_channel_add_places(noack_channel *channel, int64_t from);
+
+/* Time of the next departure; INT64_MAX: nothing is delayed. */
+int64_t noack_channel_due_ns(const noack_channel *channel);
+
+/* A datagram arrives, or what is due leaves; see leaving. Return NOACK_DONE, or a question: after
+   the answer the call is repeated. The datagram's flow is one of the channel. */
+int64_t noack_channel_handle(
+    noack_channel *channel, const noack_datagram *datagram, int64_t now_ns);
+int64_t noack_channel_release(noack_channel *channel, int64_t now_ns);
+
+/* Last departure time of each flow of a direction, (loops,); the caller fills it with -1. */
+void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns);
+
+/* ---- Simulation in virtual time ----------------------------------------------------------------- */
+
+typedef struct { /* loops whose rows have the same columns */
+    noack_process *processes[3]; /* by enum noack_role */
+    int64_t *numbers;            /* (loops,) of these loops in the run, ascending */
+} noack_loop_group;
+
+typedef struct {
+    int64_t group, place; /* place: its number in the group */
+} noack_loop_place;
+
+enum noack_destination { /* beyond enum noack_role */
+    NOACK_NETWORK = 3
+};
+
+typedef struct { /* a datagram that has been sent and not received */
+    int64_t to; /* enum noack_role, or NOACK_NETWORK */
+    noack_datagram datagram;
+} noack_sent_datagram;
+
+enum noack_simulation_reason { /* besides NOACK_DONE and the questions of who asks */
+    NOACK_ASK_SENT_PLACES = 32, /* there is no room for more datagrams that have been sent */
+    NOACK_STEPS_DONE            /* steps_left is 0 */
+};
+
+typedef struct {
+    int64_t groups, loops;
+    noack_loop_group *of_group; /* (groups,) */
+    noack_loop_place *of_loop;  /* (loops,) */
+    noack_channel *channel;
+    noack_wire wire;
+    int64_t directions[5]; /* in which direction each flow crosses the network; -1: it does not */
+    int64_t now_ns;
+    int64_t steps_left;   /* inputs of machines until it returns */
+    int64_t asking;       /* enum noack_role or NOACK_NETWORK: who asks */
+    int64_t asking_group; /* of which group */
+    int64_t sent_places;  /* a power of 2 */
+    int64_t sent_first, sent_count;
+    noack_sent_datagram *sent; /* (sent_places,) a ring, in the order of sending */
+} noack_simulation;
+
+/* Return NULL, or what is wrong with the numbers of a simulation. */
+const char *noack_simulation_check(const noack_simulation *simulation);
+
+/* Run until nothing is due up to until_ns. Return NOACK_DONE, or why Python is needed: after the
+   answer the call is repeated. */
+int64_t noack_simulate(noack_simulation *simulation, int64_t until_ns);
+
+/* ---- Replay of recorded inputs -------------------------------------------------------------------- */
+
+typedef struct {
+    int64_t begin, entries;
+} noack_columns;
+
+enum { NOACK_SETTINGS = NOACK_TABLES }; /* a kind of noack_recorded_table */
+
+typedef struct { /* rows of a table that a machine has written */
+    int64_t kind;      /* enum noack_table_number; NOACK_SETTINGS: Python replays its rows */
+    int64_t row_bytes; /* without the number of the loop */
+    int64_t stride;    /* bytes from one row to the next */
+    int64_t count;
+    const uint8_t *rows;
+    noack_columns vector[3]; /* the vector of a message: places of bytes in a row */
+} noack_recorded_table;
+
+enum noack_replay_reason { /* besides NOACK_DONE and the questions of the machine */
+    NOACK_REPLAY_SETTING = 64, /* the next input is a change of settings */
+    NOACK_CANNOT_TAKE          /* the next input has values that no run has */
+};
+
+enum noack_difference { /* of the record from its replay */
+    NOACK_EQUAL,
+    NOACK_TIME_RUNS_BACKWARD,
+    NOACK_BEFORE_DEADLINE,
+    NOACK_OTHER_TABLE, /* the machine wrote a row of another table */
+    NOACK_ROW_DIFFERS
+};
+
+typedef struct { /* the replay of a machine, or of the network */
+    int64_t role;           /* enum noack_role, or NOACK_NETWORK */
+    noack_process *process; /* of the machine, and the number of its loop there */
+    int64_t loop;
+    noack_channel *channel; /* of the network */
+    noack_recorded_table tables[4];
+    int64_t count, next;  /* inputs, and the next one */
+    const int64_t *order; /* (count,) the inputs in order, as places among the rows of all tables */
+    int64_t before_ns;    /* time of the input before */
+    int64_t difference;   /* enum noack_difference: the first one */
+    int64_t difference_at; /* at which input */
+    int64_t other_ns;      /* the time before, or the deadline; INT64_MAX: there is none */
+    uint8_t replayed[8192]; /* the row that the machine wrote then */
+    /* What was sent. Of a message: flow, sequence number, time and vector. Of a datagram: flow and
+       head. There is room for a message of each input, or for two datagrams. */
+    int64_t sent_width, sent_count;
+    int64_t *sent; /* (count or 2 count, sent_width) */
+} noack_input_replay;
+
+/* Return NULL, or what is wrong with the numbers of a replay. */
+const char *noack_replay_check(const noack_input_replay *replay);
+
+/* Replay the next inputs: compare each row bit for bit, and the times of ticks with the deadlines.
+   Return NOACK_DONE, or why Python is needed. */
+int64_t noack_replay_inputs(noack_input_replay *replay);
 /* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
 
    The loop of plant, sensor's model and controller's model, without sampling and without delay.

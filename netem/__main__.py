@@ -6,19 +6,16 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from noack.runtime.signals import stoppable_imports
 
 with stoppable_imports():
-    from netem.duplex_link import network_of
     from netem.engine.run_network import RunNetwork
-    from netem.run_relay import CoreShell, RelayShell
+    from netem.run_relay import NetworkChannel
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.topology import ENDS
-    from noack.runtime.address import Address
     from noack.runtime.command_line import Parser, failed
-    from noack.runtime.peer_sockets import has_peer_sockets
     from noack.runtime.process_entry import add_options, join_run
     from noack.runtime.process_life import RunProcess
 
@@ -35,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     try:
         options, more = joining.parse_known_args(given)
         if not more:
-            return join_run("netem", _in_a_run, options)
+            return join_run("netem", run_network, options)
         from netem.cli.relay_run import alone
 
         return alone(given)
@@ -44,27 +41,20 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 
 
-def _in_a_run(node: RunProcess) -> None:
-    """Relay in the core, which reads this host's clock; with another's clock, from Python."""
-    flows, loops = node.scenario.network.flows, node.loop_count
-
-    def ways(addresses: Mapping[str, Address]) -> list[tuple[Address, Address]]:
-        return [(addresses[ENDS[one].sender], addresses[ENDS[one].receiver]) for one in flows]
-
-    if node.follows_reference or not has_peer_sockets():
-        node.run(
-            network_of(node.scenario, node.start, loops=loops or 1),
-            lambda endpoint, addresses: RelayShell(endpoint, ways(addresses), loops=loops),
-        )
-        return
-    network = RunNetwork(node.scenario, node.start, loops)
-    node.run(
-        network,
-        lambda endpoint, addresses: CoreShell(
-            endpoint, ways(addresses), network=network, clock=node.clock,
-            spin_us=node.scenario.realtime.spin_us, loops=loops,
-        ),
-    )  # fmt: skip
+def run_network(process: RunProcess) -> None:
+    """Relay the datagrams of a run by the core."""
+    network = RunNetwork(process.scenario, process.start, process.loop_count)
+    with process.open_socket() as endpoint:
+        addresses = process.join(endpoint.getsockname()[:2])
+        ways = [
+            (addresses[ENDS[flow].sender], addresses[ENDS[flow].receiver])
+            for flow in process.scenario.network.flows
+        ]
+        channel = NetworkChannel(
+            endpoint, ways, network=network, clock=process.clock, spin_ns=process.spin_ns,
+            loops=process.loop_count,
+        )  # fmt: skip
+        process.run(network, channel, network)
 
 
 if __name__ == "__main__":

@@ -8,18 +8,21 @@ from noack.runtime.signals import stoppable_imports
 with stoppable_imports():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
-    from noack.runtime.loop_machines import run_machines
-    from plant_server.plant import plant_of
-    from plant_server.plant_arrays import PLANT_FLEET
+    from noack.runtime.live_driver import run_machines
+    from noack.runtime.process_life import RunProcess
+    from plant_server.plant import plants_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
-    return process_entry.main(
-        "plant",
-        lambda process: run_machines(process, lambda loop, _: plant_of(loop), PLANT_FLEET),
-        arguments,
-    )
+    return process_entry.main("plant", run_plants, arguments)
+
+
+def run_plants(process: RunProcess) -> None:
+    """Make the plant of each loop, and run them."""
+    numbered = process.loop_count is not None
+    machines = plants_of(process.loops, process.phases_ns, numbered=numbered)
+    run_machines(process, machines)
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ class Plant:
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
             "x": np.array(self.system.x), "z": np.array(self.system.z), "u": np.zeros(m),
-            "applied": np.zeros(sources), "held": np.zeros((self.measure_every, m)),
+            "applied": np.zeros(sources), "held": np.zeros((self.measure_every * self.reports_inputs, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip

@@ -8,16 +8,21 @@ from noack.runtime.signals import stoppable_imports
 with stoppable_imports():
     from noack.core.errors import ExitStatus
     from noack.runtime import process_entry
-    from noack.runtime.loop_machines import run_machines
-    from sensor_node.sensor import sensor_of
-    from sensor_node.sensor_arrays import SENSOR_FLEET
+    from noack.runtime.live_driver import run_machines
+    from noack.runtime.process_life import RunProcess
+    from sensor_node.sensor import sensors_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
-    return process_entry.main(
-        "sensor", lambda process: run_machines(process, sensor_of, SENSOR_FLEET), arguments
-    )
+    return process_entry.main("sensor", run_sensors, arguments)
+
+
+def run_sensors(process: RunProcess) -> None:
+    """Make the sensor of each loop, and run them."""
+    numbered = process.loop_count is not None
+    machines = sensors_of(process.loops, process.phases_ns, start=process.start, numbered=numbered)
+    run_machines(process, machines)
 
 
 if __name__ == "__main__":

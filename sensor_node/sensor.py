@@ -206,10 +206,10 @@ class Sensor:
     def _make_room(self, sensor: Any, places: int) -> None:
         """Provide room for updates that wait for their acknowledgement."""
         n, count = sensor.machine.n, sensor.sent_count
-        sent = self._memory.keep(ffi.new("noack_sent[]", places))
+        sent = self._memory.integers(np.zeros(places, np.int64))
         x = self._memory.zeros(places * n)
         if count:
-            ffi.memmove(sent, sensor.sent, ffi.sizeof("noack_sent") * count)
+            ffi.memmove(sent, sensor.sent, 8 * count)
             ffi.memmove(x, sensor.sent_x, 8 * n * count)
         sensor.sent, sensor.sent_x, sensor.sent_places = sent, x, places
 

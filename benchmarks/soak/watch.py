@@ -79,11 +79,8 @@ def is_of(role: str, process: psutil.Process) -> bool:
 
 
 def udp_port(process: psutil.Process) -> int:
-    """Return the port of a process in the loop, not that of its rehearsals."""
-    connections = process.net_connections("udp4")
-    rehearsals = {one.laddr for one in connections if one.laddr == one.raddr}
-    own = {one.laddr for one in connections if not one.raddr} - rehearsals
-    (port,) = {address.port for address in own}
+    """Return the port of a process in the loop."""
+    (port,) = {one.laddr.port for one in process.net_connections("udp4") if not one.raddr}
     return int(port)
 
 

@@ -22,7 +22,6 @@ from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
     ExitPart,
-    RehearsalPart,
     RestartPart,
     RunSummary,
 )
@@ -100,11 +99,6 @@ def summarise(
         latency_us=latency(record) if live else None,
         realtime={
             role: report.get("realtime") or {} for role, report in record.reports.items() if live
-        },
-        rehearsals={
-            role: RehearsalPart(rehearsals=int(found["rehearsals"]), cpu_share=found["cpu_share"])
-            for role, report in record.reports.items()
-            if live and (found := report.get("rehearsal"))
         },
         watchdog=watchdog_actions(record),
         estimation=signals.estimation(),

@@ -275,14 +275,6 @@ class ExitPart(SummaryPart):
     reason: str
 
 
-class RehearsalPart(SummaryPart):
-    """The rehearsals of a process (:mod:`noack.runtime.rehearsal`)."""
-
-    rehearsals: Count
-    cpu_share: float
-    """Share of a core's time."""
-
-
 class RunSummary(SummaryPart):
     """The content of ``summary.json``."""
 
@@ -329,7 +321,6 @@ class RunSummary(SummaryPart):
     lateness_us: dict[Text, LatenessPart]
     latency_us: LatencyPart | None
     realtime: dict[Text, dict[Text, str]]
-    rehearsals: dict[Text, RehearsalPart]
     watchdog: WatchdogPart
     estimation: EstimationPart | None
     disturbances: list[DisturbancePart]

@@ -6,11 +6,20 @@ import sys
 import time
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S, RunClock
+from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.wire_format import Wire
 from noack.runtime.address import LOOPBACK
-from noack.runtime.real_time_loop import run_loop
+from noack.runtime.live_driver import LiveDriver
+from noack.runtime.real_time_loop import RecordSink, run_loop
 from noack.runtime.real_time_settings import realtime
+from plant_server.plant import plants_of
 
 _WARM_UP = 20
 """Wake-ups before the measurement, to warm up the code."""
@@ -33,52 +42,35 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
 
 def idle_lateness_ns(period_ns: int, duration_s: float, spin_us: float = 0.0) -> Sequence[int]:
     """Return the lateness of each wake-up of a run's loop that has nothing else to do, in ns."""
-    metronome, wall = _Metronome(period_ns), RunClock(time.monotonic_ns())
     end_ns = round(duration_s * NS_PER_S) + _WARM_UP * period_ns
-    run_loop(
-        metronome, _Nothing(), wall, _Nothing(), end_ns=end_ns, stop=lambda: False, spin_us=spin_us
-    )
-    return metronome.late_ns[_WARM_UP:]
+    resting = {
+        "name": "resting",
+        "horizon_s": end_ns / NS_PER_S,
+        "model": {"name": "double_integrator"},
+        "plant": {"initial_state": [0.0, 0.0], "rate_hz": NS_PER_S / period_ns},
+        "trigger": {"beta": 1.0, "alpha_per_s": 1.0},
+        "network": {"mansd": 0, "loss": {"model": "lossless"}},
+    }
+    plant = plants_of((resolve(validate(resting, "the plant of a measurement")),))
+    driver = LiveDriver(plant, Wire(0, bytes(KEY_BYTES)), spin_ns=round(spin_us * 1000))
+    ticks, clock = _Ticks(), RunClock(time.monotonic_ns())
+    run_loop(driver, ticks, clock, ticks, end_ns=end_ns, stop=lambda: False)
+    return ticks.late_ns[_WARM_UP:]
 
 
-class _Metronome:
-    """A machine that only records its lateness."""
+class _Ticks:
+    """A record that keeps the lateness of each tick, and sockets that do nothing."""
 
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = period_ns
-        self._due_ns = period_ns
+    def __init__(self) -> None:
         self.late_ns: list[int] = []
 
-    def handle(self, message: object, now_ns: int) -> Sequence[object]:
-        return ()
+    def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
+        self.late_ns += (rows["now_ns"] - rows["t_ns"]).tolist()
 
-    def on_timer(self, now_ns: int) -> Sequence[object]:
-        self.late_ns.append(now_ns - self._due_ns)
-        self._due_ns += self._period_ns
-        return ()
-
-    def next_deadline_ns(self) -> int:
-        return self._due_ns
-
-
-class _Nothing:
-    """A socket and a record that do nothing."""
-
-    watched: Sequence[int] = ()
-
-    def receive(self, readable: int) -> None:
-        return None
-
-    def send(self, message: object) -> None:
+    def tend(self, now_ns: int, sink: RecordSink) -> None:
         pass
-
-    def tend(self, now_ns: int) -> Sequence[Notice]:
-        return ()
 
     def append(self, record: Record) -> None:
-        pass
-
-    def extend_table(self, table: str, rows: object) -> None:
         pass
 
     def notice(self, notice: Notice) -> None:

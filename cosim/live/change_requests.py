@@ -12,14 +12,12 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.config.runtime_parameters import is_of_network_alone, text_of
 from noack.config.scenario import MOST_CHANGES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kept_loss import found_probabilities
 from noack.runtime.control_messages import ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
-from noack.runtime.fleet.fleet_choice import may_be_compiled
 from noack.runtime.join_ticket import Ticket
 
 _CHANGE_DELAY_S = 0.2
@@ -33,7 +31,6 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        self._of_network_alone = may_be_compiled(ticket.scenario)
         loops = ticket.scenario.loops or ()
         self._schedule, *self._of_loops = (
             ChangeSchedule(one)
@@ -56,12 +53,6 @@ class ChangeRequests:
         settings = parse_message(ChangeRequest, request).get("settings", {})
         from_s, now_ns = None, clock()
         if settings:
-            if self._of_network_alone and not is_of_network_alone(settings):
-                raise CallerError(
-                    f"{text_of(settings)}: of this run only network.loss, network.mansd and "
-                    "network.constraints can be changed, as its loops may run as compiled code; "
-                    "`changes` in the scenario can set the trigger's numbers and the set point, too"
-                )
             if obstacle is not None:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:
@@ -85,11 +76,7 @@ class ChangeRequests:
             "run_dir": self._run_dir,
             "t_s": now_ns / NS_PER_S,
             "from_s": from_s,
-            "runtime_parameters": {
-                key: value
-                for key, value in current_parameters(self._schedule.last).items()
-                if not self._of_network_alone or is_of_network_alone({key: value})
-            },
+            "runtime_parameters": current_parameters(self._schedule.last),
         }
 
     def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from queue import SimpleQueue
 from typing import Any
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.compilation import compile_for
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
@@ -126,7 +125,6 @@ def launch(
                 system.prepare()
         away = {} if listening is None else listening.hosts
         here = [role for role in spawn if role not in away]
-        compile_for(scenario, here)
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)

@@ -17,8 +17,7 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
-from cosim.simulation.shared_network import simulate_loops
-from cosim.simulation.virtual_time import Progress, simulate
+from cosim.simulation.virtual_time import Progress, simulate, simulate_loops
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from netem.link_machine import Link
+from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
@@ -42,7 +42,8 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
             f"{path}: {read.length_ns / 1e9:g} s are {probes} datagrams of the simulated probe; "
             f"expected 1 to {_MOST_PROBES}; choose another --rate"
         )
-    link = Link(LinkSettings(impairments=(read,), mansd=None), 0, "link", "forward")
+    link = LinkState(LinkSettings(impairments=(read,), mansd=None), 0, "link", "forward")
+    link.start_flow(0, 0)
     sent_ns = np.arange(probes) * period_ns
     received_ns = np.full(probes, LOST_NS)
     for k, at_ns in enumerate(sent_ns.tolist()):

@@ -28,9 +28,6 @@ def print_details(console: Console, summary: Summary) -> None:
     if summary["lateness_us"]:  # none in virtual time
         console.print(_timing_table(summary))
         _print_realtime(console, summary["realtime"])
-        for role, found in sorted(summary["rehearsals"].items()):
-            share = f"{100 * found['cpu_share']:.1f} % of a core"
-            console.print(f"rehearsals of the {role}: {found['rehearsals']}, {share}")
     console.print("the paper's assumptions for this scenario:")
     print_assumptions(console, summary["assumptions"])
     print_claims(console, summary)

@@ -1,262 +1,244 @@
-"""Simulates the whole loop in virtual time: the four machines and their datagrams, without a clock.
+"""Simulates a run of N ≥ 1 loops in virtual time: native/driver/virtual.c drives the machines.
 
-The machines, their messages and the protocol are those of a live run; only the shell differs. A
-datagram arrives at the time of sending, unless the network between sensor and controller delays
-it. So a simulated run equals a live run in which no deadline is missed. It depends on its scenario
-alone and is bit-exactly repeatable on the same computer.
+The machines, their messages and the protocol are those of a live run; only the driver differs. A
+datagram arrives at the time of sending, unless the network delays it. So a simulated run equals a
+live run in which no deadline is missed. It depends on its scenario alone, bit for bit. The queues
+of the network couple the loops.
 """
 
-import heapq
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 
-from controller_node.controller import controller_of
+from controller_node.controller import controllers_of
+from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import Rows, RunRecord
-from netem.duplex_link import network_of
-from netem.link_machine import Datagram
-from noack.config.parameter_changes import (
-    ParameterChange,
-    ReconfigurableMachine,
-    change_notice,
-    scheduled,
-)
-from noack.config.resolution import tables_of
+from netem.channel import RUN_ID, Network, channel_of
+from noack.config.loops import loops_of, phases_ns
+from noack.config.parameter_changes import change_notice, scheduled
+from noack.config.resolution import network_tables, resolve, tables_of
 from noack.config.scenario import Scenario
+from noack.core.core_library import core, ffi
+from noack.machines.loop_machines import LoopMachines
+from noack.machines.machine_parts import NEVER_NS
 from noack.protocol.datagram_seal import KEY_BYTES
-from noack.protocol.fleet import FleetDecoder
-from noack.protocol.machine_interface import Machine, Notice, Record
-from noack.protocol.record_tables import (
-    NETEM_PACKET,
-    NETEM_RELEASE,
-    OWNER,
-    PACKET_HEAD_BYTES,
-    Fate,
-)
-from noack.protocol.topology import (
-    CHANGEABLE,
-    ENDS,
-    LOOP_ROLES,
-    PAPER,
-    RECEIVES,
-    RECORDER,
-    receiver_of,
-)
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, loop_number
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import LOOP, OWNER
+from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER
+from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
-
-Network = Callable[[bytes, int], int | None]
-"""Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
-
-Take = Callable[[str, Record | Notice], None]
-"""Called with each row or notice and the role that emitted it."""
-
-AnyDecoder = Decoder | FleetDecoder
+from plant_server.plant import plants_of
+from sensor_node.sensor import sensors_of
 
 Progress = Callable[[int], None]
 """Called from time to time with the simulated time, in ns."""
 
-RUN_ID = 0
-"""Run number in the datagrams of every simulated run: a record depends on the scenario alone.
-
-A simulation receives no foreign traffic, so its key need not be secret."""
-_KEY = bytes(KEY_BYTES)
-
-_TIMER_RANKS = {"plant": 0, "netem": 1, "sensor": 3, "controller": 4}
-_DATAGRAM_RANK = 2
-_BATCH_ROWS = 4096
-_HAPPENINGS_PER_WORD = 4096
+_ROLES: Mapping[str, Callable[..., LoopMachines]] = {
+    "plant": plants_of,
+    "sensor": sensors_of,
+    "controller": controllers_of,
+}
+"""In the order of ``noack_role``."""
+_INPUTS_PER_PROGRESS = 2048
+_SENT_PLACES = 64
 
 
-class DecidedLink:
-    """A link with given losses and delays: of a pattern, an adversary or another run."""
+class RecordCollector:
+    """Rows and notices of a run, in the order in which the machines of a role write them."""
 
-    def __init__(self, decide: Network) -> None:
-        self._decide = decide
-        self._inputs = 0
-        self._packets = 0
-        self._newest = -1
-        self._drop_run = 0
-        self._in_flight: list[tuple[int, int, Datagram]] = []
+    def __init__(self) -> None:
+        self._batches: dict[str, list[Rows]] = {}
+        self._settings: dict[str, list[tuple[Any, ...]]] = {}
+        self._notices: list[tuple[Notice, str]] = []
 
-    def next_deadline_ns(self) -> int | None:
-        """Return the time of the next arrival."""
-        return self._in_flight[0][0] if self._in_flight else None
+    def take(self, role: str, output: Record | Notice) -> None:
+        """Take a row or a notice of a role."""
+        if isinstance(output, Record):
+            self._settings.setdefault(output.table, []).append(output.row)
+        else:
+            self._notices.append((output, role))
 
-    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Forward the next delayed datagram."""
-        release_ns, packet, datagram = heapq.heappop(self._in_flight)
-        stale = packet < self._newest
-        self._newest = max(self._newest, packet)
-        row = (self._inputs, packet, release_ns, now_ns, datagram.flow, 0, int(stale))
-        self._inputs += 1
-        return (datagram, Record(NETEM_RELEASE, row))
+    def extend(self, table: str, rows: Rows) -> None:
+        """Take rows of a table."""
+        self._batches.setdefault(table, []).append(rows)
 
-    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Decide on a datagram; return it if it is neither lost nor delayed."""
-        delay_ns = self._decide(message.data, now_ns)
-        self._drop_run = self._drop_run + 1 if delay_ns is None else 0
-        fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
-        head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
-        release_ns = -1 if delay_ns is None else now_ns + delay_ns
-        row = (
-            self._inputs, self._packets, now_ns, now_ns,
-            message.flow, fate, self._drop_run, release_ns, -1, -1, len(message.data), head,
-        )  # fmt: skip
-        record = Record(NETEM_PACKET, row)
-        packet = self._packets
-        self._inputs += 1
-        self._packets += 1
-        if delay_ns == 0:
-            self._newest = max(self._newest, packet)
-            return (message, record)
-        if delay_ns is not None:
-            heapq.heappush(self._in_flight, (release_ns, packet, message))
-        return (record,)
+    def rows(self, table: str, dtype: np.dtype[np.void]) -> Rows:
+        """Return all rows of a table of this type."""
+        announced = np.array(self._settings.get(table, []), dtype)
+        batches = [rows for rows in self._batches.get(table, []) if rows.dtype == dtype]
+        return np.concatenate([announced, *batches])
+
+    def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
+        """Return the notices of a loop or, of None, those about the whole run, by their times."""
+        lines = [
+            notice._replace(loop=None).line() | {"process": role}
+            for notice, role in self._notices
+            if notice.loop in (None, loop)
+        ]
+        return sorted(lines, key=lambda line: int(line["t_ns"]))
 
 
-class Shuttle:
-    """Carries datagrams between the four machines, in the order of virtual time.
-
-    Order at equal times: the plant's step, delayed datagrams from the network, datagrams in the
-    order of sending, the timers of sensor and controller.
+class VirtualRun:
+    """A run in virtual time.
 
     Args:
-        machines: the machine of each role.
-        entries: length of a message's vector by flow, of each loop.
-        take: called with each row or notice and the role that emitted it.
-        network: what crosses the network.
+        scenario: the scenario of the run.
+        loops: the resolved scenario of each loop.
+        numbered: whether the rows of a loop begin with its number.
+        network: decides the fate of each update; by default the scenario's own network.
     """
 
     def __init__(
         self,
-        machines: Mapping[str, Machine[Any]],
-        entries: Sequence[Callable[[Flow], int]],
-        take: Take,
+        scenario: Scenario,
+        loops: Sequence[Scenario],
         *,
-        network: Sequence[Flow] = PAPER,
+        numbered: bool,
+        network: Network | None = None,
     ) -> None:
-        self.machines = machines
-        self._take = take
-        self._encoder = Encoder(RUN_ID, _KEY)
-        self._loops = len(entries)
-        self.decoders = {
-            role: _decoder(flow, entries)
-            for role, flow in RECEIVES.items()
-            if role != "netem"  # netem reads no payload
-        }
-        self.acknowledgements = _decoder(Flow.ACKNOWLEDGEMENT, entries)
-        self._network = network
-        self._timers = [
-            (machines[role].next_deadline_ns, rank, role) for role, rank in _TIMER_RANKS.items()
+        self._scenario = scenario
+        self.groups: Sequence[Sequence[int]] = [*_groups(loops)]
+        """The numbers of the loops whose rows have the same columns."""
+        self.phases_ns = phases = phases_ns(scenario)
+        """When each loop begins."""
+        self.machines = [
+            {
+                role: make(
+                    [loops[k] for k in numbers], [phases[k] for k in numbers], numbered=numbered
+                )
+                for role, make in _ROLES.items()
+            }
+            for numbers in self.groups
         ]
-        self._sent: deque[tuple[str, str, bytes]] = deque()
-        self._now_ns = 0
+        """The machines of each group of loops whose rows have the same columns, by role."""
+        self.channel = channel_of(scenario, loops=len(loops), network=network)
+        self.record = RecordCollector()
+        self.core: Any = self._new_core(len(loops))
+        wrong = core.noack_simulation_check(self.core)
+        if wrong != ffi.NULL:
+            raise ValueError(f"simulation: {ffi.string(wrong).decode()}")
 
-    def run(self) -> Iterator[int]:
-        """Drive the machines until nothing is due; yield the time after each step."""
-        while (following := self._next()) is not None:
-            self._now_ns, rank, role = following
-            if rank != _DATAGRAM_RANK:
-                self._emit(role, self.machines[role].on_timer(self._now_ns))
-            elif not self._receive(*self._sent.popleft()):
-                continue
-            yield self._now_ns
-
-    def announce(self, changes: Sequence[ParameterChange]) -> None:
-        """Announce parameter changes to every reconfigurable machine."""
-        for role in CHANGEABLE:
-            machine: ReconfigurableMachine[Any] = self.machines[role]  # type: ignore[assignment]
-            for change in changes:
-                self._emit(role, machine.announce(change, self._now_ns))
-
-    def _next(self) -> tuple[int, int, str] | None:
-        due = [
-            (t_ns, rank, role)
-            for deadline_ns, rank, role in self._timers
-            if (t_ns := deadline_ns()) is not None
-        ]
-        if self._sent:
-            due.append((self._now_ns, _DATAGRAM_RANK, ""))
-        return min(due, default=None)
-
-    def _receive(self, sender: str, role: str, data: bytes) -> bool:
-        message: Datagram | Message | None
-        if role == "netem":
-            direction = [ENDS[flow].sender for flow in self._network].index(sender)
-            message = Datagram(direction * self._loops + (loop_number(data) or 0), data)
-        elif (sender, role) == ("netem", "sensor"):
-            message = self.acknowledgements.decode(data)
-        else:
-            message = self.decoders[role].decode(data)
-        if message is None:
-            return False
-        self._emit(role, self.machines[role].handle(message, self._now_ns))
-        return True
-
-    def _emit(self, role: str, outputs: Sequence[Any]) -> None:
-        for output in outputs:
-            if isinstance(output, Record | Notice):
-                self._take(role, output)
+    def run(self, until_ns: int = NEVER_NS, progress: Progress | None = None) -> None:
+        """Run until nothing is due up to a time."""
+        simulation = self.core
+        while True:
+            reason = core.noack_simulate(simulation, until_ns)
+            if reason == core.NOACK_DONE:
+                break
+            if reason == core.NOACK_STEPS_DONE:
+                simulation.steps_left = _INPUTS_PER_PROGRESS
+                if progress is not None:
+                    progress(int(simulation.now_ns))
+            elif reason == core.NOACK_ASK_SENT_PLACES:
+                self._add_sent_places()
+            elif simulation.asking == core.NOACK_NETWORK:
+                self.channel.answer(reason)
+            elif reason == core.NOACK_ROWS_FULL:
+                role = [*_ROLES][simulation.asking]
+                self._take(simulation.asking_group, role)
             else:
-                forwarded = isinstance(output, Datagram)
-                data = output.data if forwarded else self._encoder.encode(output)
-                flow = self._network[output.flow // self._loops] if forwarded else output.flow
-                self._sent.append((role, receiver_of(role, flow, self._network), data))
+                role = [*_ROLES][simulation.asking]
+                self.machines[simulation.asking_group][role].answer(reason)
+        self._take_all()
 
+    def announce(self) -> None:
+        """Announce the changes that the scenario schedules to every machine whose settings change.
 
-def _decoder(flow: Flow, entries: Sequence[Callable[[Flow], int]]) -> AnyDecoder:
-    decoders = [
-        Decoder(flow, of_flow(flow), RUN_ID, _KEY, loop=loop)
-        for loop, of_flow in enumerate(entries)
-    ]
-    return decoders[0] if len(decoders) == 1 else FleetDecoder(decoders)
+        Raises:
+            CallerError: a change is invalid.
+        """
+        changes = scheduled(self._scenario)
+        for role in CHANGEABLE:
+            for change in changes:
+                if role == "netem":
+                    for output in self.channel.announce(change, 0):
+                        self.record.take(role, output)
+                    continue
+                for group, machines in enumerate(self.machines):
+                    for output in machines[role].announce(change, 0):
+                        self.record.take(role, self._of_run(group, output))
+        for change in changes:
+            self.record.take(RECORDER, change_notice(change))
 
+    def reception(self, role: str, loop: int, *, acknowledges: bool = False) -> dict[str, Any]:
+        """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
+        place = self.core.of_loop[loop]
+        machine = self.machines[place.group][role].machines[place.place].machine
+        counts = machine.acknowledgements if acknowledges else machine.received
+        rejected = zip(Rejection, counts.rejected, strict=True)
+        return {
+            "accepted": counts.accepted,
+            "rejected": {reason.value: count for reason, count in rejected if count},
+        }
 
-class Gathered:
-    """Rows and notices, in the order in which they are emitted."""
+    def _new_core(self, loops: int) -> Any:
+        """Return the ``noack_simulation``."""
+        key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
+        numbers = [ffi.new("int64_t[]", one) for one in self.groups]
+        groups = ffi.new("noack_loop_group[]", len(self.groups))
+        of_loop = ffi.new("noack_loop_place[]", loops)
+        for number, (group, machines) in enumerate(zip(groups, self.machines, strict=True)):
+            group.processes = [one.core for one in machines.values()]
+            group.numbers = numbers[number]
+            for place, loop in enumerate(self.groups[number]):
+                of_loop[loop] = (number, place)
+        simulation = ffi.new("noack_simulation *", {
+            "groups": len(groups), "loops": loops, "of_group": groups, "of_loop": of_loop,
+            "channel": self.channel.core, "wire": {"run_id": RUN_ID},
+            "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
+            "steps_left": _INPUTS_PER_PROGRESS,
+        })  # fmt: skip
+        core.noack_wire_key(ffi.addressof(simulation, "wire"), key)
+        self._kept = numbers, groups, of_loop
+        self._sent = ffi.new("noack_sent_datagram[]", _SENT_PLACES)
+        simulation.sent, simulation.sent_places = self._sent, _SENT_PLACES
+        return simulation
 
-    def __init__(
-        self, types: Mapping[str, np.dtype[np.void]], batch_rows: int = _BATCH_ROWS
-    ) -> None:
-        self._types, self._batch_rows = types, batch_rows
-        self._rows: dict[str, list[tuple[Any, ...]]] = {table: [] for table in types}
-        self._batches: dict[str, list[Rows]] = {table: [] for table in types}
-        self.notices: list[dict[str, Any]] = []
+    def _add_sent_places(self) -> None:
+        """Double the room for datagrams that have been sent."""
+        simulation, size = self.core, ffi.sizeof("noack_sent_datagram")
+        places, first = simulation.sent_places, simulation.sent_first
+        larger = ffi.new("noack_sent_datagram[]", 2 * places)
+        ffi.memmove(larger, self._sent + first, (places - first) * size)
+        ffi.memmove(larger + (places - first), self._sent, first * size)
+        self._sent = simulation.sent = larger
+        simulation.sent_places, simulation.sent_first = 2 * places, 0
 
-    def take(self, role: str, output: Record | Notice) -> None:
-        """Take a row or a notice of a role."""
+    def _take(self, group: int, role: str) -> None:
+        """Take the rows and notices of machines."""
+        machines, numbers = self.machines[group][role], np.array(self.groups[group])
+        for table, rows in machines.take_rows():
+            if len(self.groups) > 1 and LOOP in (rows.dtype.names or ()):
+                rows[LOOP] = numbers[rows[LOOP]]
+            self.record.extend(table, rows)
+        for notice in machines.take_notices():
+            self.record.take(role, self._of_run(group, notice))
+
+    def _take_all(self) -> None:
+        for group, machines in enumerate(self.machines):
+            for role in machines:
+                self._take(group, role)
+        for table, rows in self.channel.take_rows():
+            self.record.extend(table, rows)
+
+    def _of_run(self, group: int, output: Record | Notice) -> Record | Notice:
+        """Return an output of a group with the number that its loop has in the run."""
+        numbers = self.groups[group]
         if isinstance(output, Notice):
-            self.notices.append(output._replace(loop=None).line() | {"process": role})
-            return
-        rows = self._rows[output.table]
-        rows.append(output.row)
-        if len(rows) == self._batch_rows:  # an array needs a fifth of the memory of a list
-            self._batch(output.table)
-
-    def sorted_notices(self) -> list[dict[str, Any]]:
-        """The notices in the order of their times."""
-        return sorted(self.notices, key=lambda notice: int(notice["t_ns"]))
-
-    def rows(self) -> dict[str, Rows]:
-        """Return all rows by table."""
-        for table in self._types:
-            self._batch(table)
-        return {table: np.concatenate(batches) for table, batches in self._batches.items()}
-
-    def _batch(self, table: str) -> None:
-        self._batches[table].append(np.array(self._rows[table], self._types[table]))
-        self._rows[table].clear()
+            return output if output.loop is None else output._replace(loop=numbers[output.loop])
+        if len(self.groups) == 1:
+            return output
+        place, *row = output.row
+        return Record(output.table, (numbers[place], *row))
 
 
 def simulate(
     resolved: Scenario, network: Network | None = None, progress: Progress | None = None
 ) -> RunRecord:
-    """Run a scenario in virtual time, with the sampling of a live run.
+    """Run a scenario of one loop in virtual time, with the sampling of a live run.
 
     Args:
         resolved: the resolved scenario; its speed, ports and real-time settings have no effect.
@@ -269,56 +251,98 @@ def simulate(
     """
     if network is not None:
         resolved.coverage.require_unchanging()
-    gathered = Gathered(tables_of(resolved))
-    machines: dict[str, Machine[Any]] = {
-        "plant": plant_of(resolved),
-        "sensor": sensor_of(resolved),
-        "netem": network_of(resolved, forward=None if network is None else DecidedLink(network)),
-        "controller": controller_of(resolved),
-    }
-    shuttle = Shuttle(
-        machines, [resolved.message_sizes.entries], gathered.take, network=resolved.network.flows
-    )
-    drive(shuttle, resolved, gathered.take, progress)
-    rows = gathered.rows()
-    reports = reports_of(rows, shuttle, resolved)
-    return RunRecord(resolved, rows, gathered.sorted_notices(), reports, "simulated")
+    run = _completed(resolved, (resolved,), progress, numbered=False, network=network)
+    rows = {table: run.record.rows(table, dtype) for table, dtype in tables_of(resolved).items()}
+    reports = _reports(run, rows, resolved)
+    return RunRecord(resolved, rows, run.record.notices(), reports, "simulated")
 
 
-def drive(
-    shuttle: Shuttle, scenario: Scenario, take: Take, progress: Progress | None = None
-) -> None:
-    """Announce the scenario's changes, and drive the machines until nothing is due."""
-    changes = scheduled(scenario)
-    shuttle.announce(changes)
-    for change in changes:
-        take(RECORDER, change_notice(change))
+def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> LoopsRun:
+    """Run a scenario with [[loops]] in virtual time; see :func:`simulate`.
+
+    Args:
+        scenario: the scenario, not resolved; speed, ports and real-time settings have no effect.
+        progress: called with the simulated time.
+    """
+    loops = [resolve(loop) for loop in loops_of(scenario)]
+    run = _completed(scenario, loops, progress, numbered=True)
+    of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
+    by_loop = network_rows_by_loop(of_network, run.phases_ns)
+    own = [dict[str, Rows]() for _ in loops]
+    for numbers in run.groups:
+        for table, dtype in tables_of(loops[numbers[0]]).items():
+            if OWNER[table] != "netem":
+                rows = run.record.rows(table, np.dtype([(LOOP, "<u2"), *dtype.descr]))
+                for number, of_loop in _split(rows, dtype, numbers):
+                    own[number][table] = of_loop
+    records = []
+    for number, (loop, packets) in enumerate(zip(loops, by_loop, strict=True)):
+        tables = {table: (own[number] | packets)[table] for table in tables_of(loop)}
+        reports = _reports(run, tables, scenario, number)
+        notices = run.record.notices(number)
+        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=number))
+    reports = {"netem": _report("netem", of_network, {"rejected": {}})}
+    network = RunRecord(scenario, of_network, run.record.notices(), reports, "simulated")
+    return LoopsRun(network, records)
+
+
+def _completed(
+    scenario: Scenario,
+    loops: Sequence[Scenario],
+    progress: Progress | None,
+    *,
+    numbered: bool,
+    network: Network | None = None,
+) -> VirtualRun:
+    """Return a run at its end."""
+    run = VirtualRun(scenario, loops, numbered=numbered, network=network)
+    run.announce()
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
-        for happened, now_ns in enumerate(shuttle.run()):
-            if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:
-                progress(now_ns)
+        run.run(progress=progress)
+    return run
 
 
-def reports_of(
-    rows: Mapping[str, Rows], shuttle: Shuttle, scenario: Scenario, loop: int = 0
+def _groups(loops: Sequence[Scenario]) -> Iterator[list[int]]:
+    """Yield the numbers of the loops whose rows have the same columns."""
+    groups: list[tuple[Mapping[str, np.dtype[np.void]], list[int]]] = []
+    for number, loop in enumerate(loops):
+        types = tables_of(loop)
+        same = next((numbers for known, numbers in groups if known == types), None)
+        if same is None:
+            groups.append((types, [number]))
+        else:
+            same.append(number)
+    yield from (numbers for _, numbers in groups)
+
+
+def _split(
+    rows: Rows, dtype: np.dtype[np.void], numbers: Sequence[int]
+) -> Iterator[tuple[int, Rows]]:
+    """Yield the number and the rows of each loop, without the column of its number."""
+    loops = rows[LOOP]
+    order = np.argsort(loops, kind="stable")
+    counts = np.bincount(loops, minlength=max(numbers) + 1)
+    data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
+    own = np.ascontiguousarray(data).view(dtype).reshape(-1)
+    ends = [*accumulate(counts.tolist(), initial=0)]
+    for number in numbers:
+        yield number, own[ends[number] : ends[number + 1]]
+
+
+def _reports(
+    run: VirtualRun, rows: Mapping[str, Rows], scenario: Scenario, loop: int = 0
 ) -> dict[str, dict[str, Any]]:
     """Return the final report of each role, as of a loop."""
-    decoders = {role: of_loop(one, loop) for role, one in shuttle.decoders.items()}
-    reports = {role: _report(role, rows, decoders.get(role)) for role in LOOP_ROLES}
+    reports = {
+        role: _report(role, rows, run.reception(role, loop) if role in _ROLES else {"rejected": {}})
+        for role in LOOP_ROLES
+    }
     if scenario.protocol.acknowledges:
-        acknowledgements = of_loop(shuttle.acknowledgements, loop)
-        reports["sensor"]["channel"]["acknowledgements"] = acknowledgements.report()
+        counts = run.reception("sensor", loop, acknowledges=True)
+        reports["sensor"]["channel"]["acknowledgements"] = counts
     return reports
 
 
-def of_loop(decoder: AnyDecoder, loop: int) -> Decoder:
-    """Return the decoder of a loop."""
-    return decoder.decoders[loop] if isinstance(decoder, FleetDecoder) else decoder
-
-
-def _report(role: str, rows: Mapping[str, Rows], decoder: Decoder | None) -> dict[str, Any]:
-    channel: dict[str, Any] = {"rejected": {}}
-    if decoder is not None:
-        channel = decoder.report()
+def _report(role: str, rows: Mapping[str, Rows], channel: dict[str, Any]) -> dict[str, Any]:
     owned = {table: len(found) for table, found in rows.items() if OWNER[table] == role}
     return {"ended": HORIZON, "channel": channel, "rows": owned}

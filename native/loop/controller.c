@@ -75,8 +75,9 @@ static void append_predictions(noack_controller *controller, noack_output *outpu
     copy(m, output->message.vector, u);
     for (int64_t k = 1; k < controller->predictions; k++) {
         if (controller->knows_state) {
-            noack_model_advance(&controller->model, x, t_ns, t_ns + machine->period_ns, x);
-            t_ns += machine->period_ns;
+            int64_t next_ns = min_of(t_ns + machine->period_ns, MESSAGE_TIMES_NS);
+            noack_model_advance(&controller->model, x, t_ns, next_ns, x);
+            t_ns = next_ns;
             apply_law(controller, x, u);
         }
         append(output, m, u);

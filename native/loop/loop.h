@@ -8,6 +8,7 @@
 
 #define GENERATION (INT64_C(1) << 40) /* noack.protocol.machine_interface.GENERATION */
 #define NO_TICK INT64_MAX
+#define MESSAGE_TIMES_NS (INT64_C(1) << 62) /* times of messages are below; see native/wire.c */
 
 static inline void copy(int64_t count, const double *source, double *result) {
     memcpy(result, source, (size_t)count * sizeof *result);

@@ -4,23 +4,30 @@
 #include "loop.h"
 
 enum { MOST_LOOPS = 65535, MOST_PLACES = 1 << 20, MOST_EVERY = 1 << 20, MOST_ROWS = 1 << 16 };
-static const int64_t FAR_NS = INT64_C(1) << 62;
-static const int64_t MOST_NUMBER = INT64_MAX / 2;
+static const int64_t MOST_LENGTH = INT64_C(1) << 32;
+
+/* Times and numbers of which a few sums, with the time of a message, are in the range of int64_t.
+ */
+static const int64_t MOST_NS = INT64_C(1) << 60, MOST_NUMBER = INT64_MAX / 2;
 
 static int is_between(int64_t least, int64_t number, int64_t most) {
     return least <= number && number <= most;
 }
 
+/* A time up to which a machine has come: that of a message at most. */
+static int is_reached(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIMES_NS); }
+
 static const char *check_machine(const noack_machine *machine) {
     if (!is_between(1, machine->n, NOACK_MAX_ENTRIES)
         || !is_between(1, machine->m, NOACK_MAX_ENTRIES))
         return "a machine has not 1 to 64 states and inputs";
-    if (!is_between(0, machine->phase_ns, FAR_NS) || !is_between(0, machine->horizon_ns, FAR_NS)
-        || !is_between(0, machine->first_ns, FAR_NS) || !is_between(0, machine->period_ns, FAR_NS))
+    if (!is_between(0, machine->phase_ns, MOST_NS) || !is_between(0, machine->horizon_ns, MOST_NS)
+        || !is_between(0, machine->first_ns, MOST_NS)
+        || !is_between(0, machine->period_ns, MOST_NS))
         return "a machine has a phase, a horizon or a period out of range";
     if (!is_between(0, machine->step, MOST_NUMBER) || !is_between(0, machine->inputs, MOST_NUMBER)
         || !is_between(0, machine->first_number, MOST_NUMBER)
-        || (machine->period_ns > 0 && machine->step > FAR_NS / machine->period_ns))
+        || (machine->period_ns > 0 && machine->step > MOST_NS / machine->period_ns))
         return "a machine has numbers out of range";
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)
@@ -35,11 +42,12 @@ static const char *check_model(const noack_model *model, int64_t n) {
         return "a model has no matrices of its size";
     if (!is_between(4, own->places, MOST_PLACES) || (own->places & (own->places - 1)) != 0)
         return "a model's number of kept matrices is not a power of 2, from 4 on";
-    if (model->changes < 0 || model->has_point == NULL || model->points == NULL
-        || (model->changes > 0 && model->since_ns == NULL))
+    if (!is_between(0, model->changes, MOST_LENGTH) || model->has_point == NULL
+        || model->points == NULL || (model->changes > 0 && model->since_ns == NULL))
         return "a model has no set points";
-    for (int64_t k = 1; k < model->changes; k++)
-        if (model->since_ns[k] < model->since_ns[k - 1])
+    int64_t since_ns = 0;
+    for (int64_t k = 0; k < model->changes; since_ns = model->since_ns[k++])
+        if (!is_between(since_ns, model->since_ns[k], MESSAGE_TIMES_NS))
             return "the set points of a model are not in the order of time";
     return NULL;
 }
@@ -59,7 +67,7 @@ static const char *check_plant(const noack_plant *plant) {
     if (machine->period_ns < 1 || plant->input_period_ns < 1)
         return "a plant has no period";
     if (!is_between(1, plant->measure_every, MOST_EVERY)
-        || !is_between(1, plant->p, n > 64 ? n : 64))
+        || !is_between(1, plant->p, NOACK_MAX_ENTRIES))
         return "a plant has no measurement";
     if (plant->C == NULL && plant->p != n)
         return "a plant without C measures all states";
@@ -82,9 +90,12 @@ static const char *check_plant(const noack_plant *plant) {
         return "a plant receives actuations of another size";
     if (plant->p + (plant->reports_inputs ? plant->measure_every * m : 0) > NOACK_MAX_ENTRIES)
         return "a measurement has more than 64 entries";
-    if (plant->x == NULL || (plant->z == NULL && plant->internal > 0) || plant->u == NULL
-        || plant->applied == NULL || plant->held == NULL || plant->inputs == NULL
-        || plant->scratch == NULL || (plant->carries_model && plant->x_c == NULL))
+    if (plant->timeout_ns < 0 || plant->notice_ns < 0 || !is_reached(plant->newest_ns)
+        || !is_reached(plant->fallback_ns) || !is_between(0, plant->measurements, MOST_NUMBER))
+        return "a plant has a timeout, a time or a number of measurements out of range";
+    if (plant->x == NULL || plant->z == NULL || plant->u == NULL || plant->applied == NULL
+        || plant->held == NULL || plant->inputs == NULL || plant->scratch == NULL
+        || (plant->carries_model && plant->x_c == NULL))
         return "a plant has no state";
     if (plant->watchdog != NOACK_PREDICT)
         return NULL;
@@ -100,8 +111,8 @@ static const char *check_rule(const noack_trigger_rule *rule) {
     for (int k = 0; k < 4; k++)
         if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
             return "a trigger rule has no matrix";
-    if (!is_between(0, rule->grid_ns, FAR_NS) || !is_between(-FAR_NS, rule->idle_ns, FAR_NS)
-        || !is_between(0, rule->shortest_ns, FAR_NS) || !is_between(0, rule->longest_ns, FAR_NS))
+    if (!is_between(0, rule->grid_ns, MOST_NS) || !is_between(-MOST_NS, rule->idle_ns, MOST_NS)
+        || !is_between(0, rule->shortest_ns, MOST_NS) || !is_between(0, rule->longest_ns, MOST_NS))
         return "a trigger rule has times out of range";
     return NULL;
 }
@@ -111,12 +122,14 @@ static const char *check_observer(const noack_observer *observer, const noack_ma
         return NULL;
     if (observer->kind != NOACK_LUENBERGER && observer->kind != NOACK_KALMAN)
         return "an observer is of an unknown kind";
-    int64_t inputs = machine->received.entries - observer->p;
+    int64_t inputs = machine->received.entries - max_of(observer->p, 0);
     if (observer->p < 1 || inputs < machine->m || inputs % machine->m != 0)
         return "an observer receives measurements without the inputs applied";
     if (observer->Ad == NULL || observer->Bd == NULL || observer->C == NULL
         || observer->gain == NULL || observer->x == NULL || observer->scratch == NULL)
         return "an observer has no model";
+    if (observer->t_ns != -1 && !is_reached(observer->t_ns))
+        return "an observer has a time out of range";
     if (observer->kind == NOACK_KALMAN
         && (observer->P == NULL || observer->Q == NULL || observer->R == NULL))
         return "a Kalman filter has no covariances";
@@ -130,16 +143,22 @@ static const char *check_sensor(const noack_sensor *sensor) {
         || (wrong = check_rule(&sensor->rule)) != NULL
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
+    if (machine->period_ns != 0)
+        return "a sensor has ticks";
     if (sensor->observer.kind == NOACK_NO_OBSERVER ? machine->received.entries != machine->n
                                                    : sensor->plant_period_ns < 1)
         return "a sensor receives measurements of another size";
     if (sensor->x_s == NULL || sensor->event_x == NULL || sensor->x == NULL || sensor->e_s == NULL
         || sensor->scratch == NULL)
         return "a sensor has no state";
+    if (!is_reached(sensor->model_ns) || !is_reached(sensor->trigger.since_ns)
+        || !is_reached(sensor->trigger.measured_ns) || !is_between(0, sensor->events, MOST_NUMBER))
+        return "a sensor has a time or a number of events out of range";
     if (!sensor->acknowledged)
-        return NULL;
-    if (!is_between(0, sensor->sent_count, sensor->sent_places) || sensor->sent == NULL
-        || sensor->sent_x == NULL || !is_between(0, sensor->timeout_ns, FAR_NS))
+        return sensor->sent_count == 0 ? NULL : "a sensor waits for acknowledgements and has none";
+    if (!is_between(0, sensor->sent_count, sensor->sent_places)
+        || !is_between(1, sensor->sent_places, MOST_LENGTH) || sensor->sent == NULL
+        || sensor->sent_x == NULL || !is_between(0, sensor->timeout_ns, MOST_NS))
         return "a sensor with acknowledgements has no room for updates";
     return NULL;
 }
@@ -156,6 +175,9 @@ static const char *check_controller(const noack_controller *controller) {
         || controller->x == NULL || controller->u == NULL || controller->scratch == NULL
         || (controller->has_point && (controller->x_r == NULL || controller->u_r == NULL)))
         return "a controller has no state";
+    if (!is_reached(controller->model_ns)
+        || !is_between(NOACK_UNKNOWN_SEQUENCE, controller->newest, INT64_MAX))
+        return "a controller has a time or a newest update out of range";
     return check_model(&controller->model, n);
 }
 
@@ -188,10 +210,10 @@ static const char *check_tables(const noack_process *process, int64_t loop) {
         int64_t words = row_words(process, loop, k);
         if (words == 0)
             continue;
-        if (table->row_bytes != 8 * words + table->prefix_bytes || words > NOACK_MAX_ROW_WORDS
-            || (table->prefix_bytes != 0 && table->prefix_bytes != 2))
+        if ((table->prefix_bytes != 0 && table->prefix_bytes != 2)
+            || table->row_bytes != 8 * words + table->prefix_bytes || words > NOACK_MAX_ROW_WORDS)
             return "the rows of a table have another size than the machines write";
-        if (table->rows == NULL || !is_between(1, table->places, INT64_C(1) << 32)
+        if (table->rows == NULL || !is_between(1, table->places, MOST_LENGTH)
             || !is_between(0, table->count, table->places))
             return "a table has no rows";
     }
@@ -200,13 +222,15 @@ static const char *check_tables(const noack_process *process, int64_t loop) {
 
 static const char *check_loop(const noack_process *process, int64_t loop) {
     const char *wrong = check_machine(noack_process_machine(process, loop));
-    if (wrong != NULL || (wrong = check_tables(process, loop)) != NULL)
+    if (wrong != NULL)
         return wrong;
     if (process->role == NOACK_PLANT)
-        return check_plant(&process->plants[loop]);
-    if (process->role == NOACK_SENSOR)
-        return check_sensor(&process->sensors[loop]);
-    return check_controller(&process->controllers[loop]);
+        wrong = check_plant(&process->plants[loop]);
+    else if (process->role == NOACK_SENSOR)
+        wrong = check_sensor(&process->sensors[loop]);
+    else
+        wrong = check_controller(&process->controllers[loop]);
+    return wrong != NULL ? wrong : check_tables(process, loop);
 }
 
 const char *noack_process_check(const noack_process *process) {
@@ -214,7 +238,7 @@ const char *noack_process_check(const noack_process *process) {
         || !is_between(1, process->loops, MOST_LOOPS))
         return "a process has no role or no loops";
     if (process->due_ns == NULL || process->heap == NULL || process->notes == NULL
-        || !is_between(1, process->note_places, INT64_C(1) << 32)
+        || !is_between(1, process->note_places, MOST_LENGTH)
         || !is_between(0, process->note_count, process->note_places)
         || (process->role == NOACK_PLANT && process->plants == NULL)
         || (process->role == NOACK_SENSOR && process->sensors == NULL)

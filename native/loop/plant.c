@@ -34,11 +34,18 @@ int64_t noack_plant_handle(
     return NOACK_DONE;
 }
 
-/* Advance the system over a period under the input held; remember this input. */
-static void advance(noack_plant *plant) {
-    int64_t n = plant->machine.n, m = plant->machine.m, kept = (plant->measure_every - 1) * m;
+/* Remember the input of the last period, which the next measurement reports. */
+static void remember_input(noack_plant *plant) {
+    int64_t m = plant->machine.m, kept = (plant->measure_every - 1) * m;
     memmove(plant->held, plant->held + m, (size_t)kept * sizeof *plant->held);
     copy(m, plant->u, plant->held + kept);
+}
+
+/* Advance the system over a period under the input held. */
+static void advance(noack_plant *plant) {
+    int64_t n = plant->machine.n;
+    if (plant->reports_inputs)
+        remember_input(plant);
     if (plant->system != NOACK_LINEAR)
         return;
     double *moved = plant->scratch, *pushed = moved + n;

@@ -100,9 +100,8 @@ static int64_t measured_with_acknowledgements(
     int64_t due = test(sensor, t_ns, sides), waits = t_ns < sensor->wait_ns;
     int64_t event = first || (due && !waits);
     if (event) {
-        noack_sent sent = {sensor->events, t_ns};
         copy(n, sensor->x, sensor->sent_x + sensor->sent_count * n);
-        sensor->sent[sensor->sent_count++] = sent;
+        sensor->sent[sensor->sent_count++] = sensor->events;
         sensor->wait_ns = t_ns + sensor->timeout_ns;
     }
     answer(sensor, message, x_s, sides, event, now_ns, output);
@@ -115,7 +114,7 @@ static int64_t measured_with_acknowledgements(
 /* The place of an update that waits for its acknowledgement; sent_count if it does not. */
 static int64_t place_of(const noack_sensor *sensor, int64_t sequence) {
     int64_t place = 0;
-    while (place < sensor->sent_count && sensor->sent[place].sequence != sequence)
+    while (place < sensor->sent_count && sensor->sent[place] != sequence)
         place++;
     return place;
 }

@@ -115,21 +115,9 @@ void report_departure(noack_relay *relay, const departure *leaving, int64_t now_
 void record_packet(
     noack_relay *relay, int64_t direction, int64_t client, const uint8_t *data,
     const noack_decision *decision) {
-    noack_packet_row *row = &relay->packets[relay->packet_rows++];
-    *row = (noack_packet_row){
-        .input = relay->inputs++,
-        .sequence = relay->first_number + decision->packet,
-        .t_ns = min_of(scratch_of(relay)->arrival_ns, decision->arrival_ns),
-        .now_ns = decision->arrival_ns,
-        .flow = relay->loops * direction + client,
-        .fate = decision->fate,
-        .consecutive_losses = decision->consecutive_losses,
-        .release_ns = decision->release_ns,
-        .copy_ns = decision->copy_ns,
-        .bit = decision->bit,
-        .size_bytes = decision->size_bytes,
-    };
-    memcpy(row->head, data, (size_t)min_of(decision->size_bytes, NOACK_HEAD_BYTES));
+    relay->packets[relay->packet_rows++] = packet_row(
+        decision, relay->inputs++, relay->first_number, scratch_of(relay)->arrival_ns,
+        relay->loops * direction + client, data);
 }
 
 /* The delayed datagram leaves at now_ns. */

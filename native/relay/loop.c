@@ -108,7 +108,7 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
             return NOACK_LEAVING_FULL;
         if (!has_room(relay, slot->size_bytes))
             return NOACK_EVENTS_FULL;
-        heap_pop(relay);
+        heap_pop(relay->heap, &relay->heap_length);
         relay->now_ns = max_of(relay->now_ns, entry.release_ns);
         relay->clients[slot->client].in_flight--;
         departure *leaving = &own->leaving[own->leaving_count];
@@ -187,7 +187,7 @@ static void read_arrival(noack_relay *relay) {
         struct timespec stamp;
         memcpy(&stamp, CMSG_DATA(control), sizeof stamp);
         int64_t stamp_ns = (int64_t)stamp.tv_sec * NS_PER_S + stamp.tv_nsec;
-        int64_t waited_ns = simulated_ns_of(relay, own->real_ns - stamp_ns);
+        int64_t waited_ns = simulated_ns_of(&relay->clock, own->real_ns - stamp_ns);
         if (waited_ns <= relay->read_ns)
             own->arrival_ns = relay->read_ns - waited_ns;
     }
@@ -201,7 +201,7 @@ static void release(
     const uint8_t *data = own->buffers[own->batch_next];
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
     int64_t bit = copy ? decision->copy_bit : decision->bit;
-    int counts = copy ? decision->bit >= 0 && bit < 0 : bit < 0;
+    int counts = is_first_intact(decision, copy);
     int delayed = release_ns > relay->now_ns;
     int64_t number = -1;
     if (delayed || bit >= 0)
@@ -216,9 +216,9 @@ static void release(
         slot->counts = (uint8_t)counts;
         slot->fate = (uint8_t)decision->fate;
         relay->put++;
-        /* At equal times, datagrams leave in order of direction, then of arrival. */
-        int64_t order = ((direction & 1) << 62) + relay->put;
-        heap_push(relay, (noack_heap_entry){release_ns, order, number});
+        int64_t order = departure_order(direction & 1, relay->put);
+        noack_heap_entry entry = {release_ns, order, number};
+        heap_push(relay->heap, &relay->heap_length, entry);
         relay->clients[client].in_flight++;
         return;
     }
@@ -298,16 +298,18 @@ static int64_t decide_batch(noack_relay *relay) {
 /* Whether to postpone housekeeping because it would make the next delayed datagram late. */
 static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
     return relay->heap_length > 0
-           && (double)(relay->heap[0].release_ns - relay->read_ns) < HOUSEKEEPING_NS * relay->speed
-           && (double)(relay->read_ns - until_ns) < MOST_PUT_OFF_NS * relay->speed;
+           && (double)(relay->heap[0].release_ns - relay->read_ns)
+                  < HOUSEKEEPING_NS * relay->clock.speed
+           && (double)(relay->read_ns - until_ns) < MOST_PUT_OFF_NS * relay->clock.speed;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
 static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
-    int64_t wait_ns = wall_ns_of(relay, until_ns - relay->read_ns);
+    int64_t wait_ns = noack_clock_wait_ns(&relay->clock, until_ns - relay->read_ns);
     if (relay->heap_length > 0) {
-        int64_t due_ns = wall_ns_of(relay, relay->heap[0].release_ns - relay->read_ns);
+        int64_t due_ns =
+            noack_clock_wait_ns(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
         wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
     }
     struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
@@ -323,7 +325,7 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     own->ready_count = max_of(found, 0);
     own->ready_next = 0;
     if (own->ready_count == 0)
-        relay->read_ns = relay_time_ns(relay);
+        relay->read_ns = run_time_ns(&relay->clock);
     return found >= 0;
 }
 
@@ -337,7 +339,7 @@ static void receive(noack_relay *relay) {
     int taken = recvmmsg(
         relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin),
         MSG_DONTWAIT, NULL);
-    relay->read_ns = relay_time_ns(relay);
+    relay->read_ns = run_time_ns(&relay->clock);
     if (own->stamps)
         own->real_ns = clock_ns(CLOCK_REALTIME);
     if (taken > 0) {
@@ -366,14 +368,14 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             own->batch_next = own->batch_end = 0;
         }
         if (all_taken) {
-            relay->read_ns = relay_time_ns(relay);
+            relay->read_ns = run_time_ns(&relay->clock);
             int64_t wait_until_ns = until_ns;
             if (relay->read_ns >= until_ns) {
                 if (!is_soon_due(relay, until_ns)) {
                     own->ready_count = own->ready_next = 0;
                     return NOACK_HOUSEKEEPING;
                 }
-                wait_until_ns = relay->read_ns + (int64_t)(HOUSEKEEPING_NS * relay->speed);
+                wait_until_ns = relay->read_ns + (int64_t)(HOUSEKEEPING_NS * relay->clock.speed);
             }
             if (!wait_for_datagrams(relay, wait_until_ns))
                 return NOACK_HOUSEKEEPING;

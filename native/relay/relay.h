@@ -65,20 +65,12 @@ typedef struct {
 
 static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay->scratch; }
 
-/* clock.c: simulated nanoseconds since the relay's start. */
-int64_t clock_ns(int clock);
-int64_t relay_time_ns(const noack_relay *relay);
-int64_t simulated_ns_of(const noack_relay *relay, int64_t wall_ns);
-int64_t wall_ns_of(const noack_relay *relay, int64_t simulated_ns);
-
 /* store.c: delayed datagrams. */
 int64_t blocks_for(int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);
 int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit);
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot);
-void heap_push(noack_relay *relay, noack_heap_entry entry);
-void heap_pop(noack_relay *relay);
 
 /* clients.c */
 void touch_clients(noack_relay *relay);

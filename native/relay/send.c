@@ -285,7 +285,7 @@ void send_all(noack_relay *relay) {
                 mark_failed(own, number, following, socket->error);
             if (done < headers)
                 following = own->out_first[done];
-            int64_t now_ns = relay_time_ns(relay);
+            int64_t now_ns = run_time_ns(&relay->clock);
             while (number != following) {
                 account(relay, &own->leaving[number], now_ns);
                 number = own->leaving[number].next;

@@ -1,4 +1,4 @@
-/* Stores delayed datagrams: payloads in chained blocks, and a heap ordered by release time. */
+/* Stores delayed datagrams: payloads in chained blocks. */
 #include "relay.h"
 
 #include <string.h>
@@ -61,39 +61,6 @@ void free_payload(noack_relay *relay, int64_t number) {
     slot->next = (int32_t)relay->free_slot;
     relay->free_slot = number;
     relay->free_slots++;
-}
-
-static int is_before(const noack_heap_entry *a, const noack_heap_entry *b) {
-    return a->release_ns < b->release_ns
-           || (a->release_ns == b->release_ns && a->number < b->number);
-}
-
-void heap_push(noack_relay *relay, noack_heap_entry entry) {
-    noack_heap_entry *heap = relay->heap;
-    int64_t place = relay->heap_length++;
-    while (place > 0 && is_before(&entry, &heap[(place - 1) / 2])) {
-        heap[place] = heap[(place - 1) / 2];
-        place = (place - 1) / 2;
-    }
-    heap[place] = entry;
-}
-
-/* Remove the first entry. */
-void heap_pop(noack_relay *relay) {
-    noack_heap_entry *heap = relay->heap, last = heap[--relay->heap_length];
-    int64_t count = relay->heap_length, place = 0;
-    for (;;) {
-        int64_t below = 2 * place + 1;
-        if (below >= count)
-            break;
-        if (below + 1 < count && is_before(&heap[below + 1], &heap[below]))
-            below++;
-        if (!is_before(&heap[below], &last))
-            break;
-        heap[place] = heap[below];
-        place = below;
-    }
-    heap[place] = last;
 }
 
 void noack_relay_latest(const noack_relay *relay, int64_t direction, int64_t *latest_ns) {

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import LinkSpec
+from netem.relay_events import Bytes, Events
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing
 from noack.runtime.address import text_of
@@ -31,9 +31,8 @@ class _Batch(NamedTuple):
 class CaptureWriter:
     """An open capture file.
 
-    Create it before the packet path applies its real-time settings: the constructor may compile
-    for some seconds, and the new thread would inherit the settings. Each link has two interfaces:
-    the clients' side, then the server's.
+    Create it before the packet path applies its real-time settings: the new thread would inherit
+    them. Each link has two interfaces: the clients' side, then the server's.
 
     Args:
         path: the file, which is replaced; a FIFO; ``-`` for standard output.

@@ -11,7 +11,7 @@ An interface is one side of a link. ``inbound`` packets are datagrams that the e
 
 The comment of an outbound packet has its actual delay instead (``, after 10.613 ms``). Where they
 apply, it also has ``copy, ...`` and ``delivered out of order (stale)``. A datagram has the same
-packet id at both interfaces.
+packet id at both interfaces. The packets are formatted by ``native/relay/capture.c``.
 
 Source: draft-ietf-opsawg-pcapng.
 """
@@ -19,21 +19,17 @@ Source: draft-ietf-opsawg-pcapng.
 import platform
 import struct
 from collections.abc import Sequence
-from contextlib import nullcontext
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.capture.packet_blocks import FOLDER, Bytes, Events, blocks_bytes, put_blocks
-from netem.compile_notice import announced
-from netem.relay_events import EVENT
-from noack.core.code_cache import is_kept
+from netem.relay_events import EVENT, Bytes, Events
+from noack.core.core_library import core, ffi, pointer_to
 
 _SNAP_BYTES = 262_144
 """Larger than any datagram: payloads are captured completely."""
 
-_COMPILING_S = 10.0
 _LINKTYPE_RAW = 101
 _SECTION, _INTERFACE, _STATISTICS = 0x0A0D0D0A, 1, 5
 _HARDWARE, _OS, _APPLICATION = 2, 3, 4
@@ -43,8 +39,6 @@ _START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
 
 class PcapngSection:
     """The blocks of one capture file, in file order: header, packets, ..., statistics.
-
-    The first instance compiles the code that formats packets. This takes some seconds.
 
     Args:
         interfaces: name and description of each side of each link; the ``interface`` of an event
@@ -59,9 +53,6 @@ class PcapngSection:
         self._start_ns = 0
         self._end_ns = 0
         self._out = np.empty(0, np.uint8)
-        kept = is_kept(FOLDER, put_blocks)
-        with nullcontext() if kept else announced("the capture", FOLDER, _COMPILING_S):
-            self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
 
     def header(self) -> bytes:
         """Return the section header and the interface descriptions."""
@@ -89,20 +80,28 @@ class PcapngSection:
     def packets(self, events: Events, data: Bytes) -> memoryview:
         """Return the events' packets, which are valid until the next call.
 
+        Another thread of Python goes on meanwhile.
+
         Raises:
             ValueError: an event has an unknown interface, is too large, or points beyond the data.
         """
-        events = np.require(events, EVENT, ["C", "W"])  # other types would be compiled separately
-        data = np.require(data, np.uint8, ["C", "W"])
-        bound = blocks_bytes(events, data.size, len(self._interfaces))
-        if bound < 0:
-            raise ValueError(f"event {-1 - bound} of a batch is impossible: {events[-1 - bound]}")
-        if bound > self._out.size:
-            self._out = np.empty(bound, np.uint8)
+        events = np.require(events, EVENT, ["C", "A"])
+        data = np.require(data, np.uint8, "C")
+        rows = pointer_to(events, "noack_event *")
+        wrong = core.noack_capture_check(rows, events.size, data.size, len(self._interfaces))
+        if wrong != ffi.NULL:
+            raise ValueError(f"a batch is impossible: {ffi.string(wrong).decode()}")
+        most_bytes = int(events["size_bytes"].sum()) + core.NOACK_CAPTURE_BYTES * events.size
+        if most_bytes > self._out.size:
+            self._out = np.empty(most_bytes, np.uint8)
         if events.size:
             self._start_ns = self._start_ns or int(events["t_ns"][0])
             self._end_ns = int(events["t_ns"][-1])
-        size = put_blocks(events, data, self._missing, self._written, self._out)
+        size = core.noack_capture_blocks(
+            rows, events.size, pointer_to(data, "uint8_t *"),
+            pointer_to(self._missing, "int64_t *"), pointer_to(self._written, "int64_t *"),
+            pointer_to(self._out, "uint8_t *"),
+        )  # fmt: skip
         return self._out.data[:size]
 
     def miss(self, events: NDArray[np.int64]) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from netem.capture.capture_writer import CaptureWriter
 from netem.cli import emulator_options
 from netem.cli.explain_links import explain
 from netem.cli.relay_totals import print_totals
@@ -169,10 +170,6 @@ def _check_files(options: argparse.Namespace) -> None:
 
 @contextmanager
 def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
-    try:
-        from netem.capture.capture_writer import CaptureWriter
-    except ModuleNotFoundError as error:  # the emulator runs without numba
-        raise CallerError(f"--capture: needs {error.name}, which is not installed") from None
     writer = CaptureWriter(path, specs)
     try:
         yield writer

@@ -77,7 +77,7 @@ def find(name: str | None) -> str:
     begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
     if name not in files and (name in begun or (name is None and begun and not files)):
         raise PeerError(
-            f"emulator {name or begun[0]!r} is starting; its first start compiles for some time; "
+            f"emulator {name or begun[0]!r} is starting; "
             "it prints `ready` on standard output when it accepts commands"
         )
     if not files:

@@ -1,1 +1,1 @@
-"""The relay's engines: sockets and the rules of links, compiled if possible, else plain Python."""
+"""The relay around the core: its sockets, clients, memory, and what taps receive."""

@@ -25,7 +25,7 @@ from netem.engine.relay_sockets import raise_file_limit, stamp_arrivals
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.native.socket_structs import packed_name
+from noack.runtime.address import packed_name
 from noack.runtime.udp_sockets import drops_of
 
 _PERIOD_NS = 40_000_000
@@ -174,7 +174,7 @@ class Relay:
     def _relay_until(self, until_ns: int) -> None:
         """Relay datagrams, and pass their events to the taps."""
         relay = self._memory.core
-        relay.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
+        relay.clock.epoch_ns, relay.unix_ns = self._epoch_ns, self.began_unix_ns
         while (reason := core.noack_relay_run(relay, until_ns)) != core.NOACK_HOUSEKEEPING:
             if reason == core.NOACK_NEW_CLIENT:
                 name = bytes(ffi.buffer(core.noack_relay_sender(relay), core.NOACK_NAME_BYTES))

@@ -12,7 +12,7 @@ from netem.relay_events import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.native.socket_structs import NAME_BYTES, SocketName, packed_name
+from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 Array = NDArray[Any]
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))
@@ -51,11 +51,11 @@ class RelayMemory:
         self.releases: Array = np.zeros(row_count, RELEASE_ROW)
         self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
         self.core: Any = ffi.new("noack_relay *", {
-            "links": links, "epoll": self._epoll.fileno(), "speed": 1.0, "change_ns": 2**63 - 1,
-            "segment": segment, "segment_below": 2**16, "taps": taps, "records": row_count > 0,
-            "directions": self.directions, "event_count": len(self.events),
-            "data_bytes": len(self.data), "row_count": row_count, "free_slot": -1,
-            "free_block": -1,
+            "links": links, "epoll": self._epoll.fileno(), "clock": {"speed": 1.0},
+            "change_ns": 2**63 - 1, "segment": segment, "segment_below": 2**16, "taps": taps,
+            "records": row_count > 0, "directions": self.directions,
+            "event_count": len(self.events), "data_bytes": len(self.data),
+            "row_count": row_count, "free_slot": -1, "free_block": -1,
         })  # fmt: skip
         """The relay, as the core's functions take it: a ``noack_relay``."""
         first = (self._scratch.ctypes.data + 63) // 64 * 64

@@ -12,9 +12,9 @@ from typing import Any
 
 from netem.engine.relay_interface import Address, LinkSpec
 from noack.core.errors import CallerError
+from noack.runtime.address import SocketName as SocketName
+from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of
-from noack.runtime.native.socket_structs import SocketName as SocketName
-from noack.runtime.native.socket_structs import packed_name as packed_name
 from noack.runtime.peer_sockets import enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024

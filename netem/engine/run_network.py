@@ -1,18 +1,17 @@
 """The network of a run, which itself waits for, receives and sends datagrams.
 
-It decides as :mod:`netem.link_machine` does, which replays its record: both call the core
+It decides as :mod:`netem.channel` does, which replays its record: both call the core
 (native/link.c), and both number these calls.
 """
 
 import socket
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.engine.relay_memory import PACKET_ROW, Array, RelayDirection, RelayMemory, name_array
 from netem.engine.relay_sockets import stamp_arrivals
-from netem.link_machine import Datagram, at_start, due_settings, link_name
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
@@ -25,8 +24,7 @@ from noack.protocol.record_tables import (
     NETEM_SETTING,
     PACKET_HEAD_BYTES,
 )
-from noack.runtime.address import Address
-from noack.runtime.native.socket_structs import packed_name
+from noack.runtime.address import Address, packed_name
 from noack.runtime.real_time_loop import RowSink
 
 _ROWS = 256
@@ -91,7 +89,8 @@ class RunNetwork:
             spin_ns: busy-wait for this time before a departure.
         """
         relay, clients = self._relay, self._memory.clients
-        relay.epoch_ns, relay.speed, relay.spin_ns = clock.epoch_ns, clock.speed, spin_ns
+        relay.spin_ns = spin_ns
+        self.set_clock(clock)
         self._memory.sockets["fd"][1] = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
@@ -105,6 +104,10 @@ class RunNetwork:
             direction.set_server(destination, core.NOACK_DESTINATION_NAME)
         self._directions[0].row.full = 1  # refuse other sources
 
+    def set_clock(self, clock: RunClock) -> None:
+        """Read the time as this clock does."""
+        clock.set_core(self._relay.clock)
+
     def close(self) -> None:
         """Close what it opened."""
         self._memory.close()
@@ -114,7 +117,7 @@ class RunNetwork:
         return self._relay.heap[0].release_ns if self._relay.heap_length else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Accept a change; see :meth:`netem.link_machine.Link.announce`."""
+        """Accept a change; see :meth:`netem.channel.Channel.announce`."""
         outputs = self._schedule.announce(
             NETEM_SETTING, change, self._relay.inputs, now_ns, self._reached_ns
         )
@@ -164,13 +167,10 @@ class RunNetwork:
         return sum(int(one.counts_of("delays").sum()) for one in self._directions)
 
     @property
-    def send_errors(self) -> Mapping[int, int]:
-        """Number of datagrams that could not be sent or stored, by errno."""
-        counts: Counter[int] = Counter()
-        for direction in self._directions:
-            errors = direction.counts_of("errors")
-            counts.update({error: int(errors[error]) for error in np.flatnonzero(errors).tolist()})
-        return counts
+    def send_errors(self) -> Sequence[int]:
+        """Numbers of datagrams that could not be sent or stored, by errno."""
+        counts = np.sum([one.counts_of("errors") for one in self._directions], axis=0)
+        return [int(count) for count in counts]
 
     def _drive(self, until_ns: int) -> int:
         """Relay until the core returns, and do what it needs; return the reason."""

@@ -85,11 +85,6 @@ def is_of_loss_alone(settings: Mapping[str, Any]) -> bool:
     return all(key == LOSS or key.startswith(f"{LOSS}.") for key in settings)
 
 
-def is_of_network_alone(settings: Mapping[str, Any]) -> bool:
-    """Whether a change concerns the network only, and no machine of the loop computes with it."""
-    return all(key in (MANSD, CONSTRAINTS) or is_of_loss_alone({key: None}) for key in settings)
-
-
 def text_of(settings: Mapping[str, Any]) -> str:
     """Return settings as text: ``network.mansd = 2, trigger.beta = 0.3``."""
     return ", ".join(f"{key} = {_value(value)}" for key, value in sorted(settings.items()))

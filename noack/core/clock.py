@@ -5,6 +5,9 @@ Machines never read a clock; shells pass ``now_ns`` in. ``speed`` is simulated t
 
 import time
 from collections.abc import Callable
+from typing import Any
+
+from noack.core.slewed_clock import SlewedClock
 
 NS_PER_S = 1_000_000_000
 
@@ -33,27 +36,34 @@ class RunClock:
         wall_ns = self._monotonic_ns() - self.epoch_ns
         return wall_ns if self.speed == 1.0 else int(wall_ns * self.speed)
 
-    def wall_s_until(self, t_ns: int) -> float:
-        """Return the wall seconds until simulated time ``t_ns``; negative if it is in the past."""
-        wall_ns = self._monotonic_ns() - self.epoch_ns
-        return (t_ns / self.speed - wall_ns) * 1e-9
+    def set_core(self, clock: Any) -> None:
+        """Let a ``noack_clock`` of the core read as this clock does, if it reads this host's."""
+        clock.epoch_ns, clock.speed, clock.slew_ppb = self.epoch_ns, self.speed, 0
 
 
 class SlewedRunClock(RunClock):
-    """Simulated time tied to a clock that may be faster than that which measures waits.
+    """Simulated time tied to another host's clock, as this host knows it.
 
-    ``fastest`` is the largest rate of ``monotonic_ns`` relative to this machine's monotonic clock.
+    Args:
+        epoch_ns: the other clock's reading at simulated time 0.
+        speed: simulated seconds per second of the other clock.
+        slewed: the other clock, as this host knows it.
+        own_ns: this host's monotonic clock.
     """
 
     def __init__(
-        self, epoch_ns: int, speed: float, monotonic_ns: Callable[[], int], fastest: float
+        self,
+        epoch_ns: int,
+        speed: float,
+        slewed: SlewedClock,
+        own_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(epoch_ns, speed, monotonic_ns)
-        if not fastest >= 1:
-            raise ValueError(f"the largest rate must be at least 1, not {fastest}")
-        self._fastest = fastest
+        super().__init__(epoch_ns, speed, lambda: slewed.now_ns(own_ns()))
+        self._slewed = slewed
 
-    def wall_s_until(self, t_ns: int) -> float:
-        """Return a wait that ends at ``t_ns`` or a little earlier, at any rate of the clock."""
-        wall_s = super().wall_s_until(t_ns)
-        return wall_s / self._fastest if wall_s > 0 else wall_s
+    def set_core(self, clock: Any) -> None:
+        """Let a ``noack_clock`` of the core read as this clock does, until the next estimate."""
+        super().set_core(clock)
+        slew = self._slewed.slew
+        clock.slew_ppb, clock.since_ns = slew.slew_ppb, slew.since_ns
+        clock.begun_ns, clock.target_ns = slew.begun_ns, slew.target_ns

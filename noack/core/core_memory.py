@@ -69,7 +69,6 @@ class CoreMemory:
         since, known = list(since_ns), list(points)
         n = transitions.n
         model.transitions, model.changes = transitions, len(since)
-        model.moves = any(point is not None for point in known)
         model.since_ns = self.integers(since or [0])
         model.has_point = self.integers([point is not None for point in known])
         model.points = self.reals([np.zeros(n) if point is None else point for point in known])

@@ -1,10 +1,25 @@
 """The reference's time at a process: its own clock plus an offset that never jumps."""
 
+from typing import NamedTuple
+
 from noack.core.clock_offset import ClockOffset
 
 SLEW_PPB = 5_000_000
 """Default of the slew rate: 0.5 % of the rate of the process's own clock."""
 _PPB = 10**9
+
+
+class Slew(NamedTuple):
+    """How the applied offset moves from a time on: native/clock.c computes the same from it."""
+
+    slew_ppb: int
+    """Largest change of the offset, in parts per 10⁹ of the own time."""
+    since_ns: int
+    """Reading of the own clock."""
+    begun_ns: int
+    """The offset then."""
+    target_ns: int
+    """The offset towards which it moves."""
 
 
 class SlewedClock:
@@ -28,7 +43,7 @@ class SlewedClock:
         if interval is None:
             raise ValueError("the offset of the clocks is unknown: no exchange has succeeded")
         self._offset = offset
-        self._slew_ppb = slew_ppb
+        self.slew_ppb = slew_ppb
         self._since_ns = own_ns
         self._begun_at_ns = self._target_ns = interval.midpoint_ns
 
@@ -38,6 +53,11 @@ class SlewedClock:
         interval = self._offset.interval(own_ns)
         self._since_ns, self._begun_at_ns = own_ns, applied_ns
         self._target_ns = applied_ns if interval is None else interval.midpoint_ns
+
+    @property
+    def slew(self) -> Slew:
+        """How the offset moves until the next call of :meth:`follow`."""
+        return Slew(self.slew_ppb, self._since_ns, self._begun_at_ns, self._target_ns)
 
     def now_ns(self, own_ns: int) -> int:
         """Return the time of this clock at a reading of the own clock."""
@@ -57,6 +77,6 @@ class SlewedClock:
 
     def _applied_ns(self, own_ns: int) -> int:
         """In one nanosecond of the own time it changes by at most one."""
-        most_ns = self._slew_ppb * (own_ns - self._since_ns) // _PPB
+        most_ns = self.slew_ppb * (own_ns - self._since_ns) // _PPB
         change_ns = self._target_ns - self._begun_at_ns
         return self._begun_at_ns + min(max(change_ns, -most_ns), most_ns)

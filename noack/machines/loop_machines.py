@@ -22,7 +22,7 @@ from noack.protocol.wire_format import Flow, Message
 
 Rows = NDArray[np.void]
 
-_ROWS = 1024
+_ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
 
 
@@ -33,10 +33,10 @@ class LoopMachines:
         parts: the machine of each loop.
         phases_ns: when each loop begins, in the run's time; by default 0.
         numbered: whether rows begin with the number of their loop.
-        rows: rows of each table until they must be taken.
+        rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
-        ValueError: the core refuses a machine's numbers.
+        ValueError: the core refuses a machine's numbers, or the loops' rows differ.
     """
 
     def __init__(
@@ -45,10 +45,12 @@ class LoopMachines:
         phases_ns: Sequence[int] | None = None,
         *,
         numbered: bool = False,
-        rows: int = _ROWS,
+        rows: int | None = None,
     ) -> None:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
+        if any(part.shape != self.parts[0].shape for part in self.parts):
+            raise ValueError(f"the rows of these {self.role.name}s have different columns")
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
         self.numbered = numbered
         self._memory = CoreMemory()
@@ -59,7 +61,8 @@ class LoopMachines:
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
-        self._fill_tables(rows)
+        most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
+        self._fill_tables(rows or max(_ROWS, most))
         wrong = core.noack_process_check(self.core)
         if wrong != ffi.NULL:
             raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")
@@ -147,15 +150,25 @@ class LoopMachines:
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Process a message that arrives at ``now_ns``; return what the machine does."""
+        """Process a message that arrives at ``now_ns``; return what the machine does.
+
+        Raises:
+            ValueError: the loop's machine does not receive such messages.
+        """
+        part, machine = self.parts[message.loop], self.machines[message.loop].machine
+        receptions = [machine.received]
+        if part.shape.acknowledged:
+            receptions.append(machine.acknowledgements)
+        entries = {reception.flow: reception.entries for reception in receptions}
+        if entries.get(message.flow) != len(message.vector):
+            raise ValueError(
+                f"this {self.role.name} receives no {message.flow.name.lower()} "
+                f"of {len(message.vector)} entries"
+            )
         given, self._message.loop = self._message, message.loop
         given.flow, given.sequence, given.t_ns = message.flow, message.sequence, message.t_ns
         given.entries = len(message.vector)
         given.vector[0 : given.entries] = message.vector.tolist()
-        machine = self.machines[message.loop].machine
-        expected = machine.received.entries if message.flow is self.role.receives else 0
-        if given.entries != expected:
-            raise ValueError(f"a message has {given.entries} entries, not {expected}")
         return self._outputs(
             lambda: int(core.noack_process_handle(self.core, self._message, now_ns))
         )

@@ -10,6 +10,7 @@ nominal, ``now_ns`` actual.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -267,6 +268,7 @@ CLOCK_TABLES = tuple(table.name for table in TABLES if table.name == clock_table
 """Tables of what the processes, not their machines, record: they are no input of a machine."""
 
 
+@lru_cache
 def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of a run's tables; ``more`` has other sizes of :class:`RecordShape`."""
     shape = RecordShape(n, m, **more)  # type: ignore[arg-type]

@@ -17,22 +17,22 @@ Layout, little endian (``docs/wire.md`` has test vectors)::
      32+8n    16  tag over all that precedes it, under the run's key
 
 The tag covers flow, loop, run and sequence number, so that no datagram passes for one of another
-flow or loop. Content is read only after the tag was verified. Tag and encryption are in
-:mod:`noack.protocol.datagram_seal`.
+flow or loop. Content is read only after the tag was verified. The core (native/wire.c) reads and
+writes datagrams; :mod:`noack.protocol.datagram_seal` encrypts them.
 """
 
-import math
 import struct
 from enum import IntEnum, StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
-from noack.protocol.datagram_seal import TAG_BYTES, AuthenticatedSeal, EncryptedSeal, seal_of
+from noack.protocol.datagram_seal import TAG_BYTES, EncryptedSeal, require_key
 
 MAGIC = b"NA"
-VERSION = AuthenticatedSeal.version
+VERSION = 1
 VERSIONS = VERSION, EncryptedSeal.version
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
@@ -40,6 +40,13 @@ SEQUENCES, TIMES_NS = 2**63, 2**62
 """Upper limits of sequence numbers and times: they fit the record's columns, and sums of times do
 too. At 100,000 messages a second, 2⁶³ take three million years."""
 _HEADER = struct.Struct("<2sBBHHQQq")
+HEADER_ROW = np.dtype(
+    [
+        ("magic", "S2"), ("version", "u1"), ("flow", "u1"), ("dimension", "<u2"), ("loop", "<u2"),
+        ("run_id", "<u8"), ("sequence", "<u8"), ("t_ns", "<i8"),
+    ]
+)  # fmt: skip
+"""The same as a row of an array."""
 HEADER_BYTES = _HEADER.size
 FLOW_OFFSET = 3
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
@@ -123,16 +130,34 @@ def loop_number(datagram: bytes) -> int | None:
     return datagram[6] | datagram[7] << 8 if len(datagram) >= HEADER_BYTES else None
 
 
+class Wire:
+    """What the datagrams of a run have in common: its number, and its secret key of 32 bytes.
+
+    Raises:
+        ValueError: the key has another length.
+    """
+
+    def __init__(self, run_id: int, key: bytes, *, encrypted: bool = False) -> None:
+        require_key(key)
+        self.core = ffi.new(
+            "noack_wire *", {"run_id": _signed(run_id), "encrypted": int(encrypted)}
+        )
+        core.noack_wire_key(self.core, key)
+        self.seal = EncryptedSeal(key) if encrypted else None
+        """What encrypts and decrypts."""
+
+
 class Encoder:
     """Turns messages into datagrams of one run, under its secret key of 32 bytes."""
 
     def __init__(self, run_id: int, key: bytes, *, encrypted: bool = False) -> None:
-        self._run_id = run_id
-        self._seal = seal_of(key, encrypted=encrypted)
+        self._wire = Wire(run_id, key, encrypted=encrypted)
+        self._message = ffi.new("noack_message *")
+        self._datagram = ffi.new("uint8_t[]", MAX_DATAGRAM_BYTES)
 
     def encode(self, message: Message) -> bytes:
         """Return the datagram of a message; raise ValueError if a value does not fit."""
-        vector = np.ascontiguousarray(message.vector, dtype="<f8")
+        vector = np.asarray(message.vector, np.float64)
         if message.flow is Flow.ACKNOWLEDGEMENT:
             if vector.size:
                 raise ValueError(f"an acknowledgement carries no vector of shape {vector.shape}")
@@ -141,14 +166,21 @@ class Encoder:
                 f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, "
                 f"not shape {vector.shape}"
             )
+        own = self._message
         try:
-            header = _HEADER.pack(
-                MAGIC, self._seal.version, message.flow, vector.size, message.loop,
-                self._run_id, message.sequence, message.t_ns,
-            )  # fmt: skip
-        except struct.error as error:
+            if not 0 <= message.loop <= MAX_LOOPS:
+                raise OverflowError(f"loop {message.loop}")
+            own.flow, own.loop, own.t_ns = message.flow, message.loop, message.t_ns
+            own.sequence = _signed(message.sequence)
+        except OverflowError as error:
             raise ValueError(f"a number does not fit its field: {error}") from None
-        return self._seal.close(header, vector.tobytes())
+        own.entries = vector.size
+        own.vector[0 : vector.size] = vector.tolist()
+        size_bytes = core.noack_wire_encode(self._wire.core, own, self._datagram)
+        datagram = bytes(ffi.buffer(self._datagram, size_bytes))
+        if self._wire.seal is None:
+            return datagram
+        return self._wire.seal.close(datagram[:HEADER_BYTES], datagram[HEADER_BYTES:-TAG_BYTES])
 
 
 class Decoder:
@@ -169,63 +201,71 @@ class Decoder:
         loop: int = 0,
         encrypted: bool = False,
     ) -> None:
-        self._flow = flow
-        self._loop = loop
-        self._size_bytes = datagram_bytes(dimension)
-        self._dimension = dimension
-        self._vector = struct.Struct(f"<{dimension}d")
-        self._run_id = run_id
-        self._seal = seal_of(key, encrypted=encrypted)
-        self._newest = -1
-        self._not_before_ns = not_before_ns
-        self.accepted = 0
-        self.rejected: dict[Rejection, int] = dict.fromkeys(Rejection, 0)
+        self._wire = Wire(run_id, key, encrypted=encrypted)
+        self._flow, self._loop = flow, loop
+        self._reception = ffi.new(
+            "noack_reception *",
+            {
+                "flow": flow, "entries": dimension, "newest": -1,
+                "not_before_ns": not_before_ns,
+            },
+        )  # fmt: skip
+        self._message = ffi.new("noack_message *")
 
     def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
         """Return the message, or None when the datagram was rejected (see ``rejected``).
 
         From any source but the peer's address even an authentic datagram is a replay.
         """
-        examined = self._examine(datagram, from_peer=from_peer)
-        if isinstance(examined, Rejection):
-            self.rejected[examined] += 1
+        found = self._examine(datagram, from_peer, opened=False)
+        if found == core.NOACK_ENCRYPTED:
+            found = core.NOACK_BAD_TAG
+            assert self._wire.seal is not None
+            content = self._wire.seal.open(datagram, HEADER_BYTES)
+            if content is not None:
+                readable = datagram[:HEADER_BYTES] + content + datagram[-TAG_BYTES:]
+                found = self._examine(readable, from_peer, opened=True)
+        message = self._message
+        core.noack_wire_count(self._reception, found, message)
+        if found != core.NOACK_ACCEPTED:
             return None
-        self._newest = examined.sequence
-        self.accepted += 1
-        return examined
+        vector = np.array(ffi.unpack(message.vector, message.entries), np.float64)
+        return Message(self._flow, message.sequence, message.t_ns, vector, self._loop)
+
+    def _examine(self, datagram: bytes, from_peer: bool, *, opened: bool) -> int:
+        return int(
+            core.noack_wire_examine(
+                self._wire.core, self._reception, self._loop, datagram, len(datagram),
+                from_peer, opened, self._message,
+            )
+        )  # fmt: skip
+
+    @property
+    def accepted(self) -> int:
+        """Number of accepted datagrams."""
+        return int(self._reception.accepted)
+
+    @property
+    def rejected(self) -> dict[Rejection, int]:
+        """Number of rejected datagrams by reason."""
+        return rejected_of(self._reception)
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        rejected = {reason.value: n for reason, n in self.rejected.items() if n}
-        return {"accepted": self.accepted, "rejected": rejected}
+        return reception_report(self._reception)
 
-    def _examine(self, datagram: bytes, *, from_peer: bool) -> Message | Rejection:
-        # Cheap tests first: they reject most invalid input and name common mistakes.
-        if len(datagram) < HEADER_BYTES:
-            return Rejection.LENGTH
-        magic, version, flow, dimension, loop, run_id, sequence, t_ns = _HEADER.unpack_from(
-            datagram
-        )
-        if magic != MAGIC or version != self._seal.version:
-            return Rejection.VERSION
-        if len(datagram) != self._size_bytes or dimension != self._dimension:
-            return Rejection.LENGTH
-        if run_id != self._run_id:
-            return Rejection.RUN
-        if flow != self._flow:
-            return Rejection.FLOW
-        if loop != self._loop:
-            return Rejection.LOOP
-        vector = self._seal.open(datagram, HEADER_BYTES)
-        if vector is None:
-            return Rejection.TAG
-        if not from_peer:
-            return Rejection.SOURCE
-        if sequence >= SEQUENCES or not 0 <= t_ns < TIMES_NS:
-            return Rejection.RANGE
-        if sequence <= self._newest or t_ns < self._not_before_ns:
-            return Rejection.STALE
-        entries = self._vector.unpack(vector)
-        if not all(map(math.isfinite, entries)):
-            return Rejection.NOT_FINITE
-        return Message(self._flow, sequence, t_ns, np.array(entries), loop)
+
+def rejected_of(reception: Any) -> dict[Rejection, int]:
+    """Return the number of datagrams that a ``noack_reception`` rejected, by reason."""
+    return dict(zip(Rejection, reception.rejected, strict=True))
+
+
+def reception_report(reception: Any) -> dict[str, object]:
+    """Return the counters of a ``noack_reception`` for the run's summary."""
+    rejected = {reason.value: n for reason, n in rejected_of(reception).items() if n}
+    return {"accepted": reception.accepted, "rejected": rejected}
+
+
+def _signed(number: int) -> int:
+    """Return the signed number with the bits of an unsigned one of 64 bits."""
+    return int.from_bytes(number.to_bytes(8, "little"), "little", signed=True)

@@ -1,11 +1,16 @@
-"""Addresses as text: ``host:port``, ``[::1]:9000``, ``:9000``."""
+"""Addresses as text: ``host:port``, ``[::1]:9000``, ``:9000``; and as the kernel has them."""
 
 import re
 import socket
+import struct
+from typing import Any
 
 from noack.core.errors import CallerError
 
 Address = tuple[str, int]  # numeric host and port
+SocketName = tuple[Any, ...]
+"""An address in the form that sockets use: host and port; IPv6: also flow label and scope."""
+NAME_BYTES = 32  # room for a packed name; those of IPv6 have 28 bytes
 
 LOOPBACK = "127.0.0.1"
 
@@ -58,3 +63,18 @@ def text_of(address: Address) -> str:
 def family_of(address: Address) -> int:
     """``AF_INET6`` or ``AF_INET``."""
     return socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+
+
+def packed_name(name: SocketName) -> tuple[bytes, int]:
+    """Return a name as the kernel's struct sockaddr, padded to NAME_BYTES, and its length."""
+    host, port, flow, scope = (*name, 0, 0)[:4]
+    host, _, interface = host.partition("%")
+    if ":" not in host:
+        packed = struct.pack("=H", socket.AF_INET) + struct.pack("!H", port)
+        packed += socket.inet_pton(socket.AF_INET, host) + bytes(8)
+    else:
+        if interface and not scope:
+            scope = int(interface) if interface.isdecimal() else socket.if_nametoindex(interface)
+        packed = struct.pack("=H", socket.AF_INET6) + struct.pack("!HI", port, flow)
+        packed += socket.inet_pton(socket.AF_INET6, host) + struct.pack("=I", scope)
+    return packed.ljust(NAME_BYTES, b"\0"), len(packed)

@@ -153,7 +153,6 @@ class ProcessReport(ControlMessage):
     generation: Count = 0
     instance: str = ""
     realtime: dict[str, str] = Field({})  # whether each real-time setting was applied
-    rehearsal: dict[str, float] = Field({})  # number of rehearsals, share of a core's time
     reached_ns: Nanoseconds | None = None
     """Simulated time up to which all its deadlines were served; None if it failed."""
 

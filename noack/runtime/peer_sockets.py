@@ -6,12 +6,10 @@ sources stay in the queue of the first socket. They can neither displace nor del
 datagram, and the kernel's drop counters are exact for each queue. :class:`FloodWatch` limits how
 many datagrams from unknown sources are read.
 
-A datagram with a peer's forged address passes; only root can send one on the same machine. Systems
-other than Linux have no peer sockets.
+A datagram with a peer's forged address passes; only root can send one on the same machine.
 """
 
 import socket
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -48,10 +46,8 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
 
     ``endpoint`` is a bound UDP socket; it still receives from all other sources. The sockets do not
     block, have receive buffers of its size and the order of the peers. There are none if the system
-    does not support it.
+    refuses them.
     """
-    if sys.platform != "linux":
-        return ()
     size_bytes = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     with ExitStack() as undo:
         beside = []
@@ -72,14 +68,6 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
             return ()
         undo.pop_all()
     return tuple(beside)
-
-
-def has_peer_sockets() -> bool:
-    """Whether the system supports sockets for peers."""
-    with ExitStack() as stack:
-        endpoint = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        endpoint.bind(("127.0.0.1", 0))
-        return bool([*map(stack.enter_context, open_beside(endpoint, [("127.0.0.1", 9)]))])
 
 
 @contextmanager
@@ -163,6 +151,10 @@ class SourceCount:
             return
         self._fold()
         self._last, self._run = source, datagrams
+
+    def add_others(self, datagrams: int) -> None:
+        """Count datagrams of sources that are not named."""
+        self._more += datagrams
 
     def report(self) -> dict[str, int]:
         """Datagrams by source; the rare sources together are ``others``."""

@@ -9,68 +9,59 @@ import select
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cached_property
 from itertools import chain, repeat
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol
 
 from noack.config.loops import loops_of, phases_ns
-from noack.config.parameter_changes import ReconfigurableMachine
-from noack.config.resolution import tables_of
+from noack.config.parameter_changes import ParameterChange
+from noack.config.resolution import resolved_loops, tables_of
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
-from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
+from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
 from noack.protocol.record_tables import OWNER, clock_table
-from noack.protocol.topology import (
-    CHANGEABLE,
-    LOOP_ROLES,
-    RECORDER,
-    WITH_DEADLINES,
-)
+from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADLINES
+from noack.protocol.wire_format import Wire
 from noack.runtime.address import Address
 from noack.runtime.clock_record import ClockRecord
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
-from noack.runtime.fleet.fleet_socket import FLEET_BUFFER_BYTES
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.peer_sockets import enlarge_buffer
-from noack.runtime.real_time_loop import Channel, run_loop
+from noack.runtime.real_time_loop import Channel, Driver, run_loop
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.record_handover import OwnSpool, deliver_report, own_spool, persisted_rows
-from noack.runtime.reference_clock import ReferenceClock, reads_other_clock, reference_clock
-from noack.runtime.rehearsal import Rehearsal
+from noack.runtime.reference_clock import ReferenceClock, reference_clock
 from noack.runtime.signals import Signals
 from noack.runtime.telemetry import TelemetryBuffer
-from noack.runtime.udp_sockets import bind
-
-T = TypeVar("T")
+from noack.runtime.udp_sockets import CountingSocket, bind
 
 _JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
 _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_GATHER_PARTS = 8
-"""Deadlines of more than a few loops are gathered for this part of a period."""
+_REST_SHARE = 20
+_LONGEST_REST_NS = 1_000_000
+"""Ticks of more than a few loops that are nearer to others than this part of a period are done
+together: waking up for each takes CPU time."""
+_BUFFER_BYTES, _LARGEST_BUFFER_BYTES = 4 * 1024 * 1024, 256 * 1024 * 1024
+"""Receive buffer for each loop, and for all. At 50,000 datagrams a second the largest covers a
+stall of 7 s. The kernel takes what is in use."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
 
 
-class ReportingChannel(Channel[T], Protocol[T]):
-    """A channel with counters."""
+class Reconfigurable(Protocol):
+    """What accepts changes of settings during the run."""
 
-    def report(self) -> Mapping[str, object]:
-        """Counters for the run's summary."""
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Process the announcement of a change."""
         ...
-
-    def close(self) -> None:
-        """Close what it opened."""
-        ...
-
-
-OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[T]]
 
 
 class RunProcess:
@@ -94,7 +85,7 @@ class RunProcess:
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
         self.report: dict[str, Any] = {}
-        self.rehearsal: Rehearsal | None = None
+        self._applied: dict[str, str] = {}
         self._clock_record: ClockRecord | None = None
 
     def request_admission(self) -> None:
@@ -124,8 +115,7 @@ class RunProcess:
         epoch_ns, speed = begin["epoch_ns"], self.scenario.speed
         self.clock = RunClock(epoch_ns, speed)
         if (reference := self._reference) is not None:
-            fastest = 1 + reference.slew_ppb * 1e-9
-            self.clock = SlewedRunClock(epoch_ns, speed, reference.monotonic_ns, fastest)
+            self.clock = SlewedRunClock(epoch_ns, speed, reference.slewed)
         addresses: Mapping[str, Address] = begin["addresses"]
         self.updates.extend(begin.get("changes", ()))
         if not addresses.keys() >= set(LOOP_ROLES):
@@ -155,19 +145,40 @@ class RunProcess:
         return self.stopping
 
     @property
-    def follows_reference(self) -> bool:
-        """Whether the coordinator's clock is another one, so that compiled code cannot read it."""
-        return reads_other_clock(self.ticket)
-
-    @property
     def loop_count(self) -> int | None:
         """Number of loops whose datagrams carry their number; None in a run without [[loops]]."""
         return None if self.scenario.loops is None else len(self.phases_ns)
 
-    def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
-        """Join, drive the machine to the horizon, hand over the remaining rows, and report.
+    @cached_property
+    def loops(self) -> Sequence[Scenario]:
+        """The resolved scenario of each loop."""
+        run = self.scenario  # which is resolved
+        return (run,) if run.loops is None else resolved_loops(run)
 
-        Raise CallerError if the process's port is taken, PeerError if the run never started.
+    @property
+    def wire(self) -> Wire:
+        """What the datagrams of the run have in common."""
+        encrypted = self.scenario.network.encrypted
+        return Wire(self.ticket.run_id, self.ticket.key, encrypted=encrypted)
+
+    @property
+    def spin_ns(self) -> int:
+        """How long to busy-wait before a deadline."""
+        return round(self.scenario.realtime.spin_us * 1000)
+
+    @property
+    def rest_ns(self) -> int:
+        """How long to gather the ticks of many loops."""
+        if len(self.phases_ns) <= _FEW_LOOPS:
+            return 0
+        period_ns = loops_of(self.scenario)[0].timing.plant_period_ns
+        return min(int(period_ns / _REST_SHARE / self.scenario.speed), _LONGEST_REST_NS)
+
+    @contextmanager
+    def open_socket(self) -> Iterator[socket.socket]:
+        """Open the process's socket and apply its real-time settings.
+
+        Raise CallerError if the port is taken.
         """
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
         port = port if self._address is None else self._address[1]
@@ -175,43 +186,51 @@ class RunProcess:
         with (
             closing(bind(port, f"ports.{self.role}", self.ticket.host)) as endpoint,
             # Before the barrier: locking memory may take a tenth of a second.
-            realtime(settings.enabled, settings.fifo_priority, place) as applied,
+            realtime(settings.enabled, settings.fifo_priority, place) as self._applied,
         ):
-            if self.scenario.loops is not None:
-                enlarge_buffer(endpoint, FLEET_BUFFER_BYTES)  # it may be late to the start
-            channel = open_channel(endpoint, self.join(endpoint.getsockname()[:2]))
-            telemetry = self._telemetry()
-            if self.replaces is not None:
-                text = f"restarted: {self.replaces}"
-                telemetry.notice(Notice(self.start.from_ns, RESTART, text))
-            reached_ns: int | None = None
-            try:
-                reached_ns = self._drive(machine, channel, telemetry)
-            except BaseException as error:
-                self.fail(error)
-                raise
-            finally:
-                telemetry.flush()
-                self.report = {
-                    "pid": os.getpid(),
-                    "ended": self.ended,
-                    "realtime": applied,
-                    "rehearsal": self.rehearsal.report() if self.rehearsal else {},
-                    "channel": channel.report(),
-                    "rows": telemetry.totals(),
-                    "stored": telemetry.stored(),
-                    **(
-                        {"rows_by_loop": by_loop} if (by_loop := telemetry.totals_by_loop()) else {}
-                    ),
-                    "generation": self.start.generation,
-                    "instance": self.plane.instance,
-                    "reached_ns": reached_ns,
-                    **({} if self._clock_record is None else self._clock_record.summary()),
-                }
-                channel.close()
-                if self._reference is not None:
-                    self._reference.close()
-                self._hand_over(telemetry)
+            wanted = len(self.phases_ns) * _BUFFER_BYTES  # it may be late to the start
+            enlarge_buffer(endpoint, min(wanted, _LARGEST_BUFFER_BYTES))
+            yield endpoint
+
+    def run(self, driver: Driver, channel: CountingSocket, machine: Reconfigurable) -> None:
+        """Drive the machines to the horizon, hand over the remaining rows, and report.
+
+        Args:
+            driver: drives the machines of this process.
+            channel: its sockets, which are closed at the end.
+            machine: takes changes of settings.
+        """
+        telemetry = self._telemetry()
+        if self.replaces is not None:
+            text = f"restarted: {self.replaces}"
+            telemetry.notice(Notice(self.start.from_ns, RESTART, text))
+        reached_ns: int | None = None
+        try:
+            reached_ns = self._drive(driver, channel, machine, telemetry)
+            channel.finish(self.clock.now_ns(), telemetry)
+        except BaseException as error:
+            self.fail(error)
+            raise
+        finally:
+            telemetry.flush()
+            by_loop = telemetry.totals_by_loop()
+            self.report = {
+                "pid": os.getpid(),
+                "ended": self.ended,
+                "realtime": self._applied,
+                "channel": channel.report(),
+                "rows": telemetry.totals(),
+                "stored": telemetry.stored(),
+                **({"rows_by_loop": by_loop} if by_loop else {}),
+                "generation": self.start.generation,
+                "instance": self.plane.instance,
+                "reached_ns": reached_ns,
+                **({} if self._clock_record is None else self._clock_record.summary()),
+            }
+            channel.close()
+            if self._reference is not None:
+                self._reference.close()
+            self._hand_over(telemetry)
 
     @cached_property
     def _spool(self) -> OwnSpool:
@@ -229,17 +248,22 @@ class RunProcess:
             self._spool.append,
         )
 
-    def _drive(self, machine: Machine[T], channel: Channel[T], telemetry: TelemetryBuffer) -> int:
-        """Run the loop; return the simulated time up to which the machine has done its work."""
+    def _drive(
+        self,
+        driver: Driver,
+        channel: Channel,
+        machine: Reconfigurable,
+        telemetry: TelemetryBuffer,
+    ) -> int:
+        """Run the loop; return the simulated time up to which the machines have done their work."""
         has_table = clock_table(self.role) in tables_of(self.scenario)
         if has_table or self._reference is not None:
             self._clock_record = ClockRecord(
                 self.role, self.start, self.clock, self._reference, has_table=has_table
             )
-        changeable = cast(ReconfigurableMachine[T], machine) if self.role in CHANGEABLE else None
         limits = chain([None], repeat(_CHANGES_AT_ONCE))  # before the first step: all of them
         late_ns = run_loop(
-            machine,
+            driver,
             channel,
             self.clock,
             telemetry,
@@ -247,10 +271,7 @@ class RunProcess:
             stop=lambda: self.stopping,
             turns_after_end=_GRACE_TURNS,
             all_done=self._all_done,
-            spin_us=self.scenario.realtime.spin_us,
-            gather_ns=self._gather_ns,
-            rehearsal=self.rehearsal,
-            news=lambda now_ns: self._news(changeable, now_ns, next(limits)),
+            news=lambda now_ns: self._news(machine, now_ns, next(limits)),
         )
         reached_ns = self.clock.now_ns() - late_ns
         if late_ns and not self.stopping:
@@ -269,17 +290,6 @@ class RunProcess:
         if done and self.role in WITH_DEADLINES:
             self.plane.announce_done()
         return done and self.plane.done().issuperset(WITH_DEADLINES)
-
-    @property
-    def _gather_ns(self) -> int:
-        """How long to gather the deadlines of many loops: waking up for each takes CPU time.
-
-        The emulator's deadlines are delays, which stay exact.
-        """
-        if self.role == "netem" or len(self.phases_ns) <= _FEW_LOOPS:
-            return 0
-        timing = loops_of(self.scenario)[0].timing
-        return min(timing.plant_period_ns, timing.controller_period_ns) // _GATHER_PARTS
 
     @property
     def _end_ns(self) -> int:
@@ -318,7 +328,7 @@ class RunProcess:
         return None
 
     def _news(
-        self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
+        self, machine: Reconfigurable, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
         outputs = self._announce(machine, now_ns, at_most)
         if self._clock_record is None:
@@ -326,9 +336,9 @@ class RunProcess:
         return [*outputs, *self._clock_record.news(now_ns)]
 
     def _announce(
-        self, machine: ReconfigurableMachine[Any] | None, now_ns: int, at_most: int | None
+        self, machine: Reconfigurable, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
-        if machine is None:
+        if self.role not in CHANGEABLE:
             return ()
         outputs: list[Record | Notice] = []
         for change, _ in self.updates.take(at_most):

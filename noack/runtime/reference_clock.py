@@ -113,15 +113,19 @@ class ReferenceClock:
                 raise PeerError(f"cannot compare this host's clock with the coordinator's: {found}")
             select.select([self._client], (), (), _POLL_S)
 
+    @property
+    def slewed(self) -> SlewedClock:
+        """The estimate of the coordinator's monotonic clock, once it is known."""
+        assert self._slewed is not None
+        return self._slewed
+
     def monotonic_ns(self) -> int:
         """Return the estimate of the coordinator's monotonic clock; it never decreases."""
-        assert self._slewed is not None
-        return self._slewed.now_ns(self._clocks.monotonic_ns())
+        return self.slewed.now_ns(self._clocks.monotonic_ns())
 
     def poll(self) -> ClockReport:
         """Exchange times; return the bound since the report before. Call it every 50 ms."""
-        slewed, before_ns = self._slewed, self._clocks.monotonic_ns()
-        assert slewed is not None
+        slewed, before_ns = self.slewed, self._clocks.monotonic_ns()
         error_ns = slewed.error_ns(before_ns)
         restarts = self._client.poll()
         now_ns = self._clocks.monotonic_ns()

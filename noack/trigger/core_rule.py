@@ -7,7 +7,8 @@ from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix
 from noack.trigger.trigger_rule import TriggerRule
 
-_NEVER_NS = 2**62
+_NEVER_NS = 2**60
+"""The core's longest time; no run is as long."""
 
 
 def fill_rule(

@@ -67,11 +67,6 @@ class EventTrigger(Protocol):
         ...
 
 
-def new_trigger(policy: Policy) -> EventTrigger:
-    """Return a trigger that applies a policy at measurements."""
-    return policy.new_trigger() if isinstance(policy, CodedPolicy) else Trigger(policy)
-
-
 class TriggerDecision(NamedTuple):
     """A policy's decision on a measurement."""
 

@@ -15,7 +15,6 @@ from benchmarks._relay_load import Built, Ends, Soak, built, sources
 from benchmarks._relay_ours import Ours
 from benchmarks._relay_process import (
     Kind,
-    asyncio_relay,
     c_relay,
     in_turn,
     our_relay,
@@ -122,8 +121,6 @@ PEERS: dict[str, Callable[[Built], Kind | str]] = {
     "C relay, segments": lambda tools: c_relay(tools, "segment"),
     "C relay, a socket per client": lambda tools: c_relay(tools, "paths"),
     "socat": lambda tools: socat(),
-    "socat, connected": lambda tools: socat(connected=True),
-    "asyncio relay": lambda tools: asyncio_relay(),
 }
 
 
@@ -139,12 +136,6 @@ def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
         relay.ends.soak(state, 1, 0, 1000)
         assert state.received == 0
         assert (relay.ends.ping(20) > 0).all()
-
-
-def test_the_asyncio_relay_delays(tools: Built) -> None:
-    with running(asyncio_relay(delay_ms=5.0), tools) as relay:
-        # asyncio runs timers early by up to the clock's resolution
-        assert (relay.ends.pace(20, 100_000) > 4_900_000).all()
 
 
 def test_the_relays_counters_agree_with_sender_and_sink(tools: Built) -> None:

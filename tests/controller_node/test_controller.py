@@ -20,9 +20,11 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from tests.machine_parts import machine, state_of
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])
@@ -32,29 +34,30 @@ K = np.array([[1.5, -0.7], [0.1, 2.0], [0.0, 1.0]])
 def new_controller(
     mansd: int = 2,
     x0: np.ndarray | None = None,
-    phase_ns: int = MS,
+    first_ns: int = MS,
     horizon_ns: int = 10**9,
     constraints: Sequence[LossRule] = (),
     **more: Any,
-) -> Controller:
-    return Controller(
+) -> LoopMachines:
+    controller = Controller(
         H,
         LinearFeedback(K),
         inputs=len(K),
         period_ns=2 * MS,
-        phase_ns=phase_ns,
+        first_ns=first_ns,
         horizon_ns=horizon_ns,
         guarantee=LossGuarantee((LongestBurst(mansd), *constraints)),
         x0=x0,
         **more,
     )
+    return machine(controller)
 
 
 def update(sequence: int, t_ns: int, x: Sequence[float] = (1.0, -2.0)) -> Message:
     return Message(Flow.UPDATE, sequence, t_ns, np.array(x))
 
 
-def tick(controller: Controller) -> tuple[Message, Any]:
+def tick(controller: LoopMachines) -> tuple[Message, Any]:
     """Execute the next tick on time; return the actuation and its row."""
     t_ns = controller.next_deadline_ns()
     assert t_ns is not None
@@ -78,7 +81,7 @@ def propagated(x: Sequence[float] | np.ndarray, dt_ns: int) -> np.ndarray:
 
 
 def test_actuations_are_sent_on_their_grid_up_to_the_horizon() -> None:
-    controller = new_controller(phase_ns=MS, horizon_ns=9 * MS)
+    controller = new_controller(first_ns=MS, horizon_ns=9 * MS)
     sent = []
     while controller.next_deadline_ns() is not None:
         sent.append(tick(controller)[0])
@@ -107,7 +110,7 @@ def test_the_model_follows_the_newest_update_and_its_time_never_runs_back(
             message, row = tick(controller)
             model_ns = max(model_ns, row["t_ns"])
             assert message.t_ns == model_ns  # the time of the model state used for the input
-            u = safe if newest is None else product(K, controller.x_c)
+            u = safe if newest is None else product(K, state_of(controller, "x_c"))
             assert message.vector.tobytes() == u.tobytes() == row["u"].tobytes()
         else:
             event_ms, gap = item
@@ -121,8 +124,8 @@ def test_the_model_follows_the_newest_update_and_its_time_never_runs_back(
             assert (row["dropouts"], row["t_ns"], row["now_ns"]) == (gap, event_ms * MS, 50 * MS)
             assert row["x"].tolist() == x
         assert (row["model_t_ns"], row["input"]) == (model_ns, number)
-        np.testing.assert_allclose(controller.x_c, expected(), atol=1e-12)
-        np.testing.assert_array_equal(row["x_c"], controller.x_c)
+        np.testing.assert_allclose(state_of(controller, "x_c"), expected(), atol=1e-12)
+        np.testing.assert_array_equal(row["x_c"], state_of(controller, "x_c"))
 
 
 def test_late_ticks_carry_their_nominal_time() -> None:

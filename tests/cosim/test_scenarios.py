@@ -20,8 +20,7 @@ from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
-from cosim.simulation.shared_network import simulate_loops
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.link_load import require_capacity
 from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario

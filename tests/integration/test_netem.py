@@ -17,7 +17,6 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from netem.compile_notice import announced
 from noack.core.errors import ExitStatus
 
 COMMAND = [sys.executable, "-m", "netem"]
@@ -186,34 +185,6 @@ def test_a_taken_port_is_reported(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"noack netem: link relay: UDP port {taken} is already taken")
     assert done.stderr.count("\n") == 1
-
-
-def test_show_names_a_compilation(tmp_path: Path) -> None:
-    """With an empty cache, the code of a capture is compiled before the emulator is ready."""
-    environment = os.environ | {
-        "XDG_CACHE_HOME": str(tmp_path / "cache"), "XDG_RUNTIME_DIR": str(tmp_path),
-    }  # fmt: skip
-    command = [*COMMAND, "--listen", ":0", "--to", ":9", "--control", "lab"]
-    command += ["--capture", str(tmp_path / "x.pcapng")]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
-        try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            assert line.startswith("noack netem: compiling the capture for this machine, once; ")
-            assert "this takes about 10 s" in line
-            os.kill(process.pid, signal.SIGSTOP)
-            shown = subprocess.run(
-                [*COMMAND, "show"], env=environment, capture_output=True, text=True, check=False
-            )
-            assert "emulator 'lab' is starting" in shown.stdout + shown.stderr
-        finally:
-            process.kill()
-
-
-def test_the_duration_of_a_compilation_is_stored(tmp_path: Path) -> None:
-    with announced("the relay", tmp_path / "netem-0", 15.0):
-        pass
-    assert float((tmp_path / "netem.seconds").read_text()) >= 0
 
 
 def test_unintended_losses_have_their_own_exit_status() -> None:

@@ -16,7 +16,6 @@ from cosim.record.align import align_tables, identity_residual
 from cosim.record.run_record import RunRecord, load_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from netem.link_machine import Datagram, update_link_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Record
@@ -24,6 +23,7 @@ from noack.protocol.record_tables import Fate, tables
 from noack.protocol.wire_format import read_header
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.integration.conftest import Finished, run_scenario, settings
+from tests.oracles.link import Datagram, update_link_of
 
 SUMMARY_KEYS = {
     "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from netem.link_machine import Datagram, Link
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.protocol.record_tables import Fate
+from tests.oracles.link import Datagram, Link
 
 STEP_NS = 10_000_000
 P, R = 0.02, 0.1

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.link_machine import Datagram, Link, update_link_of
 from netem.words.words_to_settings import settings_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -21,6 +20,7 @@ from noack.protocol.record_tables import (
     Fate,
     tables,
 )
+from tests.oracles.link import Datagram, Link, update_link_of
 
 MS = 1_000_000
 LOSSES = [

@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.link_machine import Datagram, Link
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.core.core_library import core, ffi
@@ -24,6 +23,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import LossAutomaton
 from tests.netem import any_settings
 from tests.netem.loss_language import is_allowed
+from tests.oracles.link import Datagram, Link
 
 MS = 1_000_000
 OUT_OF_ORDER = settings_of("delay 5ms 20ms reorder 50%").impairments

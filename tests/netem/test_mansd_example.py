@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import NEVER_NS, RecordedDecision
 from noack.protocol.record_tables import Fate
+from tests.oracles.link import Link
 
 PAGE = (Path(__file__).parents[2] / "docs/mansd.md").read_text()
 NEVER = "–"

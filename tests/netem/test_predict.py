@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
+from tests.oracles.link import Link
 
 DECISIONS = 400_000
 BERNOULLI = [(p, m) for p in (0.05, 0.5, 0.97) for m in (0, 1, 4, 17)]

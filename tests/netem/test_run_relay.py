@@ -1,18 +1,15 @@
-"""Both channels of a run's emulator accept the peers' datagrams only, and count the others."""
+"""The channel of a run's emulator accepts the peers' datagrams only, and counts the others."""
 
 import itertools
 import socket
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 
-from netem.duplex_link import network_of
 from netem.engine.run_network import RunNetwork
-from netem.run_relay import CoreShell, RelayShell
+from netem.run_relay import NetworkChannel
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock
@@ -35,8 +32,7 @@ SCENARIO = resolve(
 EARLY, LATER, FOREIGN = 3, 700, 5
 
 
-@pytest.mark.parametrize("engine", ["python", "core"])
-def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: str) -> None:
+def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> None:
     published: list[tuple[str, bytes]] = []
     tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
               if OWNER[table] == "netem"}  # fmt: skip
@@ -51,7 +47,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: 
         for _ in range(FOREIGN):
             foreign.sendto(b"?", endpoint.getsockname())
         clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
-        machine, shell = opened(engine, endpoint, controller, sensor, clock)
+        machine, shell = opened(endpoint, controller, sensor, clock)
         received: Received = []
         sent = iter(range(EARLY, EARLY + LATER))
 
@@ -68,11 +64,11 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: 
 
         with closing(shell):
             run_loop(machine, shell, clock, telemetry, end_ns=None, stop=stop, news=news)
+            shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()
     assert [int(data) for data, _ in received] == list(range(EARLY + LATER))
     assert {text_of(source) for _, source in received} == {report["local"]}
-    assert report["engine"] == engine
     assert report["sent"] == EARLY + LATER
     assert report["send_errors"] == {}
     assert report["rejected"] == {"source": FOREIGN}
@@ -82,8 +78,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted(engine: 
         assert counts[table] == (EARLY + LATER) * tables[table].itemsize
 
 
-@pytest.mark.parametrize("engine", ["python", "core"])
-def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str) -> None:
+def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed() -> None:
     def datagram(loop: int, sequence: int) -> bytes:
         message = Message(Flow.UPDATE, sequence, 0, np.zeros(2), loop)
         return Encoder(1, bytes(32)).encode(message)
@@ -103,7 +98,7 @@ def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str
         closing(bind(0, "test")) as endpoint,
     ):
         clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
-        machine, shell = opened(engine, endpoint, controller, sensor, clock, loops=2)
+        machine, shell = opened(endpoint, controller, sensor, clock, loops=2)
         for data in (*sent, b"short"):
             sensor.sendto(data, endpoint.getsockname())
         received: Received = []
@@ -114,6 +109,7 @@ def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str
 
         with closing(shell):
             run_loop(machine, shell, clock, telemetry, end_ns=None, stop=stop)
+            shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()
     assert sorted(data for data, _ in received) == sorted(d for d in sent if d[6] < 2 and d[7] == 0)
@@ -122,17 +118,12 @@ def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed(engine: str
 
 
 def opened(
-    engine: str,
     endpoint: socket.socket,
     controller: socket.socket,
     sensor: socket.socket,
     clock: RunClock,
     loops: int | None = None,
-) -> tuple[Any, Any]:
+) -> tuple[RunNetwork, NetworkChannel]:
     ways = [(name_of(sensor), name_of(controller))]
-    if engine == "python":
-        return network_of(SCENARIO), RelayShell(endpoint, ways, loops=loops)
     network = RunNetwork(SCENARIO, BEGINNING, loops)
-    return network, CoreShell(
-        endpoint, ways, network=network, clock=clock, spin_us=0.0, loops=loops
-    )
+    return network, NetworkChannel(endpoint, ways, network=network, clock=clock, loops=loops)

@@ -13,11 +13,13 @@ from noack.config.scenario_file import validate
 from noack.disturbances.gaussian import GaussianDisturbance
 from noack.disturbances.step import StepDisturbance
 from noack.disturbances.uniform import UniformDisturbance
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
-from plant_server.disturbance_signal import disturbance_of
+from plant_server.disturbance_signal import BLOCK, disturbance_of
 from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.plant import Plant, plant_of
+from plant_server.plant import plant_of
+from tests.machine_parts import state_of
 
 STEPS = 4000
 
@@ -42,7 +44,7 @@ def resolved(content: dict[str, Any]) -> Scenario:
     return resolve(validate(content, "test"))
 
 
-def steps_of(plant: Plant, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
+def steps_of(plant: LoopMachines, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
     rows, sent = [], []
     for k in range(count):
         plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)
@@ -59,8 +61,8 @@ def test_disturbances_have_their_distributions_and_are_independent(
 ) -> None:
     disturbance = disturbance_of(resolved(disturbed))
     assert disturbance is not None
-    pairs = [disturbance(step) for step in range(STEPS)]
-    d, w = np.array([d for d, _ in pairs])[:, 0], np.array([w for _, w in pairs])
+    d, w = disturbance.values(range(STEPS))
+    d = d[:, 0]
     t_s = np.arange(STEPS) * 0.01
     there = (t_s >= 0.5) & (t_s < 1.0)
     normal = (d - 2.0 * there) / 0.3
@@ -78,11 +80,11 @@ def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(
     one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
     assert one is not None
     assert other is not None
-    backward = {step: other(step) for step in range(700, -1, -37)}
-    for step in range(701):
-        d, w = one(step)
-        if step in backward:
-            assert (d.tobytes(), w.tobytes()) == tuple(v.tobytes() for v in backward[step])
+    d, w = one.values(range(BLOCK, 3 * BLOCK))
+    for first in (2 * BLOCK, BLOCK):
+        rows = slice(first - BLOCK, first)
+        again = other.block(first)
+        assert tuple(v.tobytes() for v in again) == (d[rows].tobytes(), w[rows].tobytes())
 
 
 def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> None:
@@ -132,8 +134,8 @@ def test_an_input_disturbance_acts_on_a_nonlinear_plant(content: dict[str, Any])
         plain.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
         disturbed.on_timer(k * 2_000_000)
         plain.on_timer(k * 2_000_000)
-    assert plain.x[2] != 0.1
-    np.testing.assert_array_equal(disturbed.x, plain.x)
+    assert state_of(plain, "x")[2] != 0.1
+    np.testing.assert_array_equal(state_of(disturbed, "x"), state_of(plain, "x"))
 
 
 def test_measurements_carry_the_inputs_of_every_step_since_the_last(
@@ -152,11 +154,11 @@ def test_measurements_carry_the_inputs_of_every_step_since_the_last(
 def test_noise_has_its_distribution() -> None:
     C = np.array([[1.0, 2.0]])
     measuring = MeasurementModel(C, np.array([0.5]), np.array([0.0]), seed=7)
-    y = np.array([measuring(np.array([1.0, 3.0]), k)[0] for k in range(STEPS)])
-    assert kstest((y - 7.0) / 0.5, "norm").pvalue > 1e-3
+    (v,) = measuring.noise(0, STEPS).T
+    assert kstest(v / 0.5, "norm").pvalue > 1e-3
     measuring = MeasurementModel(C, np.array([0.0]), np.array([0.2]), seed=7)
-    y = np.array([measuring(np.zeros(2), k)[0] for k in range(STEPS)])
-    assert kstest(y, "uniform", (-0.2, 0.4)).pvalue > 1e-3
+    (v,) = measuring.noise(0, STEPS).T
+    assert kstest(v, "uniform", (-0.2, 0.4)).pvalue > 1e-3
 
 
 def test_measurements_without_noise_equal_the_state(content: dict[str, Any]) -> None:

@@ -6,33 +6,25 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from plant_server.input_buffer import InputBuffer
 from scipy.integrate import solve_ivp
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.core.linear_systems import Matrix, Vector
-from noack.plants.linear import LinearSystem
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.plant import Plant, plant_of
-from plant_server.watchdog import Watchdog
+from plant_server.plant import plant_of
+from tests.machine_parts import linear_plant, state_of
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])
 B = np.array([[0.0, 1.0], [2.0, -1.0]])
 
 
-def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> Plant:
-    return linear_plant(
-        A, B, np.array([1.0, -0.5]), horizon_ns=horizon_ns, measure_every=measure_every
-    )
-
-
-def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int = H_NS, **settings: int) -> Plant:
-    system = LinearSystem(A, B, x0, step_ns=period_ns)
-    return Plant(system, Watchdog(InputBuffer(B.shape[1])), period_ns=period_ns, **settings)
+def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> LoopMachines:
+    x0 = np.array([1.0, -0.5])
+    return linear_plant(A, B, x0, H_NS, horizon_ns=horizon_ns, measure_every=measure_every)
 
 
 def actuation(sequence: int, u: Sequence[float]) -> Message:
@@ -53,7 +45,7 @@ def rows(outputs: Sequence[object], table: str) -> Any:
 def test_the_plant_moves_as_an_integrator_does(inputs: list[tuple[float, float]]) -> None:
     h_ns = 40_000_000
     x = np.array([1.0, -0.5])
-    plant = linear_plant(A, B, x, period_ns=h_ns, horizon_ns=10**9)
+    plant = linear_plant(A, B, x, h_ns, horizon_ns=10**9)
     plant.handle(actuation(0, inputs[0]), 0)
     (first,) = measured(plant.on_timer(0))
     assert first.vector.tolist() == x.tolist()
@@ -100,10 +92,10 @@ def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
     plant = new_plant()
     outputs = [*plant.on_timer(0)]
     outputs += plant.handle(actuation(7, [1.0, 0.0]), 100)
-    assert plant.u.tolist() == [0.0, 0.0]
+    assert state_of(plant, "u").tolist() == [0.0, 0.0]
     outputs += plant.handle(actuation(9, [0.0, 5.0]), 200)
     outputs += plant.on_timer(H_NS)
-    assert plant.u.tolist() == [0.0, 5.0]
+    assert state_of(plant, "u").tolist() == [0.0, 5.0]
     outputs += plant.on_timer(2 * H_NS)  # no newer actuation: the input is held
     steps = rows(outputs, PLANT_STEP)
     assert steps["actuation"].tolist() == [-1, 9, 9]
@@ -142,7 +134,7 @@ def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
 
 def test_a_measurement_does_not_change_with_later_steps() -> None:
     x0 = np.array([1.0, -0.5])
-    plant = linear_plant(A, B, x0, horizon_ns=10**9)
+    plant = linear_plant(A, B, x0, H_NS, horizon_ns=10**9)
     (message,) = measured(plant.on_timer(0))
     plant.on_timer(H_NS)
     assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]

@@ -4,16 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plant_server.input_buffer import InputBuffer
 from scipy.linalg import expm
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.plant import Plant, plant_of
-from plant_server.watchdog import Watchdog, hold, zero
+from plant_server.plant import plant_of
 
 MS = 1_000_000
 K = np.array([[-3.0, -1.5]])
@@ -37,7 +36,7 @@ def scenario(policy: str, **changes: Any) -> Any:
 class Driven:
     """A plant that executes every step on time."""
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(self, plant: LoopMachines) -> None:
         self.plant = plant
         self.steps: dict[int, Any] = {}
         self.notices: list[Notice] = []
@@ -59,14 +58,14 @@ class Driven:
 
 
 def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> None:
-    for fallback, then in ((hold, 2.0), (zero, 0.0)):
-        watchdog = Watchdog(InputBuffer(1), 50 * MS, fallback)
-        watchdog.take(np.array([2.0]), 7 * MS, 0)
-        u, _, said = watchdog.input(57 * MS)
-        assert (u.tolist(), said) == ([2.0], ())
-        u, _, said = watchdog.input(57 * MS + 1)
-        assert u.tolist() == [then]
-        assert [(notice.t_ns, notice.level) for notice in said] == [(57 * MS + 1, "watchdog")]
+    for policy, then in (("hold", 2.0), ("zero", 0.0)):
+        for sent_ns, u, trips in ((10 * MS, 2.0, False), (10 * MS - 1, then, True)):
+            driven = Driven(plant_of(scenario(policy)))
+            driven.take(0, sent_ns, 2.0)
+            driven.until(60 * MS)
+            assert (driven.u(50 * MS), driven.u(60 * MS)) == (2.0, u)
+            expected = [(60 * MS, "watchdog")] if trips else []
+            assert [(notice.t_ns, notice.level) for notice in driven.notices] == expected
 
 
 def test_the_default_timeout_is_50_controller_periods() -> None:

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import transition
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
-from noack.protocol.record_tables import (
-    tables,
-)
+from noack.protocol.record_tables import tables
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.decaying import DecayingTrigger
-from sensor_node.sensor import AcknowledgedSensor
+from sensor_node.sensor import Sensor
+from tests.machine_parts import machine, state_of
 
 MS = 1_000_000
 GRID_NS = 10 * MS
@@ -36,9 +36,9 @@ def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
     return sent, np.array([record.row], tables(2, 1, acknowledged=True)[record.table])[0]
 
 
-def sensor(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> AcknowledgedSensor:
+def sensor(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> LoopMachines:
     known = None if x0 is None else np.asarray(x0, dtype=float)
-    return AcknowledgedSensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS)
+    return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
 
 
 def test_the_acknowledgement_resets_the_error_and_the_event_does_not() -> None:
@@ -77,9 +77,8 @@ def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_tim
 
 
 def test_it_does_not_retransmit_if_the_rule_is_no_longer_met() -> None:
-    one = AcknowledgedSensor(
-        np.zeros((2, 2)), DecayingTrigger(1.0, 1e-9), np.zeros(2), timeout_ns=2 * GRID_NS
-    )
+    policy, timeout_ns = DecayingTrigger(1.0, 1e-9), 2 * GRID_NS
+    one = machine(Sensor(np.zeros((2, 2)), policy, np.zeros(2), timeout_ns=timeout_ns))
     assert split(one.handle(measurement(1, [2.0, 0.0]), 0))[0]
     assert split(one.handle(measurement(3, [0.5, 0.0]), 0))[0] == []
     assert split(one.handle(measurement(4, [2.0, 0.0]), 0))[0]
@@ -91,7 +90,7 @@ def test_the_first_measurement_is_an_event_and_x_s_is_zero_as_x_c_is() -> None:
     assert row["x_s"].tolist() == [0.0, 0.0]
     assert (row["event"], row["e_s_norm"]) == (0, pytest.approx(5**0.5))
     one.handle(acknowledgement(update), 0)
-    assert one.x_s.tolist() == [1.0, 2.0]
+    assert state_of(one, "x_s").tolist() == [1.0, 2.0]
 
 
 def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
@@ -99,15 +98,17 @@ def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
     (first,), _ = split(one.handle(measurement(1, [1.0, 0.0]), 0))
     (second,), _ = split(one.handle(measurement(2, [2.0, 0.0]), 0))
     one.handle(acknowledgement(first), 2 * GRID_NS)
-    np.testing.assert_allclose(one.x_s, transition(H, GRID_NS) @ [1.0, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(
+        state_of(one, "x_s"), transition(H, GRID_NS) @ [1.0, 0.0], rtol=1e-14
+    )
     late = Message(Flow.MEASUREMENT, 3, 2 * GRID_NS + 1, np.array([9.0, 0.0]))
     assert split(one.handle(late, 2 * GRID_NS + 1))[0] == []
     one.handle(acknowledgement(second), 2 * GRID_NS + 2)
-    np.testing.assert_allclose(one.x_s, transition(H, 1) @ [2.0, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(state_of(one, "x_s"), transition(H, 1) @ [2.0, 0.0], rtol=1e-14)
 
 
 def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
     one = sensor(x0=[1.0, 1.0])
-    before = one.x_s.copy()
+    before = state_of(one, "x_s")
     _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
     assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()

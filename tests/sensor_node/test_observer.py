@@ -1,26 +1,33 @@
 """Observers against independent formulas, and a sensor with an observer."""
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
-from sensor_node.observing_sensor import AppliedInputTracker
 
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.config.state_estimation import assumed_model, steady_state, true_model
-from noack.core.linear_systems import Vector, discretise
+from noack.core.core_library import core, ffi
+from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.machines.loop_machines import LoopMachines
 from noack.observers.estimation_model import EstimationModel
-from noack.observers.kalman import KalmanObserver
-from noack.observers.luenberger import LuenbergerObserver
+from noack.observers.kalman import KalmanSettings
+from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observability import observer_gain, unobservable_mode
+from noack.observers.observer_settings import ObserverSettings
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
-from sensor_node.sensor import sensor_of
+from noack.trigger.absolute import AbsoluteTrigger
+from sensor_node.observer import Observer
+from sensor_node.sensor import Sensor, sensor_of
+from tests.machine_parts import machine
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])
@@ -55,20 +62,49 @@ def measurement(sequence: int, t_ns: int, vector: Sequence[float]) -> Message:
     return Message(Flow.MEASUREMENT, sequence, t_ns, np.array(vector, dtype=float))
 
 
+class Estimator:
+    """The core's observer, of one input and one output."""
+
+    def __init__(self, settings: ObserverSettings, x: Vector) -> None:
+        self._memory, self.core = CoreMemory(), ffi.new("noack_observer *")
+        settings.fill(self.core, model(), x, self._memory)
+
+    def take(self, u: float, y: float) -> None:
+        """Predict with an input, and correct with a measurement."""
+        core.noack_observer_predict(self.core, 2, 1, self._memory.reals([u]))
+        core.noack_observer_correct(self.core, 2, self._memory.reals([y]))
+
+    @property
+    def x(self) -> Vector:
+        return reals_at(self.core.x, 2).copy()
+
+
+def luenberger(L: Matrix) -> LuenbergerSettings:
+    return LuenbergerSettings.model_validate_json(
+        json.dumps({"kind": "luenberger", "gain": L.tolist()})
+    )
+
+
+def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> LoopMachines:
+    """A sensor with a Luenberger observer that starts at a known estimate."""
+    start = np.array(x_hat)
+    observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
+    return machine(Sensor(np.zeros((2, 2)), AbsoluteTrigger(1.0), observer=observer))
+
+
 def test_the_kalman_filter_converges_to_the_observer_with_the_steady_gain() -> None:
     """P converges to the solution of the Riccati equation, from there on L is constant."""
-    kalman = KalmanObserver(model(), np.zeros(2), np.eye(2))
+    settings = {"kind": "kalman", "initial_std": [1.0, 1.0], "Q": Q.tolist(), "R": R.tolist()}
+    kalman = Estimator(KalmanSettings.model_validate_json(json.dumps(settings)), np.zeros(2))
     for _ in range(2000):
-        kalman.predict(np.zeros(1))
-        kalman.correct(np.zeros(1))
+        kalman.take(0.0, 0.0)
     before = solve_discrete_are(expm(A * H_NS * 1e-9).T, C.T, Q, R)
     after = np.linalg.inv(np.linalg.inv(before) + C.T @ np.linalg.inv(R) @ C)
-    np.testing.assert_allclose(kalman.covariance, after, rtol=1e-9)
-    steady = LuenbergerObserver(model(), after @ C.T @ np.linalg.inv(R), kalman.x)
-    for u, y in np.random.default_rng(1).normal(size=(20, 2, 1)):
+    np.testing.assert_allclose(reals_at(kalman.core.P, 2, 2), after, rtol=1e-9)
+    steady = Estimator(luenberger(after @ C.T @ np.linalg.inv(R)), kalman.x)
+    for u, y in np.random.default_rng(1).normal(size=(20, 2)):
         for observer in (kalman, steady):
-            observer.predict(u)
-            observer.correct(y)
+            observer.take(u, y)
         np.testing.assert_allclose(kalman.x, steady.x, rtol=1e-8)
 
 
@@ -81,16 +117,17 @@ def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
     L = observer_gain(Ad_T, C, tuple(map(complex, poles)))
     error_matrix = (np.eye(2) - L @ C) @ Ad_T
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(error_matrix)), np.sort(poles), rtol=1e-9)
-    x, x_hat = np.array([0.4, -1.0]), np.array([0.0, 0.5])
-    following = AppliedInputTracker(LuenbergerObserver(model(steps), L, x_hat), 1, 1, H_NS, 0)
-    error = following.take(0, C @ x, np.zeros(steps)) - x
+    x = np.array([0.4, -1.0])
+    sensor = observing(L, [0.0, 0.5], steps)
+    error = estimates(sensor.handle(measurement(0, 0, [*C @ x, *np.zeros(steps)]), 0)) - x
     rng = np.random.default_rng(2)
     Ad, Bd, *_ = model()
     for k in range(1, 20):
         inputs = rng.normal(size=steps)
         for u in inputs:
             x = Ad @ x + Bd @ np.array([u])
-        x_hat = following.take(k * steps * H_NS, C @ x, inputs)
+        received = measurement(k, k * steps * H_NS, [*C @ x, *inputs])
+        x_hat = estimates(sensor.handle(received, 0))
         expected = error_matrix @ error
         np.testing.assert_allclose(x_hat - x, expected, atol=1e-12)
         error = x_hat - x
@@ -113,10 +150,8 @@ def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
 
 
 def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
-    one = AppliedInputTracker(
-        LuenbergerObserver(model(2), np.zeros((2, 1)), np.ones(2)), 1, 1, H_NS, 0
-    )
-    x = one.take(5 * H_NS, np.zeros(1), np.array([0.7, -0.4]))
+    sensor = observing(np.zeros((2, 1)), [1.0, 1.0], 2)
+    x = estimates(sensor.handle(measurement(0, 5 * H_NS, [0.0, 0.7, -0.4]), 0))
     Ad, Bd, *_ = model()
     expected = np.ones(2)
     for u in (0.7, 0.7, 0.7, 0.7, -0.4):

@@ -11,11 +11,13 @@ from scipy.linalg import expm
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
+from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.decaying import DecayingTrigger
 from sensor_node.sensor import Sensor, sensor_of
+from tests.machine_parts import machine, state_of
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))
@@ -34,7 +36,7 @@ def rows(outputs: Sequence[Output], n: int) -> Any:
     return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
 
 
-def feed(sensor: Sensor, x: Callable[[float], float], until_s: float) -> list[Output]:
+def feed(sensor: LoopMachines, x: Callable[[float], float], until_s: float) -> list[Output]:
     """Measure the scalar x(t) on the grid."""
     outputs: list[Output] = []
     for k in range(round(until_s * 1e9) // GRID_NS + 1):
@@ -50,7 +52,7 @@ def next_on_grid_ns(t_s: float) -> int:
 def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
     """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
     x0, beta = 2.0, 0.3
-    sensor = Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([x0]))
+    sensor = machine(Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([x0])))
     sent = updates(feed(sensor, lambda t: x0 * math.exp(-t), 3.0))
     expected = [next_on_grid_ns(math.log(1 + beta / x0))]
     while expected[-1] <= 3_000_000_000:
@@ -62,7 +64,7 @@ def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:
     beta = 0.1
     for x, events in ((beta, 0), (math.nextafter(beta, 1), 1)):
-        sensor = Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([0.0]))
+        sensor = machine(Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([0.0])))
         assert len(updates(sensor.handle(measurement(0, 0, [x]), 0))) == events
 
 
@@ -88,7 +90,7 @@ def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
 ) -> None:
     H, W, run = system
     x0 = run[0][1] + 0.02
-    sensor = Sensor(H, DecayingTrigger(0.2, 0.5, floor, W), x0 if known else None)
+    sensor = machine(Sensor(H, DecayingTrigger(0.2, 0.5, floor, W), x0 if known else None))
     reset_ns, reset = (0, x0) if known else (0, None)
     for k, (t_ns, x) in enumerate(run):
         outputs = sensor.handle(measurement(k, t_ns, x), t_ns)
@@ -107,13 +109,12 @@ def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
             assert bool(sent) == (reset is None or error > threshold)
         assert (row["event"] != NO_SEQUENCE) == bool(sent)
         if sent:  # whether or not the packet arrives
-            assert sensor.x_s is not None
-            assert sensor.x_s.tolist() == x.tolist()
+            assert state_of(sensor, "x_s").tolist() == x.tolist()
             reset_ns, reset = t_ns, x
 
 
 def test_an_update_carries_the_measured_state_and_its_time() -> None:
-    sensor = Sensor(np.zeros((2, 2)), DecayingTrigger(0.1, 1.0))
+    sensor = machine(Sensor(np.zeros((2, 2)), DecayingTrigger(0.1, 1.0)))
     outputs: list[Output] = []
     for k, x in enumerate([[1.0, 2.0], [1.0, 2.05], [3.0, 2.0], [3.0, 7.0]]):
         outputs += sensor.handle(measurement(10 + k, k * GRID_NS, x), k * GRID_NS + 777)
@@ -138,7 +139,7 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     lateness_ns = np.sort(rng.integers(0, 5 * 10**9, 200))
     runs = []
     for late_ns in (np.zeros(200, int), lateness_ns):
-        sensor, outputs = Sensor(np.array([[-0.4]]), DecayingTrigger(0.2, 0.5)), []
+        sensor, outputs = machine(Sensor(np.array([[-0.4]]), DecayingTrigger(0.2, 0.5))), []
         for k in range(200):
             message = measurement(k, k * GRID_NS, [math.sin(3 * k * GRID_NS * 1e-9)])
             outputs += sensor.handle(message, k * GRID_NS + int(late_ns[k]))
@@ -152,7 +153,7 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
 
 
 def test_the_sensor_acts_on_measurements_only() -> None:
-    sensor = Sensor(ZOH, DecayingTrigger(0.5, 0.25))
+    sensor = machine(Sensor(ZOH, DecayingTrigger(0.5, 0.25)))
     sensor.handle(measurement(0, 0, [1.0]), 0)
     assert sensor.next_deadline_ns() is None
     assert sensor.on_timer(10**9) == ()
@@ -182,5 +183,5 @@ def test_the_sensor_of_a_scenario_uses_the_model_not_the_plant(
 
 def test_a_scenario_without_a_known_start_transmits_at_once(content: dict[str, Any]) -> None:
     sensor = sensor_of(resolve(validate(content, "here")))
-    assert sensor.x_s is None
+    assert not sensor.machines[0].knows_state
     assert len(updates(sensor.handle(measurement(0, 0, [1.0, 0.0]), 0))) == 1

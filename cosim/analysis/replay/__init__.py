@@ -3,29 +3,20 @@
 Every machine receives its recorded inputs, in the order of the ``input`` column over all its tables
 and at their recorded ``now_ns``. The replay compares
 
-* every emitted row with the recorded row, byte for byte (``machine_replay.py``), and
+* every emitted row with the recorded row, byte for byte (``input_replay.py``), and
 * every emitted message with the message that the next process recorded as received
   (``message_comparison.py``).
 
 No output depends on the exact value of ``now_ns``. So it is only checked that ``now_ns`` is not
 before the deadlines and does not decrease.
-
-The machines of a long run are compiled code where there is some; if a row differs, the single
-machines are used, which find the place.
 """
-
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 
-from cosim.analysis.replay.compiled_replay import LEAST_STEPS
-from cosim.analysis.replay.machine_replay import MachineReplay, UnequalError
+from cosim.analysis.replay.machine_replay import MachineReplay
 from cosim.analysis.replay.message_comparison import MessageComparison
 from cosim.analysis.replay.replay_result import Replay
 from cosim.record.run_record import RunRecord
-from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.topology import LOOP_ROLES
 
 __all__ = ["Replay", "replay"]
@@ -38,39 +29,18 @@ def replay(record: RunRecord) -> Replay:
     the network, or that of a loop, whose network is not replayed. The record is read part by part,
     so that memory does not grow with the length of the run.
     """
-    # A diverging run overflows and is replayed all the same.
-    with np.errstate(all="ignore"), _without_collection():
-        try:
-            is_long = not record.is_network and record.count(PLANT_STEP) >= LEAST_STEPS
-            return _replay(record, compiled=is_long)
-        except UnequalError:
-            return _replay(record, compiled=False)
-
-
-def _replay(record: RunRecord, *, compiled: bool) -> Replay:
     roles = ("netem",) if record.is_network else LOOP_ROLES
     machines = {
-        role: MachineReplay(role, record, compiled=compiled)
+        role: MachineReplay(role, record)
         for role in roles
         if record.number is None or role != "netem"
     }
     messages = None if record.is_network else MessageComparison(record, machines)
-    for part in record.slices():
-        for machine in machines.values():
-            machine.take(part)
-        if messages is not None:
-            messages.take(part)
+    with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
+        for part in record.slices():
+            for machine in machines.values():
+                machine.take(part)
+            if messages is not None:
+                messages.take(part)
     results = tuple(result for one in machines.values() for result in one.results)
     return Replay(processes=results, messages=() if messages is None else messages.results())
-
-
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """Suspend the collection of cycles: a part has many objects, but no cycles."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -1,51 +1,36 @@
-"""Replays machines from their recorded rows and compares the rows that they emit."""
+"""Replays machines from their recorded rows, generation by generation, up to the first gap."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from controller_node.controller import controller_of
-from cosim.analysis.replay.compiled_replay import compiled_machine
+from cosim.analysis.replay.input_replay import InputReplay, Numbers, table_and_row
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
-from cosim.analysis.replay.single_machine_replay import SingleMachineReplay, table_and_row
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.process_lives import Life
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
-from netem.duplex_link import network_of
+from netem.channel import Channel, channel_of
 from noack.config.loops import loops_of
 from noack.config.scenario import Scenario
-from noack.protocol.machine_interface import GENERATION, Machine, Start
+from noack.machines.loop_machines import LoopMachines
+from noack.protocol.machine_interface import GENERATION, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
 )
 from noack.protocol.topology import SENDS
-from noack.protocol.wire_format import Flow, Message
-from noack.runtime.fleet.fleet_replay import FleetReplay, Numbers, SentMessages
+from noack.protocol.wire_format import Flow
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
-_MACHINES: Mapping[str, Callable[[Scenario, Start], Machine[Any]]] = {
-    "plant": lambda scenario, _: plant_of(scenario),
+_MACHINES: Mapping[str, Callable[[Scenario, Start], LoopMachines | Channel]] = {
+    "plant": plant_of,
     "sensor": sensor_of,
-    "netem": lambda scenario, start: network_of(scenario, start, loops=len(loops_of(scenario))),
+    "netem": lambda scenario, start: channel_of(scenario, start, loops=len(loops_of(scenario))),
     "controller": controller_of,
 }
-
-
-class UnequalError(Exception):
-    """A compiled machine did not emit the recorded rows; the single machines show where."""
-
-
-def sent_messages(messages: Sequence[Message]) -> SentMessages:
-    """Return messages of one flow as arrays."""
-    return SentMessages(
-        np.array([message.sequence for message in messages], np.int64),
-        np.array([message.t_ns for message in messages], np.int64),
-        np.array([message.vector for message in messages], np.float64),
-    )
 
 
 class MachineReplay:
@@ -54,36 +39,25 @@ class MachineReplay:
     Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
-    def __init__(self, role: str, record: RunRecord, *, compiled: bool = False) -> None:
+    def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
         self._numbers = record.life_numbers(role)
-        self._lives = [
-            _LifeReplay(role, record.scenario, life, compiled=compiled)
-            for life in record.lives(role)
-        ]
-        self.sent: list[Any] = []
-        """Messages that the single machines emitted in the newest part."""
-        self._sent: list[SentMessages] = []
-        self._flow = SENDS.get(role)
+        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.lives(role)]
+        self.newest: list[InputReplay] = []
+        """The replays of the newest part; they have what was sent."""
 
     def take(self, part: Slice) -> None:
         """Replay the next part of the record."""
-        self.sent, self._sent = [], []
         places = {table: self._numbers.places(part[table]) for table in self._tables}
+        several = len(self._lives) > 1
+        self.newest = []
         for i, life in enumerate(self._lives):
-            owned = {table: part[table][places[table] == i] for table in self._tables}
+            owned = {
+                table: part[table][places[table] == i] if several else part[table]
+                for table in self._tables
+            }
             if any(map(len, owned.values())):
-                sent = life.take(owned)
-                if isinstance(sent, SentMessages):
-                    self._sent.append(sent)
-                else:
-                    self.sent += sent
-
-    def sent_in(self, flow: Flow) -> list[SentMessages]:
-        """Return the messages of a flow that the machines emitted in the newest part."""
-        found = [message for message in self.sent if message.flow is flow]
-        single = [sent_messages(found)] if found else []
-        return single + (self._sent if flow is self._flow else [])
+                self.newest += life.take(owned)
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
@@ -99,13 +73,9 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: Life, *, compiled: bool) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
         self._role, self._scenario, self._life = role, scenario, life
-        self._run: SingleMachineReplay | None = None
-        self._compiled = None
-        if compiled and not life.generation:
-            self._compiled = compiled_machine(role, scenario)
-        self._now_ns: int | None = None
+        self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
         report = life.report
         self._written = None if report is None else sum(report["rows"][one] for one in life.rows)
@@ -117,40 +87,21 @@ class _LifeReplay:
         """Rows in the parts before, by table."""
         self._stopped = False
 
-    def take(self, owned: Slice) -> list[Any] | SentMessages:
-        """Replay the next rows; return the messages that the machine emitted.
-
-        Raises:
-            UnequalError: the compiled machine did not emit these rows.
-        """
+    def take(self, owned: Slice) -> list[InputReplay]:
+        """Replay the next rows; return the replay, unless it has stopped before."""
         if self._stopped:
             return []
         order = self._in_order(owned)
-        sent: list[Any] | SentMessages
-        if self._compiled is not None:
-            taken, sent = len(order), self._take_compiled(self._compiled, owned, order)
-        else:
-            if self._run is None:
-                start = _start(self._life.generation, owned)
-                self._run = SingleMachineReplay(_MACHINES[self._role](self._scenario, start))
-            taken = self._run.replay(owned, order, self._before)
-            sent = self._run.sent
+        if self._run is None:
+            start = _start(self._life.generation, owned)
+            machine = _MACHINES[self._role](self._scenario, start)
+            self._run = InputReplay(self._role, machine, _sizes(self._role, self._scenario))
+        taken = self._run.replay(owned, order, self._before)
         self._stopped |= taken < len(order)
         self._compared += taken
         for table, rows in owned.items():
             self._before[table] += len(rows)
-        return sent
-
-    def _take_compiled(self, machine: FleetReplay, owned: Slice, order: Numbers) -> SentMessages:
-        times = np.concatenate([rows["now_ns"] for rows in owned.values()])[order]
-        before = times[:1] if self._now_ns is None else [self._now_ns]
-        sent = None
-        if (np.diff(times, prepend=before) >= 0).all():
-            sent = machine.take(owned, order)
-        if sent is None:
-            raise UnequalError
-        self._now_ns = int(times[-1]) if len(times) else self._now_ns
-        return sent
+        return [self._run]
 
     def result(self) -> ProcessReplay:
         generation, differs = (
@@ -199,6 +150,14 @@ class _LifeReplay:
             table, self._before[table] + row, int(owned[table]["now_ns"][row]),
             "the inputs are not numbered in turn", "input", int(numbers[suspect]), expected,
         )  # fmt: skip
+
+
+def _sizes(role: str, scenario: Scenario) -> Mapping[Flow, int]:
+    """Return the entries of the vectors that a machine sends, by flow."""
+    if role == "netem":
+        return {}
+    sizes = {SENDS[role]: scenario.message_sizes.entries(SENDS[role])}
+    return sizes | ({Flow.ACKNOWLEDGEMENT: 0} if role == "controller" else {})
 
 
 def _start(generation: int, owned: Slice) -> Start:

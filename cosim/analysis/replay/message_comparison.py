@@ -4,22 +4,20 @@ Every received message must be bit-identical to a sent one. Messages that were l
 are not compared.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cosim.analysis.replay.machine_replay import MachineReplay, sent_messages
-from cosim.analysis.replay.recorded_inputs import received_vectors
+from cosim.analysis.replay.input_replay import NONE_SENT, Numbers, SentMessages, received_vectors
+from cosim.analysis.replay.machine_replay import MachineReplay
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
-from noack.protocol.datagram_seal import KEY_BYTES, EncryptedSeal
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
-    PACKET_HEAD_BYTES,
     PLANT_ACTUATION,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
@@ -27,8 +25,7 @@ from noack.protocol.record_tables import (
     direction_of,
 )
 from noack.protocol.topology import ENDS
-from noack.protocol.wire_format import Encoder, Flow, Header, Message, read_header
-from noack.runtime.fleet.fleet_replay import SentMessages
+from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, Message, datagram_bytes
 
 _RECEIVED = {
     Flow.MEASUREMENT: SENSOR_MEASUREMENT,
@@ -57,10 +54,10 @@ class MessageComparison:
         netem = self._machines.get("netem")
         if netem is None:  # a loop's network is replayed with that of the other loops
             packets = part[NETEM_PACKET][part[NETEM_PACKET]["release_ns"] >= 0]
-            sent = [*zip(packets["flow"].tolist(), packets["head"].tolist(), strict=True)]
+            forwarded = [(packets["flow"], packets["head"])]
         else:
-            sent = [(one.flow, one.data) for one in netem.sent]
-        survivors = [(flow, read_header(data)) for flow, data in sent]
+            forwarded = [one.forwarded() for one in netem.newest]
+        survivors = [(flows, headers_of(heads)) for flows, heads in forwarded]
         for hop in self._hops:
             hop.take(part, survivors)
 
@@ -103,6 +100,16 @@ def _compare_changes(record: RunRecord) -> Iterator[MessagesReplay]:
         )
 
 
+def headers_of(heads: NDArray[np.void]) -> Rows:
+    """Return the headers in the first bytes of datagrams."""
+    return np.ascontiguousarray(heads).view(HEADER_ROW)
+
+
+def first_bytes(headers: Rows) -> NDArray[np.uint8]:
+    """Return the bytes of headers, (k, 32)."""
+    return headers.view(np.uint8).reshape(len(headers), HEADER_ROW.itemsize)
+
+
 class _Difference(NamedTuple):
     """The first difference of one kind."""
 
@@ -129,32 +136,31 @@ class _Hop:
         self._direction = direction_of(flow)
         self._selects = table == NETEM_PACKET and len(network) > 1
         self._was_forwarded = table != NETEM_PACKET and flow in network
-        self._sent = sent_messages([])
+        self._sent = NONE_SENT
         """Messages that may still be received, in order of their numbers."""
         self._survivors: set[int] = set()
         self._waiting: Rows | None = None
         self._newest = -1
         self._received = self._read = 0
-        self._encoder: Encoder | None = None
+        self._run: np.void | None = None
+        """Version and run number of the datagrams."""
         self._compared = 0
         # Whether a message that was not sent, or not forwarded, is a difference is known at the
         # end: then it is known whether the replay covers all messages.
         self._first: dict[str, _Difference] = {}
 
-    def take(self, part: Slice, survivors: list[tuple[int, Header | None]]) -> None:
+    def take(self, part: Slice, survivors: list[tuple[Numbers, Rows]]) -> None:
         """Add the messages sent in a part, and compare those received in the part before.
 
         By its receiver's clock, a message may be received before it was sent by its sender's, if
         they are on different hosts, and so in the part before.
         """
-        for messages in self._sender.sent_in(self._flow):
-            self._add(messages)
+        for one in self._sender.newest:
+            self._add(one.sent_in(self._flow))
         if self._was_forwarded:
-            self._survivors |= {
-                header.sequence
-                for flow, header in survivors
-                if flow == self._direction and header is not None
-            }
+            for flows, headers in survivors:
+                mine = headers[(flows == self._direction) & (headers["magic"] == MAGIC)]
+                self._survivors.update(mine["sequence"].tolist())
         self._compare_waiting()
         self._waiting = part[self._table]
 
@@ -234,28 +240,39 @@ class _Hop:
 
     def _compare_heads(self) -> None:
         """Compare the part of a datagram that netem records: its first bytes and its size."""
-        heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
-        headers = [read_header(head) for head in heads]
-        # The run number is random and recorded only here.
-        kinds = Counter((header.run_id, header.version) for header in headers if header is not None)
-        if self._encoder is None and kinds:
-            run_id, version = kinds.most_common(1)[0][0]
-            encrypted = version == EncryptedSeal.version
-            self._encoder = Encoder(run_id, bytes(KEY_BYTES), encrypted=encrypted)
-        encoder = self._encoder or Encoder(0, bytes(KEY_BYTES))
-        for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
-            sequence = -1 if header is None else header.sequence
-            self._newest = max(self._newest, sequence)
-            message = self._find(row, sequence, "head", head)
-            if message is None:
-                continue
-            self._compared += 1
-            data = encoder.encode(message._replace(loop=self._loop))
-            expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
-            if head != expected:
-                self._differs(row, "differs from the message sent", "head", head, expected)
-            elif size != len(data):
-                self._differs(row, "differs from the message sent", "size_bytes", size, len(data))
+        headers, sizes = headers_of(self._rows["head"]), self._rows["size_bytes"]
+        is_valid = headers["magic"] == MAGIC
+        if self._run is None and is_valid.any():
+            # The run number is random and recorded only here.
+            kinds, counts = np.unique(headers[is_valid][["version", "run_id"]], return_counts=True)
+            self._run = kinds[np.argmax(counts)]
+        sequences = np.where(is_valid, headers["sequence"].view(np.int64), -1)
+        self._newest = int(max(self._newest, sequences.max(initial=-1)))
+        sent = self._sent
+        places = np.searchsorted(sent.sequences, sequences, "right") - 1
+        known = (places >= 0) & (np.append(sent.sequences, 0)[places] == sequences)
+        self._compared += int(known.sum())
+        expected, at = np.zeros(len(headers), HEADER_ROW), places[known]
+        if known.any():
+            own = expected[known]
+            own["magic"], own["flow"] = MAGIC, self._flow
+            own["dimension"], own["loop"] = sent.vectors.shape[1], self._loop
+            own["version"], own["run_id"] = (0, 0) if self._run is None else self._run.tolist()
+            own["sequence"], own["t_ns"] = sent.sequences[at], sent.t_ns[at]
+            expected[known] = own
+        size_bytes = datagram_bytes(sent.vectors.shape[1])
+        differs = first_bytes(headers) != first_bytes(expected)
+        for row in np.flatnonzero(differs.any(axis=1) | (sizes != size_bytes)).tolist():
+            head, size = self._rows["head"][row].tobytes(), int(sizes[row])
+            if not known[row]:
+                kind = _CONTENT if sequences[row] < 0 else _SENT
+                self._differs(row, "was never sent", "head", head, kind=kind)
+            elif differs[row].any():
+                what = "differs from the message sent"
+                self._differs(row, what, "head", head, expected[row].tobytes())
+            else:
+                what = "differs from the message sent"
+                self._differs(row, what, "size_bytes", size, size_bytes)
 
     def _compare_flows(self) -> None:
         """Check that only the sensor's flow was forwarded."""

@@ -31,16 +31,15 @@ def check(
     """
     from cosim.output.assumptions_table import print_assumptions
     from noack.config.link_load import require_capacity
-    from noack.config.resolution import policy_of, resolve
+    from noack.config.resolution import resolve
     from noack.config.scenario_file import dumps as scenario_toml
     from noack.theory.assumptions import assumptions
-    from noack.trigger.trigger_policy import new_trigger
 
     loaded = cli.load_scenario(scenario, settings)
     if loaded.loops is not None:
         return _check_loops(loaded, json=json)
     resolved = resolve(loaded)
-    new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
+    _make_trigger(resolved)
     require_capacity(loaded)
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = cli.console()
@@ -58,6 +57,16 @@ def check(
     return ExitStatus.OK
 
 
+def _make_trigger(resolved: "Scenario") -> None:
+    """Make the trigger: some policies need a stable loop, others a user's class."""
+    from noack.config.resolution import policy_of
+    from noack.trigger.trigger_policy import CodedPolicy
+
+    policy = policy_of(resolved)
+    if isinstance(policy, CodedPolicy):
+        policy.new_trigger()
+
+
 def _check_loops(scenario: "Scenario", *, json: bool) -> int:
     """Check each loop and the bottleneck; print the scenario, which is not resolved."""
     from noack.config.link_load import (
@@ -67,13 +76,12 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
         update_delay,
     )
     from noack.config.loops import phases_ns
-    from noack.config.resolution import policy_of, resolved_loops
+    from noack.config.resolution import resolved_loops
     from noack.config.scenario_file import dumps as scenario_toml
-    from noack.trigger.trigger_policy import new_trigger
 
     loops, loads = resolved_loops(scenario), link_loads(scenario)
     for loop in loops:
-        new_trigger(policy_of(loop))
+        _make_trigger(loop)
     require_capacity(scenario)
     if json:
         cli.print_json(scenario.model_dump(mode="json"))

@@ -14,7 +14,7 @@ from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.simulation.exact_simulation import ROW as ROW
 from cosim.simulation.exact_simulation import EventLog, ExactSimulation
-from netem.link_machine import UPDATE_LINK
+from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario

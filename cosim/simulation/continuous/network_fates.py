@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from netem.link_machine import UPDATE_LINK, Link
+from netem.channel import UPDATE_LINK
+from netem.link_state import LinkState
 from noack.config.scenario import Scenario
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
@@ -23,7 +24,8 @@ def network_fates(resolved: Scenario) -> Callable[[int], bool]:
     they can be computed without sending. Delays, rate limits and blackouts do not exist in the
     paper's loop and are ignored. For ``initial_sync = "first_packet"`` update 0 is delivered.
     """
-    link = Link(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link.start_flow(0, 0)
     known: list[bool] = []
 
     def delivered(event: int) -> bool:

@@ -21,7 +21,7 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import OK
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import SampledWork
 from noack.core.clock import NS_PER_S

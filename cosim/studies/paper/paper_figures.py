@@ -17,7 +17,8 @@ from cosim.simulation.continuous.continuous_run import ContinuousRun
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.paper.draw_measures import MODES, Mode
 from cosim.studies.paper.paper_results import Results
-from netem.link_machine import UPDATE_LINK, Link
+from netem.channel import UPDATE_LINK
+from netem.link_state import LinkState
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import Fate, effective
@@ -63,7 +64,8 @@ def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
 
 def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
     """Return the network's decision for each of the first updates, (events,)."""
-    link = Link(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link.start_flow(0, 0)
     return np.array([link.decide(0, 1, 0).fate for _ in range(events)], dtype=np.int64)
 
 

@@ -125,6 +125,3 @@ class RealtimeSection(ScenarioSection):
     spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Busy-wait this long before each deadline; this takes time from other processes on the
     core."""
-    rehearse: bool = True
-    """Sensor and controller rehearse their handling of an event between two steps, so that it is in
-    the processor's caches."""

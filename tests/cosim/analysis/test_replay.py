@@ -16,13 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.replay import _replay, replay
+from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference
 from cosim.simulation.virtual_time import simulate
-from noack.config.fleet_layout import FleetRole
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load, validate
-from noack.core.linear_systems import HeldInputPropagator
+from noack.core.linear_systems import Matrix, discretise
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -35,10 +34,6 @@ from noack.protocol.record_tables import (
     SETTINGS,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.fleet.compiled_driver import compiled_replay
-from noack.runtime.fleet.compiled_fleet import CompiledFleet
-from noack.runtime.fleet.fleet_replay import replay_arguments
-from noack.runtime.native.object_code import NativeFunction
 from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
 
@@ -210,13 +205,13 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
 
 
 def test_a_changed_machine_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plant's arithmetic in another order: only the last bits differ."""
+    """The plant's matrix differs in its last bits only."""
 
-    def reordered(self: HeldInputPropagator, x: Any, u: Any, dt_ns: int) -> Any:
-        Ad, Bd = self.step(dt_ns)
-        return Bd @ u + (Ad * (1 + 1e-16)) @ (x * (1 + 2.3e-16))
+    def changed_matrix(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
+        Ad, Bd = discretise(A, B, dt_ns)
+        return np.nextafter(Ad, np.inf), Bd
 
-    monkeypatch.setattr(HeldInputPropagator, "__call__", reordered)
+    monkeypatch.setattr("plant_server.plant.discretise", changed_matrix)
     found = replay(RECORD)
     accounts = {account.process: account for account in found.processes}
     assert accounts["plant"].difference is not None
@@ -306,39 +301,3 @@ def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
     found = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
     assert found.bit_exact, found.verdict()
     assert found.verdict()["inputs"] == sum(map(len, rows.values()))
-
-
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile the machines, unless they are in the cache, and use them for every replay."""
-
-    def code_of(role: FleetRole) -> NativeFunction:
-        parts, name = role.parts_of([RECORD.scenario]), OWNER[role.on_message]
-        assert parts is not None
-        fleet = CompiledFleet(name, role, parts, RECORD.scenario, [RECORD.scenario], 0, bytes(32))
-        return compiled_replay(role, replay_arguments(fleet))
-
-    monkeypatch.setattr("cosim.analysis.replay.compiled_replay.kept_replay", code_of)
-    monkeypatch.setattr("cosim.analysis.replay.LEAST_STEPS", 1)
-
-
-@pytest.mark.usefixtures("compiled")
-def test_compiled_machines_replay_a_run_with_the_same_result() -> None:
-    assert _replay(RECORD, compiled=True) == _replay(RECORD, compiled=False)
-
-
-@pytest.mark.usefixtures("compiled")
-@pytest.mark.parametrize(
-    ("table", "column", "bit"),
-    [
-        (PLANT_STEP, "x", 3), (SENSOR_MEASUREMENT, "e_s_norm", 0), (CONTROLLER_STEP, "u", 9),
-        (CONTROLLER_DELIVERY, "dropouts", 2), (PLANT_ACTUATION, "now_ns", 40),
-        (PLANT_STEP, "now_ns", 34), (SENSOR_MEASUREMENT, "input", 5),
-    ],
-)  # fmt: skip
-def test_a_difference_to_compiled_machines_is_named_by_the_single_ones(
-    table: str, column: str, bit: int
-) -> None:
-    damaged = flipped(RECORD, table, 2, column, bit)
-    assert replay(damaged).bit_exact is False
-    assert replay(damaged) == _replay(damaged, compiled=False)

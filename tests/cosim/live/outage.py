@@ -7,16 +7,15 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
-import cosim.simulation.virtual_time
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import Network, simulate
+from netem.channel import Network
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Machine
 from noack.protocol.record_tables import PLANT_STEP
+from tests.cosim.simulation.shuttle import shuttled
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NO_OUTAGE = "none"
@@ -113,12 +112,7 @@ def simulate_with(
     network: Network | None = None,
 ) -> RunRecord:
     """Simulate a scenario with the machine of one role replaced."""
-    name = f"{role}_of"
-    build = getattr(cosim.simulation.virtual_time, name)
-    with patch.object(
-        cosim.simulation.virtual_time, name, lambda *args, **more: wrap(build(*args, **more))
-    ):
-        return simulate(resolved, network)
+    return shuttled(resolved, network, {role: wrap})
 
 
 def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:

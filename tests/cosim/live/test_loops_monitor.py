@@ -10,7 +10,7 @@ from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.live.loops_monitor import MOST_CHECKED, Finding, LoopsMonitor
 from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.loops import phases_ns
 from noack.config.resolution import tables_of
 from noack.config.scenario_file import validate

@@ -13,7 +13,7 @@ from cosim.record.loops_run import LoopsRun, loop_directories
 from cosim.record.loops_spool import finish_run_record
 from cosim.record.run_directory import REPORTS_FILE, write_scenario
 from cosim.record.run_record import Rows, RunRecord, load_record
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.resolution import network_tables, tables_of
 from noack.config.scenario_file import validate
 from noack.core.errors import MachineError

@@ -17,11 +17,10 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, identity_residual
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import Gathered, Shuttle, _report, simulate
-from netem.duplex_link import network_of
-from netem.link_machine import Datagram, update_link_of
+from cosim.simulation.virtual_time import simulate
+from netem.channel import Datagram, channel_of
 from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import loop_of, resolve, tables_of
+from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.core.errors import CallerError
@@ -36,11 +35,10 @@ from noack.protocol.record_tables import (
     SENSOR_SETTING,
     Fate,
 )
-from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Flow, Message
-from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 from tests.cosim.record.changed_records import changed
+from tests.cosim.simulation.shuttle import Shuttle
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -139,7 +137,7 @@ def test_the_plant_and_both_models_converge_to_the_set_point() -> None:
 
 def test_a_cap_lowered_during_a_burst_delivers_the_next_datagram() -> None:
     content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "worst_case"}}}
-    link = update_link_of(resolve(validate(content, "here")))
+    link = channel_of(resolve(validate(content, "here")))
     runs = []
     for number in range(12):
         if number == 5:  # one datagram was delivered, then four were lost
@@ -200,19 +198,13 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     resolved = resolve(validate(CONTENT, "here"))
     change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
-    gathered = Gathered(tables_of(resolved))
-    machines: dict[str, Any] = {
-        "plant": plant_of(resolved), "sensor": sensor_of(resolved),
-        "netem": network_of(resolved), "controller": controller_of(resolved),
-    }  # fmt: skip
-    shuttle = Shuttle(machines, [resolved.message_sizes.entries], gathered.take)
-    for now_ns in shuttle.run():
+    shuttle = Shuttle(resolved, (resolved,))
+    for now_ns in shuttle.steps():
         for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
-            shuttle._emit(role, machines[role].announce(change, now_ns))
+            machine: Any = shuttle.machines[role]
+            shuttle.emit(role, machine.announce(change, now_ns))
             del told_ns[role]
-    rows = gathered.rows()
-    reports = {role: _report(role, rows, None) for role in LOOP_ROLES}
-    record = RunRecord(resolved, rows, gathered.notices, reports, "simulated")
+    record = shuttle.record()
     assert replay(record).bit_exact
     (made,) = changes_of(record)
     assert list(made.late) == ["controller"]
@@ -244,7 +236,7 @@ def test_a_sensor_with_an_observer_applies_a_change() -> None:
     assert np.nanmax(residual) < 1e-12
 
 
-@pytest.mark.parametrize("machine_of", [sensor_of, network_of, controller_of])
+@pytest.mark.parametrize("machine_of", [sensor_of, channel_of, controller_of])
 def test_the_machines_of_the_acknowledgement_baseline_refuse_changes(
     machine_of: Callable[[Scenario], Any],
 ) -> None:

@@ -18,8 +18,6 @@ from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_record
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from netem.duplex_link import Duplex, network_of
-from netem.link_machine import Datagram, Link
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
@@ -43,6 +41,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.wire_format import Flow, read_header
 from noack.theory.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
+from tests.oracles.link import Datagram, Duplex, Link, network_of
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")

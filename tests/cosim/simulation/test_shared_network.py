@@ -9,8 +9,7 @@ from cosim.analysis.replay import replay
 from cosim.record.loop_rows import network_rows_by_loop
 from cosim.record.loops_run import LoopsRun
 from cosim.record.run_record import RunRecord
-from cosim.simulation.shared_network import simulate_loops
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import LATE
 from noack.config.resolution import resolve

@@ -9,13 +9,13 @@ import pyarrow as pa
 from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_replay import read_fates
 from netem.fates.fate_trace import METADATA, SCHEMA, description
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.tables import edited_table, written
+from tests.oracles.link import Link
 
 _LATEST_NS = 2**62
 """Later than every arrival: a century of Unix time."""

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import LinkSpec
-from netem.relay_events import EVENT
+from netem.relay_events import EVENT, Bytes, Events
 from noack.impairments.link_settings import LinkSettings
 
 T_NS = 1_767_225_600_123_456_789

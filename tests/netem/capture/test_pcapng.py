@@ -1,8 +1,8 @@
 """``reader`` reads every file; it implements the draft and the RFCs independently of the code."""
 
 import struct
+from contextlib import suppress
 from decimal import Decimal
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.capture import pcapng
-from netem.capture.packet_blocks import put_blocks
 from netem.capture.pcapng import PcapngSection
 from netem.engine.relay_interface import DIRECTIONS
+from netem.relay_events import EVENT
 from noack.protocol.record_tables import Fate
 from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
 from tests.netem.capture.reader import Datagram, datagram, read
@@ -152,24 +151,41 @@ def test_the_largest_datagram_fits(family: int, most: int) -> None:
     file = read(section.header() + bytes(section.packets(table, data)))
     assert len(datagram(file.packets[0].frame).payload) == most
     table["size_bytes"] += 1
-    with pytest.raises(ValueError, match=r"event 0 .* is impossible"):
+    with pytest.raises(ValueError, match="too large for a datagram"):
         section.packets(table, np.append(data, np.uint8(0)))
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
+    ("field", "value", "text"),
     [
-        ("interface", 2), ("t_ns", -1), ("family", 0), ("size_bytes", 8),
-        ("offset", 19), ("offset", 2**63), ("offset", 2**64 - 1),
+        ("interface", 2, "an interface that does not exist"), ("t_ns", -1, "before 1970"),
+        ("family", 0, "neither of IPv4 nor of IPv6"), ("size_bytes", 8, "outside the data"),
+        ("size_bytes", 2**32 - 1, "too large"), ("offset", 19, "outside the data"),
+        ("offset", 2**63, "outside the data"), ("offset", 2**64 - 1, "outside the data"),
     ],
 )  # fmt: skip
-def test_an_impossible_event_is_refused(field: str, value: int) -> None:
+def test_an_impossible_event_is_refused(field: str, value: int, text: str) -> None:
     table, data = batch({}, {})
     table, data = table[:1], data[:18]
     PcapngSection(INTERFACES).packets(table, data)
     table[field] = value
-    with pytest.raises(ValueError, match="event 0 of a batch is impossible"):
+    with pytest.raises(ValueError, match=f"a batch is impossible: .*{text}"):
         PcapngSection(INTERFACES).packets(table, data)
+
+
+@given(events, st.data())
+def test_events_of_any_numbers_are_refused_or_written(
+    described: dict[str, Any], data: st.DataObject
+) -> None:
+    table, payload = batch({}, described)
+    fields = data.draw(st.lists(st.sampled_from(EVENT.names), max_size=3, unique=True))
+    for name in fields:
+        low, high = (getattr(np.iinfo(EVENT[name].base), end) for end in ("min", "max"))
+        table[name][1] = data.draw(st.one_of(st.integers(0, 8), st.integers(low, high)))
+    section = PcapngSection(INTERFACES)
+    with suppress(ValueError):
+        packets = read(section.header() + bytes(section.packets(table, payload))).packets
+        assert packets[1].comment.endswith(f", packet {table['packet'][1]}")
 
 
 def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
@@ -191,24 +207,3 @@ def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
         ends = [struct.unpack("<II", options[code][0]) for code in (2, 3)]
         assert [high << 32 | low for high, low in ends] == [T_NS, T_NS + 7]
         assert t_ns == T_NS + 7
-
-
-def test_formatting_releases_the_gil() -> None:
-    assert put_blocks.targetoptions["nogil"]  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("kept", [True, False])
-def test_a_wait_for_the_compiler_is_explained(
-    kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It shows the typical duration or, if known, the last one, even of other source versions."""
-    monkeypatch.setattr(pcapng, "is_kept", lambda folder, function: kept)
-    for digest, about_s in (("0", 10), ("1", 42)):
-        monkeypatch.setattr(pcapng, "FOLDER", tmp_path / f"capture-{digest}")
-        PcapngSection([("a", "b")])
-        line = (
-            "noack netem: compiling the capture for this machine, once; "
-            f"this takes about {about_s} s\n"
-        )
-        assert capsys.readouterr().err == ("" if kept else line)
-        (tmp_path / "capture.seconds").write_text("42.4\n")

@@ -14,7 +14,7 @@ from netem.engine.relay_memory import RelayMemory, name_array
 from netem.engine.relay_sockets import socket_name, unpacked_address
 from netem.words.words_to_settings import settings_of
 from noack.core.core_library import core, pointer_to
-from noack.runtime.native.socket_structs import packed_name
+from noack.runtime.address import packed_name
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running
 
 ROWS, PLACES = 24, 32

@@ -12,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.duplex_link import network_of
 from netem.engine.run_network import RunNetwork
-from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolve
@@ -27,6 +25,7 @@ from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.wire_format import Flow
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of
+from tests.oracles.link import Datagram, network_of
 
 NEVER_NS = 2**61
 Arrival = tuple[int, int, int]

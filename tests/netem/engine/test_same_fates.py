@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from netem.engine.relay_interface import LinkSpec
-from netem.link_machine import Datagram, Link
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
+from tests.oracles.link import Datagram, Link
 
 CLIENTS = 3
 DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_bit")

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
-from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
 from noack.core.core_library import ffi
 from noack.impairments.link_settings import LinkSettings
+from tests.oracles.link import Datagram, Link
 
 MAX_GAP_NS = 3_000_000
 

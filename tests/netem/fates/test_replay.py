@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.fates.fate_replay import read_fates
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.netem.any_settings import harsh as settings
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record
+from tests.oracles.link import Link
 
 BAD = settings_of(
     "loss gemodel 20% 40% duplicate 40% corrupt 40% delay 100us 100us rate 50mbit queue 3 "

@@ -51,7 +51,7 @@ class Emulator:
         assert status == 0, stderr
         for line in stderr.splitlines():
             # A program may end with datagrams to it in flight.
-            usual = ("compiling", "Ctrl-C ends", "ICMP port unreachable")
+            usual = ("Ctrl-C ends", "ICMP port unreachable")
             assert any(words in line for words in usual), stderr
         return link
 

@@ -21,9 +21,9 @@ from dnslib import RR, DNSRecord
 from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 
 from netem.cli.emulator_options import LINK_NAME
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from tests.netem.programs.conftest import FORWARDED, Emulate
+from tests.oracles.link import Link
 
 TIMEOUT_S = 0.03
 """Timeout of a try. A later answer costs another try but carries the number of its own try."""

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.link_settings import read_files
+from tests.oracles.link import Link
 
 NS = 10**9
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of, text_of
 from noack.impairments.disciplines.codel import Codel
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import predict
+from tests.oracles.link import Link
 
 MS = 10**6
 RATE_BPS = 8_000_000

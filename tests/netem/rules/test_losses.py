@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
+from tests.oracles.link import Link
 
 COUNT = 400_000
 Joint = Callable[[int], float]

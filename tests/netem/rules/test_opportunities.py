@@ -7,9 +7,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.link_machine import Link
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
+from tests.oracles.link import Link
 
 MS = 10**6
 OVERHEAD_BYTES = 32

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.traces.trace_formats import read_trace
+from tests.oracles.link import Link
 
 CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
 MS = 10**6

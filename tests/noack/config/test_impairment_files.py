@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import tomli_w
 
-from netem.link_machine import Link
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
@@ -19,6 +18,7 @@ from noack.impairments.link_settings import LinkSettings, read_files
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.record_tables import Fate
+from tests.oracles.link import Link
 
 
 def read_delay(folder: Path, **settings: Any) -> Delay:

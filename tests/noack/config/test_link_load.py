@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.simulation.shared_network import simulate_loops
-from netem.link_machine import Datagram, Link
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.link_load import link_loads, load_warnings, require_capacity, update_delay
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
@@ -22,6 +21,7 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import require_scores
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
+from tests.oracles.link import Datagram, Link
 
 PERIODIC = {"policy": "periodic", "period_s": 0.05}
 BITS = 8 * (datagram_bytes(2) + 28)

@@ -1,10 +1,14 @@
 from fractions import Fraction
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.clock import RunClock, SlewedRunClock
+from noack.core.clock_offset import ClockOffset, Exchange
+from noack.core.core_library import core, ffi
+from noack.core.slewed_clock import SlewedClock
 
 EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])
@@ -33,12 +37,21 @@ def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
     assert times == sorted(times)
 
 
+def in_core(clock: RunClock) -> Any:
+    """Return the clock in the core."""
+    made = ffi.new("noack_clock *")
+    clock.set_core(made)
+    return made
+
+
 @given(speeds, st.integers(0, 10**12), st.integers(0, 10**13))
 def test_the_computed_wait_ends_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
-    wait_s = clock_at(speed, wall_ns).wall_s_until(t_ns)
-    assert (wait_s > 0) == (t_ns > wall_ns * Fraction(speed)) or abs(wait_s) < 1e-9
-    # Within half a nanosecond of wall time plus the rounding of times of up to 10¹⁵ ns.
-    assert abs(clock_at(speed, wall_ns + round(wait_s * 1e9)).now_ns() - t_ns) <= 2 + speed
+    now_ns = clock_at(speed, wall_ns).now_ns()
+    wait_ns = core.noack_clock_wait_ns(in_core(clock_at(speed, wall_ns)), t_ns - now_ns)
+    assert (wait_ns > 0) == (t_ns > now_ns) or 0 <= t_ns - now_ns <= speed
+    if wait_ns > 0:
+        # Within a nanosecond of wall time plus the rounding of times of up to 10¹⁵ ns.
+        assert abs(clock_at(speed, wall_ns + wait_ns).now_ns() - t_ns) <= 2 + 2 * speed
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
@@ -47,21 +60,49 @@ def test_a_speed_that_is_not_positive_is_refused(speed: float) -> None:
         RunClock(EPOCH_NS, speed)
 
 
-@given(speeds, st.integers(0, 10**12), st.integers(0, 10**13), st.floats(1, 1.2), st.floats(0.8, 1))
+slews = st.integers(1_300_000, 10**9 - 1)
+
+
+def slewed_clock(begin_ns: int, offset_ns: int, target_ns: int, slew_ppb: int) -> SlewedClock:
+    """A clock that has one offset and moves to another one."""
+    offset = ClockOffset()
+    offset.add(Exchange(begin_ns, begin_ns + offset_ns, begin_ns + offset_ns, begin_ns))
+    clock = SlewedClock(offset, begin_ns, slew_ppb)
+    sent_ns = begin_ns + 10**9
+    offset.add(Exchange(sent_ns, sent_ns + target_ns, sent_ns + target_ns, sent_ns))
+    clock.follow(sent_ns)
+    return clock
+
+
+@given(speeds, st.integers(0, 10**12), st.integers(0, 10**13), slews, st.booleans())
 def test_a_wait_on_a_slewed_clock_is_never_too_long(
-    speed: float, wall_ns: int, t_ns: int, fastest: float, share: float
+    speed: float, wall_ns: int, wanted_ns: int, slew_ppb: int, ahead: bool
 ) -> None:
-    readings = [EPOCH_NS + wall_ns]
-    clock = SlewedRunClock(EPOCH_NS, speed, lambda: readings[-1], fastest)
-    assert clock.now_ns() == clock_at(speed, wall_ns).now_ns()
-    direct_s, wait_s = clock_at(speed, wall_ns).wall_s_until(t_ns), clock.wall_s_until(t_ns)
-    assert wait_s <= direct_s if direct_s > 0 else wait_s == direct_s
-    if wait_s > 0:
-        readings.append(readings[0] + int(wait_s * 1e9 * fastest * share))
-        # The rounding of times of up to 10¹⁵ ns, as above.
-        assert clock.now_ns() <= t_ns + 2 + speed
+    slewed = slewed_clock(wall_ns, 0, 10**13 if ahead else -(10**13), slew_ppb)
+    readings = [wall_ns + 10**9]
+    clock = SlewedRunClock(slewed.now_ns(readings[0]), speed, slewed, lambda: readings[-1])
+    wait_ns = core.noack_clock_wait_ns(in_core(clock), wanted_ns)
+    assert wait_ns <= wanted_ns / speed
+    readings.append(readings[0] + wait_ns)
+    # The rounding of times of up to 10¹⁵ ns, as above.
+    assert clock.now_ns() <= wanted_ns + 2 + 2 * speed
 
 
-def test_a_rate_below_that_of_waits_is_refused() -> None:
-    with pytest.raises(ValueError, match="largest rate must be at least 1"):
-        SlewedRunClock(EPOCH_NS, 1.0, lambda: 0, 0.9)
+@given(
+    speeds, st.integers(0, 10**12), st.integers(-(10**14), 10**14), st.integers(-(10**9), 10**9),
+    slews, st.lists(st.integers(0, 10**15), min_size=1, max_size=9),
+)  # fmt: skip
+def test_the_core_reads_the_same_clocks(
+    speed: float, begin_ns: int, offset_ns: int, jump_ns: int, slew_ppb: int, waits: list[int]
+) -> None:
+    slewed = slewed_clock(begin_ns, offset_ns, offset_ns + jump_ns, slew_ppb)
+    readings = [begin_ns + 10**9]
+    own: RunClock = RunClock(begin_ns, speed, lambda: readings[-1])
+    other: RunClock = SlewedRunClock(begin_ns + offset_ns, speed, slewed, lambda: readings[-1])
+    for clock in (own, other):
+        other_clock, found = in_core(clock), []
+        for wait_ns in sorted(waits):
+            readings.append(readings[0] + wait_ns)
+            found.append(core.noack_clock_at_ns(other_clock, readings[-1]))
+            assert found[-1] == clock.now_ns()
+        assert found == sorted(found)

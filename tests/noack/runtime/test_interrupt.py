@@ -32,7 +32,7 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
     "words",
     [
         ["cosim.cli", "typer", "--version"],
-        ["netem", "netem.duplex_link", "--help"],
+        ["netem", "netem.channel", "--help"],
         ["plant_server", "noack.runtime.process_entry", "--help"],
     ],
 )

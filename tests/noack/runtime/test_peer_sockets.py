@@ -1,28 +1,28 @@
 """Datagrams from unknown sources: separated by the kernel, read within bounds, counted."""
 
-import select
 import socket
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from typing import Any
 
-import numpy as np
 import pytest
 
-from noack.protocol.machine_interface import Notice
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
+from noack.core.errors import PeerError
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK
+from noack.runtime.live_driver import LoopChannel
 from noack.runtime.peer_sockets import (
     IN_A_FLOOD,
     IN_AN_INTERVAL,
     FloodWatch,
     SourceCount,
+    enlarge_buffer,
     open_beside,
 )
-from noack.runtime.udp_sockets import SHED, MessageSocket, bind
-
-RUN_ID, KEY = 7, bytes(range(32))
+from noack.runtime.udp_sockets import SHED, bind
+from tests.noack.runtime.live_loops import Live, measurement, scenario
 
 
 def opened() -> socket.socket:
@@ -30,44 +30,6 @@ def opened() -> socket.socket:
     endpoint.bind((LOOPBACK, 0))
     endpoint.setblocking(False)
     return endpoint
-
-
-class Ear:
-    """A sensor's socket, which receives measurements of two entries from ``peer``."""
-
-    def __init__(self, peer: socket.socket, endpoint: socket.socket | None = None) -> None:
-        self._endpoint = bind(0, "port") if endpoint is None else endpoint
-        self.decoder = Decoder(Flow.MEASUREMENT, 2, RUN_ID, KEY)
-        self.encoder = Encoder(RUN_ID, KEY)
-        self.address = self._endpoint.getsockname()
-        self.channel = MessageSocket(
-            self._endpoint, self.decoder, self.encoder, Flow.UPDATE,
-            source=peer.getsockname(), destination=peer.getsockname(),
-        )  # fmt: skip
-        self.lines: list[Notice] = []
-
-    @staticmethod
-    def message(sequence: int) -> Message:
-        return Message(Flow.MEASUREMENT, sequence, sequence, np.array([1.0, 2.0]))
-
-    def turns(self, most: int) -> list[int]:
-        """Call the socket as the loop does, at most ``most`` times; return the sequence numbers."""
-        received = []
-        for _ in range(most):
-            readable, _, _ = select.select(self.channel.watched, (), (), 0)
-            if not readable:
-                break
-            message = self.channel.receive(readable[0])
-            if message is not None:
-                received.append(message.sequence)
-        return received
-
-    def tend(self) -> None:
-        self.lines += self.channel.tend(0)
-
-    def close(self) -> None:
-        self.channel.close()
-        self._endpoint.close()
 
 
 BEGUN, OVER = "flood:", "the flood is over:"
@@ -140,27 +102,6 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-@pytest.fixture
-def peer(stack: ExitStack) -> socket.socket:
-    return stack.enter_context(opened())
-
-
-@pytest.fixture
-def stranger(stack: ExitStack) -> socket.socket:
-    return stack.enter_context(opened())
-
-
-@pytest.fixture
-def ear(stack: ExitStack, peer: socket.socket) -> Ear:
-    return stack.enter_context(closing(Ear(peer)))
-
-
-needs_linux = pytest.mark.skipif(
-    sys.platform != "linux", reason="only Linux keeps strangers' datagrams apart"
-)
-
-
-@needs_linux
 def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack: ExitStack) -> None:
     endpoint, first, second, stranger = (stack.enter_context(opened()) for _ in range(4))
     beside = open_beside(endpoint, [first.getsockname(), second.getsockname()])
@@ -181,82 +122,84 @@ def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack:
             thief.bind(endpoint.getsockname())
 
 
-@needs_linux
-def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(
-    ear: Ear, peer: socket.socket, stranger: socket.socket
-) -> None:
-    stranger_sent = 0
-    for round_ in range(10):
-        for _ in range(1000):
-            stranger.sendto(b"x" * 80, ear.address)
-        peer.sendto(ear.encoder.encode(ear.message(round_)), ear.address)
-        stranger_sent += 1000
-        assert ear.turns(300) == [round_]
-        ear.tend()
-    report = ear.channel.report()
-    rejected = report["rejected"]
-    assert isinstance(rejected, dict)
+def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[str, Any]) -> None:
+    with closing(Live("sensor", [scenario(content)])) as live:
+        sent = 0
+        for round_ in range(10):
+            for _ in range(1000):
+                live.other.sendto(b"x" * 80, live.address)
+            sent += 1000
+            live.send(measurement(round_, [1.0, 0.0]))
+            live.drive_until_accepted(round_ + 1)
+            live.channel.tend(0, live.rows)
+        live.channel.finish(0, live.rows)
+        report = live.channel.report()
+    rejected: Any = report["rejected"]
     assert rejected[SHED] > 5000
-    assert sum(rejected.values()) == stranger_sent
+    assert sum(rejected.values()) == sent
     assert report["accepted"] == 10
     assert report["lost_in_kernel"] == 0
-    assert report["peer_sockets"] is True
-    assert [line.text.split(":")[0] for line in ear.lines] == ["flood"]
+    assert [line.text.split(":")[0] for line in live.rows.notices] == ["flood"]
 
 
-@needs_linux
-def test_a_peer_is_read_before_unknown_sources(
-    ear: Ear, peer: socket.socket, stranger: socket.socket
-) -> None:
-    ear.tend()
-    for _ in range(50):
-        stranger.sendto(b"", ear.address)
-    peer.sendto(ear.encoder.encode(ear.message(0)), ear.address)
-    assert ear.turns(1) == [0]
-
-
-@needs_linux
-def test_work_between_two_clock_readings_is_bounded(ear: Ear, peer: socket.socket) -> None:
-    """Forged sources put junk into the peer's socket; here the peer itself sends the junk."""
-    for _ in range(100):
-        peer.sendto(b"x", ear.address)
-    assert ear.turns(1) == []
-    assert 0 < ear.decoder.rejected[Rejection.LENGTH] <= 16
-
-
-def test_datagrams_before_the_peer_sockets_are_read_first(
-    stack: ExitStack, peer: socket.socket
-) -> None:
+def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any]) -> None:
     """A restarted process receives datagrams before it has a socket per peer."""
-    endpoint = stack.enter_context(bind(0, "port"))
-    encoder, early = Encoder(RUN_ID, KEY), 2 * IN_AN_INTERVAL
-    for sequence in range(early):
-        peer.sendto(encoder.encode(Ear.message(sequence)), endpoint.getsockname())
-    ear = stack.enter_context(closing(Ear(peer, endpoint)))
-    peer.sendto(encoder.encode(ear.message(early)), ear.address)
-    assert ear.turns(2 * early) == list(range(early + 1))
-    ear.tend()
-    assert ear.lines == []
+    early = 9000  # more than Python reads in one turn later
+
+    def before(live: Live) -> None:
+        enlarge_buffer(live.endpoint, 256 * 1024 * 1024)
+        live.send(*(measurement(number, [1.0, 0.0]) for number in range(early)))
+
+    with closing(Live("sensor", [scenario(content)], early=before)) as live:
+        live.send(measurement(early, [1.0, 0.0]))
+        live.channel.tend(0, live.rows)
+        assert live.driver.accepted == early
+        live.drive_until_accepted(early + 1)
+        assert not any(live.driver.rejected.values())
+        assert live.rows.notices == []
+        numbers = [row[1] for row in live.rows.tables[SENSOR_MEASUREMENT]]
+        assert numbers == list(range(early + 1))
 
 
-def test_the_loop_receives_without_peer_sockets(
-    stack: ExitStack,
-    peer: socket.socket,
-    stranger: socket.socket,
-    monkeypatch: pytest.MonkeyPatch,
+def test_of_strangers_datagrams_python_reads_a_bounded_number_at_a_turn(
+    content: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
-    ear = stack.enter_context(closing(Ear(peer)))
-    for _ in range(100):
-        stranger.sendto(ear.encoder.encode(ear.message(7)), ear.address)
-    peer.sendto(ear.encoder.encode(ear.message(0)), ear.address)
-    assert ear.turns(30) == [0]
-    ear.tend()
-    report = ear.channel.report()
+    """Datagrams may come faster than Python reads them: it must not read until there are none."""
+    with closing(Live("sensor", [scenario(content)])) as live:
+        taken = list[bytes]()
+
+        def take(data: bytes, *_: Any) -> None:
+            taken.append(data)
+            live.other.sendto(b"y", live.address)
+
+        monkeypatch.setattr(live.channel, "take", take)
+        live.other.sendto(b"x", live.address)
+        live.channel.tend(0, live.rows)
+        assert len(taken) == IN_AN_INTERVAL
+
+
+def test_authentic_datagrams_of_others_are_replays(content: dict[str, Any]) -> None:
+    with closing(Live("sensor", [scenario(content)])) as live:
+        for number in range(100):
+            live.send(measurement(number, [1.0, 0.0]), by=live.other)
+        live.send(measurement(0, [1.0, 0.0]))
+        live.drive_until_accepted(1)
+        live.channel.finish(0, live.rows)
+        report = live.channel.report()
+        names = ["{}:{}".format(*one.getsockname()) for one in (live.peer, live.other)]
     assert report["rejected"] == {"source": 100}
-    assert report["peer_sockets"] is False
-    assert report["lost_in_kernel"] == 0
-    assert ear.lines == []
+    assert report["received_from"] == dict(zip(names, (1, 100), strict=True))
+    assert live.rows.notices == []
+
+
+def test_a_process_needs_a_socket_for_each_peer(
+    content: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = (LOOPBACK, 9)
+    with closing(Live("sensor", [scenario(content)])) as live, closing(bind(0, "port")) as endpoint:
+        monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
+        with pytest.raises(PeerError, match="refused to open a socket for each peer"):
+            LoopChannel(endpoint, live.driver, Flow.UPDATE, source=own, destination=own)
 
 
 def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
@@ -277,7 +220,6 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     assert count.report() == report
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has peer sockets")
 def test_a_peer_socket_has_the_receive_buffer_of_the_first_one_from_the_start() -> None:
     with ExitStack() as stack:
         endpoint = stack.enter_context(bind(0, "port"))

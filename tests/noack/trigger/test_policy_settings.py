@@ -14,7 +14,7 @@ from noack.core.errors import CallerError
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_condition import QuadraticForm
-from noack.trigger.trigger_policy import Trigger
+from tests.noack.trigger.core_trigger import CoreTrigger
 
 DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
 RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
@@ -37,27 +37,29 @@ def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_a_block_of_measurements_gives_the_same_event_as_single_ones(
+def test_the_core_decides_by_the_rules_condition(
     content: dict[str, Any], name: str, seed: int
 ) -> None:
     table = EXAMPLES[name].model_dump(mode="json", exclude_none=True)
     policy = policy_of(resolve(validate(content | {"trigger": table}, "here")))
-    at_once, one_by_one = Trigger(policy), Trigger(policy)
-    t_ns, z = samples(seed, 400)
-    start = np.array([0.5, -0.3])
-    for trigger in (at_once, one_by_one):
-        trigger.start(0, start)
-    decisions = (one_by_one.test(int(t), x[:N], x[N:]) for t, x in zip(t_ns, z, strict=True))
-    expected = next((k for k, decision in enumerate(decisions) if decision.event), None)
-    found = None
-    # in blocks: accumulated quantities continue from block to block
-    for begin in range(0, len(z), 32):
-        block = slice(begin, begin + 32)
-        k = at_once.first_event(t_ns[block], z[block, :N], z[block, N:])
-        if k is not None:
-            found = begin + k
+    trigger, start = CoreTrigger(policy, N), np.array([0.5, -0.3])
+    trigger.start(0, start)
+    condition = policy.trigger_rule(N).after(0, start)
+    auxiliary, rate = policy.initial_dynamic_variable, 0.0
+    if condition.has_auxiliary:
+        (rate,) = condition.auxiliary_rates(np.array([[*start, 0.0, 0.0]])).tolist()
+    for t_ns, z in zip(*samples(seed, 400), strict=True):
+        found = trigger.test(int(t_ns), z[:N], z[N:])
+        if condition.has_auxiliary:
+            (last,) = condition.auxiliary_rates(z[None]).tolist()
+            auxiliary, rate = condition.auxiliary_after(0.01, auxiliary, rate, last), last
+        sides = condition.sides(int(t_ns), z[:N], z[N:], auxiliary)
+        assert (found.left, found.right) == pytest.approx(sides, rel=1e-9, abs=1e-12)
+        if abs(sides.left - sides.right) > 1e-9:
+            exceeds = sides.left > sides.right and condition.counts_at(int(t_ns))
+            assert found.event == (exceeds or t_ns >= condition.latest_ns)
+        if found.event:
             break
-    assert found == expected
 
 
 def nested(rule: dict[str, Any]) -> dict[str, Any]:

@@ -12,15 +12,15 @@ from cosim.simulation.batch.batch_status import OK
 from cosim.simulation.continuous.continuous_run import ContinuousRun
 from noack.trigger.dwell import DwellTrigger
 from noack.trigger.send_on_area import SendOnAreaTrigger
-from noack.trigger.trigger_policy import Trigger
 from tests.cosim.simulation.batch.exact import one, random_population, random_setting, reference
+from tests.noack.trigger.core_trigger import CoreTrigger
 
 MS = 1_000_000
 W = np.array([[2.0, 0.5], [0.0, 1.0]])
 
 
 def test_a_live_sensor_sums_trapezoids_and_restarts_at_an_event() -> None:
-    trigger, x = Trigger(SendOnAreaTrigger(0.1, W)), np.ones(2)
+    trigger, x = CoreTrigger(SendOnAreaTrigger(0.1, W), 2), np.ones(2)
     trigger.start(0, x)
     since_ms, area, last, events = 0, 0.0, 0.0, []
     for t_ms in range(2, 2000, 2):

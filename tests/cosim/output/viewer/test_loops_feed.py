@@ -14,7 +14,7 @@ from cosim.record.align import align_tables
 from cosim.record.loops_run import LoopsRun
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.shipped_files import find_shipped
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET

@@ -23,7 +23,7 @@ from cosim.record.environment import write_environment
 from cosim.record.loops_run import LoopsRun, write_loops
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
 from cosim.shipped_files import find_shipped
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import NETEM_PACKET
 from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series

@@ -16,7 +16,6 @@ from cosim.simulation.batch.batch_interface import (
 from cosim.simulation.batch.batch_status import OK
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
-from netem.link_machine import UPDATE_LINK, Link
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
@@ -32,6 +31,7 @@ from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from noack.trigger.decaying import DecayingTrigger
+from tests.oracles.link import UPDATE_LINK, Link
 
 LOSSES = (
     NoLoss(),

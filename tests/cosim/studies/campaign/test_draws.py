@@ -8,13 +8,13 @@ import pytest
 from cosim.simulation.batch.batch_interface import run_batch
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
-from netem.link_machine import update_link_of
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
 from tests.cosim.studies.campaign.conftest import Few
+from tests.oracles.link import update_link_of
 
 
 def with_plant(scenario: Scenario, **changed: object) -> Scenario:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.run_summary import summarise
-from cosim.simulation.shared_network import simulate_loops
+from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.campaign_grid import grid, row_type
 from cosim.studies.campaign.loops_draws import LOOPS_ROW, LoopsWork
 from cosim.studies.campaign.random_draws import seeds_of

@@ -1,0 +1,147 @@
+/* A peer of the latency benchmark: a ping through a relay, in C, with the settings of a run.
+ *
+ * ping COUNT PERIOD_NS PRIORITY sends COUNT datagrams of 72 bytes on loopback, one every PERIOD_NS.
+ * Sender, relay and receiver are processes; relay and receiver block in recv. Writes the one-way
+ * latencies, int64_t in ns, to standard output: from the reading of the clock before the sender's
+ * send to that after the receiver's recv. PRIORITY is the receiver's SCHED_FIFO priority; with 0
+ * the processes have no real-time settings. Standard error names the settings that were refused.
+ */
+#define _GNU_SOURCE
+#include <arpa/inet.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <sched.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
+#include <sys/wait.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { PING_BYTES = 72, NS_PER_S = 1000000000, SETTLE_NS = 300000000 };
+enum { SENDER = 1, RELAY, RECEIVER }; /* places along the loop: sensor, emulator, controller */
+
+static void require(int succeeded, const char *what) {
+    if (!succeeded) {
+        perror(what);
+        exit(1);
+    }
+}
+
+static void request(const char *setting, int succeeded) {
+    if (!succeeded)
+        fprintf(stderr, "%s: not permitted: %s\n", setting, strerror(errno));
+}
+
+/* The settings of noack/runtime/real_time_settings.py. */
+static void apply_settings(int priority, int place) {
+    if (priority == 0)
+        return;
+    request("memory_lock", mlockall(MCL_CURRENT | MCL_FUTURE) == 0);
+    request("timer_slack", prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0);
+    int rank = priority - RECEIVER + place, number = -1;
+    struct sched_param parameters = {.sched_priority = rank > 1 ? rank : 1};
+    request("sched_fifo", sched_setscheduler(0, SCHED_FIFO, &parameters) == 0);
+    cpu_set_t all, second;
+    sched_getaffinity(0, sizeof all, &all);
+    for (size_t core = 0; core < CPU_SETSIZE && number < 1; core++) {
+        if (CPU_ISSET(core, &all)) {
+            CPU_ZERO(&second);
+            CPU_SET(core, &second);
+            number++;
+        }
+    }
+    request("affinity", number == 1 && sched_setaffinity(0, sizeof second, &second) == 0);
+    int32_t longest_us = 0, file = open("/dev/cpu_dma_latency", O_WRONLY); /* stays open */
+    request("cpu_dma_latency", file >= 0 && write(file, &longest_us, sizeof longest_us) > 0);
+}
+
+static int64_t now_ns(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
+}
+
+static void sleep_until(int64_t t_ns) {
+    struct timespec until = {.tv_sec = t_ns / NS_PER_S, .tv_nsec = t_ns % NS_PER_S};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR)
+        ;
+}
+
+static int udp_socket(void) {
+    struct sockaddr_in address = {.sin_family = AF_INET};
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    int endpoint = socket(AF_INET, SOCK_DGRAM, 0);
+    require(
+        endpoint >= 0 && bind(endpoint, (struct sockaddr *)&address, sizeof address) == 0, "bind");
+    return endpoint;
+}
+
+static void connect_to(int from, int to) {
+    struct sockaddr_in address;
+    socklen_t size = sizeof address;
+    getsockname(to, (struct sockaddr *)&address, &size);
+    require(connect(from, (struct sockaddr *)&address, size) == 0, "connect");
+}
+
+static void relay(int in, int out) {
+    char data[PING_BYTES];
+    for (ssize_t size = 1; size > 0;) { /* an empty datagram ends a process */
+        size = recv(in, data, sizeof data, 0);
+        send(out, data, (size_t)size, 0);
+    }
+}
+
+static void receive(int in, long count) {
+    int64_t data[PING_BYTES / 8], *latencies_ns = calloc((size_t)count, sizeof *latencies_ns);
+    long received = 0;
+    require(latencies_ns != NULL, "calloc");
+    while (recv(in, data, sizeof data, 0) > 0 && received < count)
+        latencies_ns[received++] = now_ns() - data[0];
+    fwrite(latencies_ns, sizeof *latencies_ns, (size_t)received, stdout);
+    require(fflush(stdout) == 0, "write");
+}
+
+static void send_all(int out, long count, int64_t period_ns) {
+    int64_t data[PING_BYTES / 8] = {0}, begin_ns = now_ns() + SETTLE_NS;
+    for (long number = 0; number < count; number++) {
+        sleep_until(begin_ns + number * period_ns);
+        data[0] = now_ns();
+        send(out, data, sizeof data, 0);
+    }
+    sleep_until(now_ns() + SETTLE_NS);
+    send(out, data, 0, 0);
+}
+
+int main(int argc, char **argv) {
+    require(argc == 4, "usage: ping COUNT PERIOD_NS PRIORITY");
+    long count = atol(argv[1]);
+    int64_t period_ns = atoll(argv[2]);
+    int priority = atoi(argv[3]), failed = 0;
+    int receiver_in = udp_socket(), relay_in = udp_socket(), relay_out = udp_socket();
+    int sender_out = udp_socket();
+    connect_to(relay_out, receiver_in);
+    connect_to(sender_out, relay_in);
+    for (int place = RECEIVER; place >= SENDER; place--) {
+        pid_t child = fork();
+        require(child >= 0, "fork");
+        if (child > 0)
+            continue;
+        apply_settings(priority, place);
+        if (place == RECEIVER)
+            receive(receiver_in, count);
+        else if (place == RELAY)
+            relay(relay_in, relay_out);
+        else
+            send_all(sender_out, count, period_ns);
+        return 0;
+    }
+    for (int status; wait(&status) > 0;)
+        failed |= status != 0;
+    return failed;
+}

@@ -1,0 +1,151 @@
+/* The network of a run as a machine without sockets: both directions between sensors and
+   controllers. A simulation and a replay drive it; the relay of a live run decides alike.
+
+   Datagrams come in; those that survive go out, at once or later. Each input has one row of the
+   record, numbered over both directions. */
+#include "core.h"
+
+enum { MOST_LOOPS = 65535 };
+
+static int is_between(int64_t least, int64_t number, int64_t most) {
+    return least <= number && number <= most;
+}
+
+const char *noack_channel_check(const noack_channel *channel) {
+    if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))
+        return "a network has 1 to 65535 loops, and one or two directions";
+    for (int64_t i = 0; i < channel->directions; i++) {
+        if (channel->links[i] == NULL || channel->links[i]->rows < channel->loops)
+            return "a direction of the network has no row for a loop";
+    }
+    if (!is_between(2, channel->places, INT32_MAX) || channel->row_places < 1
+        || !is_between(0, channel->heap_count, channel->places)
+        || !is_between(0, channel->packet_count, channel->row_places)
+        || !is_between(0, channel->release_count, channel->row_places))
+        return "a table of the network has no room, or more rows than room";
+    return NULL;
+}
+
+void noack_channel_add_places(noack_channel *channel, int64_t from) {
+    for (int64_t i = channel->places - 1; i >= from; i--) {
+        channel->delayed[i].next = channel->free_place;
+        channel->free_place = i;
+    }
+}
+
+int64_t noack_channel_due_ns(const noack_channel *channel) {
+    return channel->heap_count > 0 ? channel->heap[0].release_ns : INT64_MAX;
+}
+
+static int64_t leave(noack_channel *channel, const noack_delayed *leaving) {
+    const noack_datagram *datagram = &leaving->datagram;
+    noack_link *link = channel->links[datagram->flow / channel->loops];
+    return noack_link_leave(
+        link, datagram->flow % channel->loops, leaving->packet, datagram->size_bytes,
+        leaving->delayed, leaving->counts);
+}
+
+/* Whether a datagram of the same direction is due and has not left. */
+static int is_behind(const noack_channel *channel, int64_t direction, int64_t release_ns) {
+    if (channel->heap_count == 0 || channel->heap[0].release_ns > release_ns)
+        return 0;
+    for (int64_t i = 0; i < channel->heap_count; i++) {
+        const noack_datagram *other = &channel->delayed[channel->heap[i].slot].datagram;
+        if (channel->heap[i].release_ns <= release_ns && other->flow / channel->loops == direction)
+            return 1;
+    }
+    return 0;
+}
+
+/* Let a datagram, or its copy, leave now, or keep it until it is due. */
+static void release(
+    noack_channel *channel, const noack_datagram *datagram, const noack_decision *decision,
+    int copy) {
+    int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
+    int64_t bit = copy ? decision->copy_bit : decision->bit;
+    int64_t direction = datagram->flow / channel->loops;
+    noack_delayed *kept = &channel->delayed[channel->free_place];
+    kept->packet = decision->packet;
+    kept->copy = copy;
+    kept->counts = is_first_intact(decision, copy);
+    kept->delayed = release_ns > decision->arrival_ns;
+    copy_datagram(&kept->datagram, datagram);
+    kept->datagram.bit = bit;
+    if (bit >= 0 && bit < 8 * NOACK_HEAD_BYTES)
+        kept->datagram.head[bit / 8] ^= (uint8_t)(1 << (bit % 8));
+    channel->put++;
+    if (!kept->delayed && !is_behind(channel, direction, release_ns)) {
+        leave(channel, kept);
+        copy_datagram(&channel->leaving[channel->leaving_count++], &kept->datagram);
+        return;
+    }
+    noack_heap_entry entry = {
+        release_ns, departure_order(direction, channel->put), channel->free_place};
+    channel->free_place = kept->next;
+    heap_push(channel->heap, &channel->heap_count, entry);
+}
+
+int64_t noack_channel_handle(
+    noack_channel *channel, const noack_datagram *datagram, int64_t now_ns) {
+    int64_t direction = datagram->flow / channel->loops, row = datagram->flow % channel->loops;
+    int asks = channel->is_scripted && direction == 0;
+    noack_link *link = channel->links[direction];
+    noack_decision decision;
+    channel->leaving_count = 0;
+    if (now_ns >= channel->change_ns)
+        return NOACK_ASK_CHANGE;
+    if (channel->packet_count == channel->row_places)
+        return NOACK_ROWS_FULL;
+    if (channel->heap_count + 2 > channel->places)
+        return NOACK_ASK_PLACES;
+    if (asks && !channel->answered) {
+        copy_datagram(&channel->asked, datagram);
+        channel->asked_ns = now_ns;
+        return NOACK_ASK_OUTCOME;
+    }
+    channel->answered = 0;
+    channel->reached_ns = now_ns;
+    if (asks)
+        link_repeat(link, row, datagram->size_bytes, now_ns, &channel->outcome, &decision);
+    else
+        noack_link_decide(link, row, datagram->size_bytes, now_ns, &decision);
+    channel->packets[channel->packet_count++] = packet_row(
+        &decision, channel->inputs++, channel->first_number, datagram->arrival_ns, datagram->flow,
+        datagram->head);
+    if (decision.release_ns != NOACK_NEVER_NS)
+        release(channel, datagram, &decision, 0);
+    if (decision.copy_ns != NOACK_NEVER_NS)
+        release(channel, datagram, &decision, 1);
+    return NOACK_DONE;
+}
+
+int64_t noack_channel_release(noack_channel *channel, int64_t now_ns) {
+    channel->leaving_count = 0;
+    if (channel->release_count == channel->row_places)
+        return NOACK_ROWS_FULL;
+    noack_heap_entry due = channel->heap[0];
+    noack_delayed *leaving = &channel->delayed[due.slot];
+    heap_pop(channel->heap, &channel->heap_count);
+    channel->releases[channel->release_count++] = (noack_release_row){
+        .input = channel->inputs++,
+        .sequence = channel->first_number + leaving->packet,
+        .t_ns = due.release_ns,
+        .now_ns = now_ns,
+        .flow = leaving->datagram.flow,
+        .copy = leaving->copy,
+        .stale = leave(channel, leaving),
+    };
+    copy_datagram(&channel->leaving[channel->leaving_count++], &leaving->datagram);
+    leaving->next = channel->free_place;
+    channel->free_place = due.slot;
+    return NOACK_DONE;
+}
+
+void noack_channel_latest(const noack_channel *channel, int64_t direction, int64_t *latest_ns) {
+    for (int64_t i = 0; i < channel->heap_count; i++) {
+        const noack_datagram *one = &channel->delayed[channel->heap[i].slot].datagram;
+        int64_t row = one->flow % channel->loops;
+        if (one->flow / channel->loops == direction)
+            latest_ns[row] = max_of(latest_ns[row], channel->heap[i].release_ns);
+    }
+}

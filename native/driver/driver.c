@@ -1,0 +1,320 @@
+/* The live driver: messages and ticks of the machines of a process, in real time. */
+#define _GNU_SOURCE
+#include "../core.h"
+
+#include <errno.h>
+#include <netinet/in.h>
+#include <poll.h>
+#include <stddef.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <time.h>
+
+enum {
+    BUFFERS = 64,       /* datagrams that are received or sent at once */
+    TICKS = 32,         /* that are done before it receives again */
+    BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
+    QUIET_NS = 500000,  /* housekeeping in Python nearly always takes less time */
+    MOST_PUT_OFF_NS = 50000000
+};
+
+typedef struct {
+    struct mmsghdr in_headers[BUFFERS], out_headers[BUFFERS];
+    struct iovec in_vectors[BUFFERS], out_vectors[BUFFERS];
+    uint8_t in_names[BUFFERS][NOACK_NAME_BYTES];
+    int64_t in_next, in_end; /* the current datagram, and the end of those received */
+    int64_t out_count;
+    int64_t is_accepted; /* 1: the current datagram has become the message */
+    int64_t is_ticking;  /* 1: a tick waits for an answer */
+    int64_t now_ns;      /* time of the message or tick */
+    int64_t batch;       /* datagrams that one call receives */
+    int64_t worked;      /* 1: something was done since it last slept */
+    int64_t has_more;    /* 1: a socket may have more datagrams than were received */
+    noack_message message;
+    uint8_t in_data[BUFFERS][BUFFER_BYTES], out_data[BUFFERS][BUFFER_BYTES];
+} driver_scratch;
+
+static driver_scratch *scratch_of(const noack_driver *driver) { return driver->scratch; }
+
+int64_t noack_driver_scratch_bytes(void) { return (int64_t)sizeof(driver_scratch); }
+
+static int is_name(const noack_peer *peer) {
+    return 0 <= peer->name_bytes && peer->name_bytes <= NOACK_NAME_BYTES;
+}
+
+const char *noack_driver_check(const noack_driver *driver) {
+    if (!(driver->clock.speed > 0))
+        return "clock.speed: not above 0";
+    if (driver->clock.slew_ppb < 0 || driver->clock.slew_ppb >= NS_PER_S)
+        return "clock.slew_ppb: not from 0 to 10^9";
+    if (driver->spin_ns < 0 || driver->rest_ns < 0 || driver->rest_ns >= NS_PER_S)
+        return "spin_ns, rest_ns: a time below 0 or of 1 s";
+    if (driver->receiver_count < 0 || driver->receiver_count > 2)
+        return "receiver_count: not from 0 to 2";
+    for (int k = 0; k < 2; k++)
+        if (!is_name(&driver->sources[k]) || !is_name(&driver->destinations[k]))
+            return "name_bytes: not from 0 to 32";
+    return NULL;
+}
+
+static void renew_header(driver_scratch *own, int64_t k) {
+    own->in_headers[k].msg_hdr.msg_namelen = NOACK_NAME_BYTES;
+}
+
+void noack_driver_open(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    for (int k = 0; k < BUFFERS; k++) {
+        own->in_vectors[k] = (struct iovec){own->in_data[k], BUFFER_BYTES};
+        own->out_vectors[k] = (struct iovec){own->out_data[k], 0};
+        own->in_headers[k].msg_hdr = (struct msghdr){
+            .msg_name = own->in_names[k], .msg_iov = &own->in_vectors[k], .msg_iovlen = 1};
+        own->out_headers[k].msg_hdr =
+            (struct msghdr){.msg_iov = &own->out_vectors[k], .msg_iovlen = 1};
+        renew_header(own, k);
+    }
+    /* A call that has received as many as it may does not look for another one. */
+    own->batch = min_of(driver->process->loops, BUFFERS);
+}
+
+/* Whether a name is that of a peer: the same family, port and host. */
+static int is_peer(const uint8_t name[NOACK_NAME_BYTES], const noack_peer *peer) {
+    sa_family_t family;
+    memcpy(&family, name, sizeof family);
+    if (peer->name_bytes == 0 || memcmp(name, peer->name, 4) != 0)
+        return 0;
+    size_t host = family == AF_INET ? offsetof(struct sockaddr_in, sin_addr)
+                                    : offsetof(struct sockaddr_in6, sin6_addr);
+    return memcmp(name + host, peer->name + host, family == AF_INET ? 4 : 16) == 0;
+}
+
+void noack_driver_add_datagram(
+    noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
+    int64_t size_bytes) {
+    driver_scratch *own = scratch_of(driver);
+    size_bytes = min_of(size_bytes, BUFFER_BYTES);
+    memcpy(own->in_data[0], data, (size_t)size_bytes);
+    memcpy(own->in_names[0], name, NOACK_NAME_BYTES);
+    own->in_headers[0].msg_len = (unsigned)size_bytes;
+    own->in_next = 0;
+    own->in_end = 1;
+}
+
+/* Send the datagrams that wait; a failure is counted. */
+static void send_all(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    int fd = (int)driver->sender;
+    for (int64_t k = 0; k < own->out_count;) {
+        const struct msghdr *first = &own->out_headers[k].msg_hdr;
+        int64_t left = own->out_count - k, sent;
+        if (left == 1)
+            sent = sendto(
+                       fd, first->msg_iov->iov_base, first->msg_iov->iov_len, MSG_DONTWAIT,
+                       first->msg_name, first->msg_namelen)
+                           < 0
+                       ? -1
+                       : 1;
+        else
+            sent = sendmmsg(fd, &own->out_headers[k], (unsigned)left, MSG_DONTWAIT);
+        if (sent > 0) {
+            driver->sent += sent;
+            k += sent;
+        } else if (errno != EINTR) {
+            driver->errors[errno & (NOACK_ERRNOS - 1)]++;
+            k++;
+        }
+    }
+    own->out_count = 0;
+}
+
+/* Write the datagram of the message that a machine sends, if it sends one. */
+static int64_t put_output(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    const noack_output *output = &driver->process->output;
+    own->worked = 1;
+    if (!output->sends)
+        return NOACK_DRIVER_NOTHING;
+    if (own->out_count == BUFFERS)
+        send_all(driver);
+    int64_t place = own->out_count++;
+    noack_peer *destination = &driver->destinations[output->message.flow == NOACK_ACKNOWLEDGEMENT];
+    struct msghdr *header = &own->out_headers[place].msg_hdr;
+    header->msg_name = destination->name;
+    header->msg_namelen = (socklen_t)destination->name_bytes;
+    int64_t size_bytes = noack_wire_encode(&driver->wire, &output->message, own->out_data[place]);
+    own->out_vectors[place].iov_len = (size_t)size_bytes;
+    if (!driver->wire.encrypted)
+        return NOACK_DRIVER_NOTHING;
+    driver->datagram = own->out_data[place];
+    driver->datagram_bytes = size_bytes;
+    return NOACK_DRIVER_SEAL;
+}
+
+/* Ask Python for what a step needs. */
+static int64_t ask(noack_driver *driver, int64_t question) {
+    driver->question = question;
+    return question == NOACK_ROWS_FULL ? NOACK_DRIVER_ROWS : NOACK_DRIVER_QUESTION;
+}
+
+/* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
+static int64_t examine(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    uint8_t *datagram = own->in_data[own->in_next];
+    int64_t size_bytes = own->in_headers[own->in_next].msg_len;
+    int64_t loop = noack_wire_loop(datagram, size_bytes);
+    int is_answer = driver->sources[1].name_bytes > 0
+                    && noack_wire_flow(datagram, size_bytes) == NOACK_ACKNOWLEDGEMENT;
+    if (loop >= driver->process->loops) /* rejected by the first loop */
+        loop = 0;
+    noack_machine *machine = noack_process_machine(driver->process, max_of(loop, 0));
+    noack_reception *reception = is_answer ? &machine->acknowledgements : &machine->received;
+    own->now_ns = run_time_ns(&driver->clock);
+    int64_t found = NOACK_BAD_TAG;
+    if (driver->opened != NOACK_NOT_AUTHENTIC)
+        found = noack_wire_examine(
+            &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
+            is_peer(own->in_names[own->in_next], &driver->sources[is_answer]), driver->opened,
+            &own->message);
+    if (found == NOACK_ENCRYPTED) {
+        driver->datagram = datagram;
+        driver->datagram_bytes = size_bytes;
+        return NOACK_DRIVER_OPEN;
+    }
+    driver->opened = NOACK_NOT_OPENED;
+    noack_wire_count(reception, found, &own->message);
+    own->is_accepted = found == NOACK_ACCEPTED;
+    return NOACK_DRIVER_NOTHING;
+}
+
+/* Handle the datagrams received, or as many as Python is not needed for. */
+static int64_t handle_messages(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    while (own->in_next < own->in_end) {
+        if (!own->is_accepted) {
+            if (examine(driver) == NOACK_DRIVER_OPEN)
+                return NOACK_DRIVER_OPEN;
+            if (!own->is_accepted) {
+                own->in_next++;
+                continue;
+            }
+        }
+        int64_t question = noack_process_handle(driver->process, &own->message, own->now_ns);
+        if (question != NOACK_DONE)
+            return ask(driver, question);
+        own->is_accepted = 0;
+        own->in_next++;
+        int64_t reason = put_output(driver);
+        if (reason != NOACK_DRIVER_NOTHING)
+            return reason;
+    }
+    return NOACK_DRIVER_NOTHING;
+}
+
+/* Do the ticks that are due, or the first of them. */
+static int64_t do_ticks(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    for (int count = 0; count < TICKS; count++) {
+        if (!own->is_ticking) {
+            int64_t due_ns = noack_process_due_ns(driver->process);
+            if (due_ns == INT64_MAX)
+                break;
+            own->now_ns = run_time_ns(&driver->clock);
+            if (own->now_ns < due_ns)
+                break;
+            own->is_ticking = 1;
+        }
+        int64_t question = noack_process_tick(driver->process, own->now_ns);
+        if (question != NOACK_DONE)
+            return ask(driver, question);
+        own->is_ticking = 0;
+        int64_t reason = put_output(driver);
+        if (reason != NOACK_DRIVER_NOTHING)
+            return reason;
+    }
+    return NOACK_DRIVER_NOTHING;
+}
+
+/* Wall time until the next tick, or a little less; INT64_MAX: there is none. */
+static int64_t next_tick_ns(const noack_driver *driver, int64_t now_ns) {
+    int64_t due_ns = noack_process_due_ns(driver->process);
+    return due_ns == INT64_MAX ? INT64_MAX : noack_clock_wait_ns(&driver->clock, due_ns - now_ns);
+}
+
+/* Sleep until a socket has datagrams, a tick is near, or for wait_ns. Return the sockets to read as
+   bits, or -1 if a signal interrupted it. */
+static int64_t sleep_until_needed(noack_driver *driver, int64_t tick_ns, int64_t wait_ns) {
+    driver_scratch *own = scratch_of(driver);
+    nfds_t count = (nfds_t)driver->receiver_count;
+    int rests = own->worked && !own->has_more && 0 < tick_ns && tick_ns < driver->rest_ns;
+    if (rests)
+        wait_ns = driver->rest_ns;
+    else if (tick_ns != INT64_MAX)
+        wait_ns = max_of(min_of(wait_ns, tick_ns - driver->spin_ns), 0);
+    own->worked = 0;
+    struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
+    struct pollfd readable[2];
+    for (nfds_t k = 0; k < count; k++)
+        readable[k] = (struct pollfd){.fd = (int)driver->receivers[k], .events = POLLIN};
+    if (ppoll(readable, rests ? 0 : count, &limit, NULL) < 0)
+        return errno == EINTR ? -1 : 0;
+    int64_t ready = 0;
+    for (nfds_t k = 0; k < count; k++)
+        ready |= (int64_t)(rests || readable[k].revents != 0) << k;
+    return ready;
+}
+
+/* Receive datagrams from the sockets that have some, and count their sources. */
+static void receive(noack_driver *driver, int64_t ready) {
+    driver_scratch *own = scratch_of(driver);
+    own->in_next = own->in_end = own->has_more = 0;
+    for (int64_t k = 0; k < driver->receiver_count; k++) {
+        if (!(ready >> k & 1) || own->in_end == BUFFERS)
+            continue;
+        unsigned most = (unsigned)min_of(own->batch, BUFFERS - own->in_end);
+        int taken = recvmmsg(
+            (int)driver->receivers[k], &own->in_headers[own->in_end], most, MSG_DONTWAIT, NULL);
+        own->in_end += max_of(taken, 0); /* after an ICMP error of a datagram, it fails once */
+        own->has_more |= taken == (int)most;
+    }
+    for (int64_t k = 0; k < own->in_end; k++) {
+        int64_t source = 0;
+        while (source < 2 && !is_peer(own->in_names[k], &driver->sources[source]))
+            source++;
+        if (source < 2)
+            driver->sources[source].received++;
+        else
+            driver->foreign++;
+        renew_header(own, k);
+    }
+}
+
+int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
+    driver_scratch *own = scratch_of(driver);
+    for (;;) {
+        int64_t reason = NOACK_DRIVER_NOTHING;
+        if (!own->is_ticking)
+            reason = handle_messages(driver);
+        if (reason == NOACK_DRIVER_NOTHING)
+            reason = do_ticks(driver);
+        if (reason == NOACK_DRIVER_SEAL)
+            return reason;
+        if (own->out_count > 0)
+            send_all(driver);
+        if (reason != NOACK_DRIVER_NOTHING)
+            return reason;
+        if (until_ns == INT64_MIN)
+            return NOACK_DRIVEN;
+        int64_t now_ns = run_time_ns(&driver->clock), tick_ns = next_tick_ns(driver, now_ns);
+        int64_t wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
+        if (now_ns >= until_ns) {
+            if (tick_ns > QUIET_NS
+                || noack_clock_wait_ns(&driver->clock, now_ns - until_ns) >= MOST_PUT_OFF_NS)
+                return NOACK_DRIVEN;
+            wait_ns = QUIET_NS;
+        }
+        int64_t ready = sleep_until_needed(driver, tick_ns, wait_ns);
+        if (ready < 0)
+            return NOACK_DRIVEN;
+        if (ready > 0)
+            receive(driver, ready);
+    }
+}

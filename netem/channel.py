@@ -1,0 +1,314 @@
+"""The network of a run as a machine without sockets: native/channel.c decides, this configures it.
+
+Simulation and replay drive it. The relay of a live run (:mod:`netem.engine.run_network`) decides
+alike. The flows 0 to N − 1 of a run with N loops come from the sensors, the next N from the
+controllers, if acknowledgements or actuations cross the network. The two directions are
+independent: each has its own settings, random streams and guarantee. Payloads are not interpreted.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netem.link_state import LinkState
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange
+from noack.config.scenario import Scenario
+from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.impairments.link_records import NEVER_NS
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.datagram_seal import KEY_BYTES
+from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    NETEM_SETTING,
+    PACKET_HEAD_BYTES,
+    Fate,
+)
+from noack.protocol.wire_format import Encoder, Flow, Message
+
+Rows = NDArray[np.void]
+
+Network = Callable[[bytes, int], int | None]
+"""Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
+
+_PACKET_ROW = np.dtype(
+    [
+        *((name, "<i8") for name in dtype_of("noack_packet_row").names[:-1]),  # type: ignore[index]
+        ("head", f"V{PACKET_HEAD_BYTES}"),
+    ]
+)
+_RELEASE_ROW = dtype_of("noack_release_row")
+NO_TIME_NS = 2**63 - 1
+"""Stands for a time that never comes, in the core."""
+UNKNOWN_ARRIVAL_NS = 2**62
+RUN_ID = 0
+"""Run number in the datagrams of every simulated run: a record depends on the scenario alone.
+
+A simulation receives no foreign traffic, so its key need not be secret."""
+_PLACES, _ROWS = 64, 4096
+
+
+def link_name(flow: Flow) -> str:
+    """Return the name of the link of a flow; part of its random streams' names."""
+    return flow.name.lower()
+
+
+UPDATE_LINK = link_name(Flow.UPDATE)
+
+
+class Datagram(NamedTuple):
+    """A datagram of a flow."""
+
+    flow: int
+    data: bytes
+    arrival_ns: int = UNKNOWN_ARRIVAL_NS
+    """Arrival at the socket, for the record; later than its handling: unknown."""
+
+
+class Channel:
+    """Memory and settings of a ``noack_channel``.
+
+    Args:
+        links: the direction from the sensors, and that from the controllers if there is one; each
+            has room for ``loops`` flows.
+        loops: number of loops.
+        first_number: number of the first input and of each flow's first packet.
+        schedule: announced changes of the first direction's settings; None: there can be none.
+        network: decides for the datagrams from the sensors, instead of their link.
+    """
+
+    def __init__(
+        self,
+        links: Sequence[LinkState],
+        *,
+        loops: int = 1,
+        first_number: int = 0,
+        schedule: ChangeSchedule | None = None,
+        network: Network | None = None,
+    ) -> None:
+        self._links, self._loops = tuple(links), loops
+        self._schedule, self._network = schedule, network
+        for number, link in enumerate(links):
+            for loop in range(loops):
+                link.start_flow(loop, number * loops + loop)
+        self.core: Any = ffi.new("noack_channel *", {
+            "loops": loops, "directions": len(links), "links": [link.core for link in links],
+            "is_scripted": network is not None, "first_number": first_number,
+            "inputs": first_number, "reached_ns": -1, "change_ns": NO_TIME_NS, "free_place": -1,
+            "row_places": _ROWS,
+        })  # fmt: skip
+        """The channel, as the core's functions take it; valid as long as this object lives."""
+        self._packets: Rows = np.zeros(_ROWS, dtype_of("noack_packet_row"))
+        self._releases: Rows = np.zeros(_ROWS, _RELEASE_ROW)
+        self.core.packets = pointer_to(self._packets, "noack_packet_row *")
+        self.core.releases = pointer_to(self._releases, "noack_release_row *")
+        self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
+        self._delayed: Any = ffi.new("noack_delayed[]", 0)
+        self._taken: list[tuple[str, Rows]] = []
+        self._handled = 0
+        self._payloads: dict[int, bytes] = {}
+        self._copies: dict[int, int] = {}  # delayed copies of each payload
+        self._add_places(_PLACES)
+        if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
+            raise ValueError(f"network: {ffi.string(wrong).decode()}")
+
+    @property
+    def links(self) -> Sequence[LinkState]:
+        """The directions."""
+        return self._links
+
+    def answer(self, question: int) -> None:
+        """Do what the core asked for; the call is then repeated."""
+        if question == core.NOACK_ASK_CHANGE:
+            self._change()
+        elif question == core.NOACK_ASK_PLACES:
+            self._add_places(self.core.places)
+        elif question == core.NOACK_ASK_OUTCOME:
+            self._decide()
+        else:
+            assert question == core.NOACK_ROWS_FULL
+            self._taken += self.take_rows()
+
+    def take_rows(self) -> list[tuple[str, Rows]]:
+        """Return all rows since the last call, in batches of a table in their order."""
+        channel, taken = self.core, self._taken
+        packets = self._packets[: channel.packet_count].view(_PACKET_ROW).copy()
+        releases = self._releases[: channel.release_count].copy()
+        channel.packet_count = channel.release_count = 0
+        self._taken = []
+        return [*taken, (NETEM_PACKET, packets), (NETEM_RELEASE, releases)]
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Accept a change; it applies from the first datagram that arrives at or after its time T.
+
+        A smaller cap applies from that datagram on: if the number of consecutive losses before it
+        has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
+        largest cap that applied during it.
+        """
+        assert self._schedule is not None
+        outputs = self._schedule.announce(
+            NETEM_SETTING, change, self.core.inputs, now_ns, self.core.reached_ns
+        )
+        self.core.inputs += 1
+        self._set_change_time()
+        return outputs
+
+    def next_deadline_ns(self) -> int | None:
+        """Time of the next departure in either direction; None: nothing is in flight."""
+        due_ns = int(core.noack_channel_due_ns(self.core))
+        return None if due_ns == NO_TIME_NS else due_ns
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Process a datagram; return it if it is neither lost nor delayed."""
+        if not 0 <= message.flow < self.core.loops * len(self.links):
+            raise ValueError(f"a network of {self.core.loops} loops has no flow {message.flow}")
+        channel, number, data = self.core, self._handled, message.data
+        datagram = ffi.new("noack_datagram *", {
+            "flow": message.flow, "size_bytes": len(data), "arrival_ns": message.arrival_ns,
+            "bit": -1, "head": data[:PACKET_HEAD_BYTES], "message": {"sequence": number},
+        })  # fmt: skip
+        before = channel.heap_count
+        self._payloads[number] = data
+        outputs = self._step(lambda: core.noack_channel_handle(channel, datagram, now_ns))
+        self._handled += 1
+        self._copies[number] = channel.heap_count - before
+        self._forget(number)
+        return outputs
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Forward the datagram that is due; if one is due in each direction, the first one."""
+        outputs = self._step(lambda: core.noack_channel_release(self.core, now_ns))
+        number = self.core.leaving[0].message.sequence
+        self._copies[number] -= 1
+        self._forget(number)
+        return outputs
+
+    def _step(self, step: Callable[[], int]) -> Sequence[Datagram | Record | Notice]:
+        """Make a step; return the datagrams that leave, and its row."""
+        while (question := step()) != core.NOACK_DONE:
+            self.answer(question)
+        leaving = (self.core.leaving[place] for place in range(self.core.leaving_count))
+        datagrams = [
+            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit))
+            for one in leaving
+        ]
+        rows = [Record(table, row) for table, batch in self.take_rows() for row in batch.tolist()]
+        return (*datagrams, *rows)
+
+    def _forget(self, number: int) -> None:
+        """Forget a payload after its last departure."""
+        if not self._copies[number]:
+            del self._copies[number], self._payloads[number]
+
+    def _change(self) -> None:
+        """Apply the changes that are due at the datagram whose arrival asked for them."""
+        assert self._schedule is not None
+        first, channel = self.links[0], self.core
+        for settings in due_settings(self._schedule, first.settings, channel.change_ns):
+            self.change(settings)
+        self._set_change_time()
+
+    def change(self, settings: LinkSettings) -> None:
+        """Apply other settings to the first direction; see native/link_change.c."""
+        latest_ns = np.full(self.links[0].rows, NEVER_NS, np.int64)
+        core.noack_channel_latest(self.core, 0, pointer_to(latest_ns, "int64_t *"))
+        self.links[0].change(settings, latest_ns)
+
+    def _set_change_time(self) -> None:
+        next_ns = None if self._schedule is None else self._schedule.next_ns
+        self.core.change_ns = NO_TIME_NS if next_ns is None else next_ns
+
+    def _decide(self) -> None:
+        """Let the user's network decide."""
+        assert self._network is not None
+        asked = self.core.asked.message
+        data = encoded(asked) if asked.flow else self._payloads[asked.sequence]
+        delay_ns = self._network(data, self.core.asked_ns)
+        fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
+        self.core.outcome = (fate, -1 if delay_ns is None else delay_ns, -1, -1, -1)
+        self.core.answered = 1
+
+    def _add_places(self, count: int) -> None:
+        """Add room for delayed datagrams."""
+        channel, before = self.core, self.core.places
+        heap = np.zeros(before + count, dtype_of("noack_heap_entry"))
+        heap[:before] = self._heap
+        delayed = ffi.new("noack_delayed[]", before + count)
+        ffi.memmove(delayed, self._delayed, before * ffi.sizeof("noack_delayed"))
+        self._heap, self._delayed = heap, delayed
+        channel.heap, channel.delayed = pointer_to(heap, "noack_heap_entry *"), delayed
+        channel.places = before + count
+        core.noack_channel_add_places(channel, before)
+
+
+def channel_of(
+    resolved: Scenario, start: Start = BEGINNING, *, loops: int = 1, network: Network | None = None
+) -> Channel:
+    """Return the network of a resolved scenario; ``network`` replaces the link of the updates."""
+    links: list[LinkState] = []
+    for flow in resolved.network.flows:
+        settings, names = at_start(resolved.network.link_of(flow), link_name(flow), start)
+        if network is not None and not links:
+            settings = LinkSettings(mansd=None, first_delivered=False)
+        links.append(
+            LinkState(
+                settings,
+                resolved.seeds.loss,
+                *names,
+                rows=loops,
+                restarted=start.is_restart,
+                decisions=[()] if network else (),
+            )
+        )
+    schedule = None if network else ChangeSchedule(resolved, lambda one: one.network.link)
+    return Channel(
+        links, loops=loops, first_number=start.first_number, schedule=schedule, network=network
+    )
+
+
+def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:
+    """Return the settings of a link of a run, and the names of its random streams.
+
+    A restarted emulator does not know the losses before. Therefore its first datagrams pass
+    (see :class:`netem.link_state.LinkState`), and later ones are drawn from other random streams
+    than before.
+    """
+    if not start.is_restart:
+        return settings, [name]
+    settings = settings.model_copy(update={"first_delivered": True})
+    return settings, [name, f"again-{start.generation}"]
+
+
+def due_settings(
+    schedule: ChangeSchedule, present: LinkSettings, now_ns: int
+) -> Iterator[LinkSettings]:
+    """Yield the settings that replace the present ones before a datagram that arrives now."""
+    while (change := schedule.take(now_ns)) is not None:
+        first = present.first_delivered  # a restarted emulator has its own value
+        settings = change.prepared.model_copy(update={"first_delivered": first})
+        if settings != present:
+            present = settings
+            yield settings
+
+
+def encoded(message: Any) -> bytes:
+    """Return the datagram of a simulated run with a ``noack_message``."""
+    vector = np.array(ffi.unpack(message.vector, message.entries))
+    return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(
+        Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop)
+    )
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """Return the data with one bit flipped; bit 0 is the least significant bit of byte 0.
+
+    A bit of −1 is none.
+    """
+    if bit < 0:
+        return data
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)

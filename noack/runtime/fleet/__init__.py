@@ -1,1 +1,0 @@
-"""The machines of many loops in arrays, driven by compiled code."""

@@ -1,0 +1,287 @@
+"""The live driver: the core drives the machines of a process; Python does what is rare.
+
+``native/driver/driver.c`` waits for ticks and datagrams, passes them to the machines, sends their
+messages, and collects the rows of the record. It returns to Python at housekeeping, if a table of
+rows is full, if users' code is to answer, and for each datagram that is encrypted.
+"""
+
+import socket
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+import numpy as np
+
+from noack.core.clock import RunClock
+from noack.core.core_library import core, ffi
+from noack.machines.loop_machines import LoopMachines
+from noack.protocol.datagram_seal import TAG_BYTES
+from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
+from noack.protocol.wire_format import (
+    HEADER_BYTES,
+    Flow,
+    Rejection,
+    Wire,
+    reception_report,
+    rejected_of,
+)
+from noack.runtime.address import Address, SocketName, packed_name
+from noack.runtime.process_life import RunProcess
+from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.udp_sockets import CountingSocket, errors_by_text
+
+_AT_ONCE_NS = -(2**63)
+"""Do what is due, and do not wait."""
+
+
+def run_machines(process: RunProcess, machines: LoopMachines) -> None:
+    """Join the run, drive the machines of all loops to the horizon, and report.
+
+    Raises:
+        CallerError: the process's port is taken.
+        PeerError: the run never started, or the system refused a socket for a peer.
+    """
+    driver = LiveDriver(
+        machines, process.wire, admitted_ns=process.admitted_ns, spin_ns=process.spin_ns,
+        rest_ns=process.rest_ns,
+    )  # fmt: skip
+    with process.open_socket() as endpoint:
+        addresses = process.join(endpoint.getsockname()[:2])
+        channel = LoopChannel(
+            endpoint, driver, SENDS[process.role], by_loop=process.loop_count is not None,
+            **_ends(process, addresses),
+        )  # fmt: skip
+        process.run(driver, channel, machines)
+
+
+class _Ends(TypedDict):
+    """The other ends of a process's flows; see :class:`LoopChannel`."""
+
+    source: Address
+    destination: Address
+    acknowledged_by: Address | None
+    acknowledges_to: Address | None
+
+
+def _ends(process: RunProcess, addresses: Mapping[str, Address]) -> _Ends:
+    role, network, answer = process.role, process.scenario.network.flows, Flow.ACKNOWLEDGEMENT
+    answers = answer in network
+    return {
+        "source": addresses[sender_to(role, RECEIVES[role], network)],
+        "destination": addresses[receiver_of(role, SENDS[role], network)],
+        "acknowledged_by": (
+            addresses["netem"] if answers and role == ENDS[answer].receiver else None
+        ),
+        "acknowledges_to": addresses["netem"] if answers and role == ENDS[answer].sender else None,
+    }
+
+
+class LiveDriver:
+    """Drives the machines of all loops of a process.
+
+    Args:
+        machines: the machines.
+        wire: what their datagrams have in common.
+        admitted_ns: messages from before this time of the run are stale.
+        spin_ns: busy-wait for this time before a tick.
+        rest_ns: sleep for this time if the next tick is nearer, to do several at once.
+    """
+
+    def __init__(
+        self,
+        machines: LoopMachines,
+        wire: Wire,
+        *,
+        admitted_ns: int = 0,
+        spin_ns: int = 0,
+        rest_ns: int = 0,
+    ) -> None:
+        self.machines, self._wire = machines, wire
+        self._scratch = np.zeros(core.noack_driver_scratch_bytes() + 64, np.uint8)
+        self.core: Any = ffi.new(
+            "noack_driver *",
+            {
+                "process": machines.core, "wire": wire.core[0], "clock": {"speed": 1.0},
+                "spin_ns": spin_ns, "rest_ns": rest_ns, "sender": -1,
+                "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
+            },
+        )  # fmt: skip
+        for machine, phase_ns in zip(self._each_machine(), machines.phases_ns, strict=True):
+            machine.received.not_before_ns = admitted_ns - phase_ns
+            machine.acknowledgements.not_before_ns = admitted_ns - phase_ns
+        self._check()
+        core.noack_driver_open(self.core)
+
+    def open(
+        self,
+        sender: socket.socket,
+        receivers: Sequence[socket.socket],
+        sources: Sequence[Address],
+        destinations: Sequence[Address | None],
+    ) -> None:
+        """Use these sockets from now on.
+
+        Args:
+            sender: an unconnected socket.
+            receivers: the sockets of the peers.
+            sources: where the messages of every run come from; also where acknowledgements do.
+            destinations: where they go to.
+        """
+        self.core.sender = sender.fileno()
+        self.core.receiver_count = len(receivers)
+        for place, receiver in enumerate(receivers):
+            self.core.receivers[place] = receiver.fileno()
+        for peers, addresses in (
+            (self.core.sources, sources),
+            (self.core.destinations, destinations),
+        ):
+            for place, address in enumerate(addresses):
+                if address is not None:
+                    peers[place].name, peers[place].name_bytes = packed_name(address)
+        self._check()
+
+    def set_clock(self, clock: RunClock) -> None:
+        """Read the time as this clock does."""
+        clock.set_core(self.core.clock)
+
+    def next_deadline_ns(self) -> int | None:
+        """The next tick of all machines, in the time of the run."""
+        return self.machines.next_deadline_ns()
+
+    def drive(self, until_ns: int, sink: RecordSink) -> None:
+        """Work until about a time of the run; pass on the rows of the record."""
+        own, machines = self.core, self.machines
+        while (reason := core.noack_drive(own, until_ns)) != core.NOACK_DRIVEN:
+            if reason == core.NOACK_DRIVER_ROWS:
+                self._pass_rows(sink)
+            elif reason == core.NOACK_DRIVER_QUESTION:
+                machines.answer(own.question)
+            elif reason == core.NOACK_DRIVER_OPEN:
+                self._open_datagram()
+            else:
+                self._seal_datagram()
+        self._pass_rows(sink)
+
+    def take(self, data: bytes, source: SocketName, sink: RecordSink) -> None:
+        """Process a datagram that Python has received."""
+        name, _ = packed_name(source)
+        core.noack_driver_add_datagram(self.core, name, data, len(data))
+        self.drive(_AT_ONCE_NS, sink)
+
+    @property
+    def accepted(self) -> int:
+        """Number of accepted datagrams."""
+        return sum(machine.received.accepted for machine in self._each_machine())
+
+    @property
+    def rejected(self) -> Mapping[Rejection, int]:
+        """Number of rejected datagrams by reason."""
+        counts = dict.fromkeys(Rejection, 0)
+        for machine in self._each_machine():
+            for reason, number in rejected_of(machine.received).items():
+                counts[reason] += number
+        return counts
+
+    def reports(self) -> list[dict[str, object]]:
+        """Counters of each loop, for the run's summary."""
+        return [reception_report(machine.received) for machine in self._each_machine()]
+
+    def acknowledgements(self) -> dict[str, object]:
+        """Counters of the acknowledgements of all loops."""
+        reports = [machine.acknowledgements for machine in self._each_machine()]
+        rejected = [rejected_of(one) for one in reports]
+        by_reason = {reason.value: sum(one[reason] for one in rejected) for reason in Rejection}
+        return {
+            "accepted": sum(one.accepted for one in reports),
+            "rejected": {reason: n for reason, n in by_reason.items() if n},
+        }
+
+    def _each_machine(self) -> list[Any]:
+        process = self.machines.core
+        return [core.noack_process_machine(process, loop) for loop in range(process.loops)]
+
+    def _check(self) -> None:
+        wrong = core.noack_driver_check(self.core)
+        if wrong != ffi.NULL:
+            raise ValueError(ffi.string(wrong).decode())
+
+    def _pass_rows(self, sink: RecordSink) -> None:
+        for table, rows in self.machines.take_rows():
+            sink.extend_table(table, rows)
+        for notice in self.machines.take_notices():
+            sink.notice(notice)
+
+    def _open_datagram(self) -> None:
+        """Decrypt the vector of the datagram in place."""
+        own, seal = self.core, self._wire.seal
+        assert seal is not None
+        memory = ffi.buffer(own.datagram, own.datagram_bytes)
+        vector = seal.open(bytes(memory), HEADER_BYTES)
+        if vector is not None:
+            memory[HEADER_BYTES : HEADER_BYTES + len(vector)] = vector
+        own.opened = core.NOACK_NOT_AUTHENTIC if vector is None else core.NOACK_OPENED
+
+    def _seal_datagram(self) -> None:
+        """Encrypt the vector of the datagram in place, and write its tag."""
+        own, seal = self.core, self._wire.seal
+        assert seal is not None
+        memory = ffi.buffer(own.datagram, own.datagram_bytes)
+        memory[:] = seal.close(bytes(memory[:HEADER_BYTES]), bytes(memory[HEADER_BYTES:-TAG_BYTES]))
+
+
+class LoopChannel(CountingSocket):
+    """The sockets of a process in the loop.
+
+    Args:
+        endpoint: its socket.
+        driver: drives its machines.
+        sends: the flow that it sends in every run.
+        source: where the flow that it receives in every run comes from.
+        destination: where the flow that it sends goes to.
+        acknowledged_by: where acknowledgements come from; None: it receives none.
+        acknowledges_to: where they go to; None: it sends none.
+        by_loop: whether the report has the counters of each loop.
+
+    Raises:
+        PeerError: the system refused a socket for a peer.
+    """
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        driver: LiveDriver,
+        sends: Flow,
+        *,
+        source: Address,
+        destination: Address,
+        acknowledged_by: Address | None = None,
+        acknowledges_to: Address | None = None,
+        by_loop: bool = False,
+    ) -> None:
+        sources = [source] if acknowledged_by is None else [source, acknowledged_by]
+        super().__init__(endpoint, destination, sources)
+        self._driver, self._sends, self._by_loop = driver, sends, by_loop
+        self._expected = sources
+        self._is_acknowledged = acknowledged_by is not None
+        driver.open(endpoint, self.peer_sockets, sources, (destination, acknowledges_to))
+
+    def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
+        """Pass a datagram to the driver, which rejects all but those of the peers."""
+        self._driver.take(data, source, sink)
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        driver, own = self._driver, self._driver.core
+        for peer, address in zip(own.sources, self._expected, strict=False):
+            self.count_received(address, peer.received)
+        self._sources.add_others(own.foreign)
+        own.foreign = 0
+        rejected = {reason.value: n for reason, n in driver.rejected.items()}
+        return super().report() | {
+            "sent": own.sent,
+            "send_errors": errors_by_text(own.errors),
+            "sends": self._sends.name.lower(),
+            "accepted": driver.accepted,
+            "rejected": self.rejected(rejected),
+            **({"loops": driver.reports()} if self._by_loop else {}),
+            **({"acknowledgements": driver.acknowledgements()} if self._is_acknowledged else {}),
+        }

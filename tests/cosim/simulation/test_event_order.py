@@ -1,0 +1,125 @@
+"""The core drives the machines of a run as the plain driver in Python does, bit for bit."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
+from noack.config.loops import loops_of
+from noack.config.resolution import resolve, tables_of
+from noack.config.scenario_file import load, validate
+from noack.core.core_library import core, ffi
+from noack.protocol.record_tables import OWNER
+from tests.cosim.simulation.shuttle import Shuttle, shuttled
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+IMPAIRMENTS = [
+    {"kind": "duplicate", "probability": 0.3},
+    {"kind": "corrupt", "probability": 0.3},
+    {"kind": "delay", "delay_s": 0.01, "jitter_s": 0.01},
+]
+FLOWS: dict[str, dict[str, Any]] = {
+    "updates": {},
+    "acknowledgements": {"protocol": "ack", "acknowledgements": {"impairments": IMPAIRMENTS}},
+    "actuations": {"actuation": {"impairments": IMPAIRMENTS, "mansd": 2}},
+}
+LOOPS = [
+    {"name": "pendulum", "count": 3},
+    {"name": "periodic", "trigger": {"policy": "periodic", "period_s": 0.1}},
+    {
+        "name": "oscillator",
+        "model": {"A": [[0.0, 1.0, 0.0], [-1.0, -0.1, 0.0], [0.0, 0.0, -1.0]],
+                  "B": [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+                  "gain": [[-1.0, -1.0, 0.0], [0.0, 0.0, -1.0]]},
+        "plant": {"initial_state": [0.1, 0.0, 0.1], "initial_state_halfwidth": [0.0, 0.0, 0.0],
+                  "uncertainty_A": [[0.0] * 3] * 3, "uncertainty_B": [[0.0] * 2] * 3},
+    },
+]  # fmt: skip
+"""Those of the last entry have vectors of other lengths."""
+
+
+def require_equal(found: RunRecord, expected: RunRecord) -> None:
+    for table in expected.tables:
+        assert found[table].dtype == expected[table].dtype
+        assert found[table].tobytes() == expected[table].tobytes(), table
+    assert found.reports == expected.reports
+    assert found.notices == expected.notices
+
+
+@pytest.mark.parametrize("flows", FLOWS)
+def test_one_loop(flows: str) -> None:
+    network = {"impairments": IMPAIRMENTS} | FLOWS[flows]
+    base = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"])
+    given = base.model_dump(mode="json", exclude_none=True)
+    resolved = resolve(validate(given | {"network": given["network"] | network}, ""))
+    found = simulate(resolved)
+    require_equal(found, shuttled(resolved))
+    rejected = {
+        reason for report in found.reports.values() for reason in report["channel"]["rejected"]
+    }
+    assert {"stale", "tag"} <= rejected
+
+
+def test_changes_during_the_run() -> None:
+    changes = [
+        {"at_s": 0.5, "set": {"network.loss.good_to_bad": 0.9, "network.mansd": 1}},
+        {"at_s": 1.0, "set": {"trigger.beta": 0.1, "controller.setpoint": [0.0, 0.0]}},
+    ]
+    given = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"]).model_dump(
+        mode="json", exclude_none=True
+    )
+    resolved = resolve(validate(given | {"changes": changes}, ""))
+    require_equal(simulate(resolved), shuttled(resolved))
+
+
+def test_a_scripted_network() -> None:
+    resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"]))
+
+    def decide(data: bytes, now_ns: int) -> int | None:
+        return None if data[16] % 3 == 1 else now_ns % 70_000_000
+
+    require_equal(simulate(resolved, decide), shuttled(resolved, decide))
+
+
+def test_loops_of_different_sizes_on_one_network() -> None:
+    given = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=2.0"]).model_dump(
+        mode="json", exclude_none=True
+    )
+    rate = {"kind": "rate", "rate_bps": 50_000, "queue": 6}
+    network = given["network"] | {
+        "impairments": [rate, IMPAIRMENTS[1]], "actuation": {"impairments": IMPAIRMENTS},
+    }  # fmt: skip
+    scenario = validate(given | {"network": network, "loops": LOOPS}, "")
+    shuttle = Shuttle(scenario, [resolve(one) for one in loops_of(scenario)], numbered=True)
+    shuttle.run()
+    found = simulate_loops(scenario)
+    for table in ("netem_packet", "netem_release"):
+        rows = np.array(shuttle.rows.get(table, []), found.network[table].dtype)
+        assert rows.tobytes() == found.network[table].tobytes()
+    for number, record in enumerate(found.loops):
+        for table, dtype in tables_of(record.scenario).items():
+            if OWNER[table] != "netem":
+                own = [row[1:] for row in shuttle.rows.get(table, []) if row[0] == number]
+                assert np.array(own, dtype).tobytes() == record[table].tobytes(), table
+        received = record.reports["controller"]["channel"]
+        assert received == shuttle.decoders["controller"][number].report()
+    assert found.loops[4]["plant_step"]["x"].shape[1] == 3
+
+
+def test_numbers_of_no_simulation_are_refused() -> None:
+    resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=1.0"]))
+    run = VirtualRun(resolved, (resolved,), numbered=False)
+    own = run.core
+    for name, value in (("loops", 2), ("groups", 0), ("sent_places", 3), ("sent_count", -1)):
+        before = getattr(own, name)
+        setattr(own, name, value)
+        assert core.noack_simulation_check(own) != ffi.NULL
+        setattr(own, name, before)
+    own.directions[2] = 1
+    assert core.noack_simulation_check(own) != ffi.NULL
+    own.directions[2] = 0
+    own.of_loop[0].place = 1
+    assert core.noack_simulation_check(own) != ffi.NULL

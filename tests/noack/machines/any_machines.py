@@ -1,0 +1,342 @@
+"""Random machines with every kind of setting: the same numbers make the same machine."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from hypothesis import strategies as st
+
+from controller_node.controller import Controller
+from noack.controllers.controller_settings import ControlFailedError
+from noack.controllers.linear_feedback import LinearFeedback
+from noack.core.core_library import core, ffi
+from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.ordered_arithmetic import product
+from noack.impairments.loss_guarantee import (
+    DeliveriesBetweenBursts,
+    LongestBurst,
+    LossesInWindow,
+    LossGuarantee,
+)
+from noack.machines.loop_machines import LoopMachines
+from noack.observers.estimation_model import EstimationModel
+from noack.observers.kalman import KalmanSettings
+from noack.observers.luenberger import LuenbergerSettings
+from noack.plants.linear import LinearSystem
+from noack.plants.systems.plant_system import SystemFailedError
+from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
+from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.trigger.absolute import AbsoluteTrigger
+from noack.trigger.deadline import DeadlineTrigger
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.dwell import DwellTrigger
+from noack.trigger.dynamic import DynamicTrigger
+from noack.trigger.lyapunov import LyapunovTrigger
+from noack.trigger.mixed import MixedTrigger
+from noack.trigger.periodic_trigger import PeriodicTrigger
+from noack.trigger.quadratic import QuadraticTrigger
+from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.self_triggered_interval import Forecast
+from noack.trigger.send_on_area import SendOnAreaTrigger
+from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
+from plant_server.disturbance_signal import Disturbance
+from plant_server.measurement import MeasurementModel
+from plant_server.plant import Plant
+from plant_server.watchdog import NEVER_NS, Watchdog
+from sensor_node.observer import Observer
+from sensor_node.sensor import Sensor
+
+MS = 1_000_000
+Rng = np.random.Generator
+
+
+class Sizes(NamedTuple):
+    """What the machines of a process have in common: the columns of their rows."""
+
+    n: int
+    m: int
+    outputs: int = 0
+    """0: no observer."""
+    measure_every: int = 1
+    predictions: int = 1
+    predictive: bool = False
+    acknowledged: bool = False
+    internal: int = 0
+    """Above 0: the user's system."""
+    disturbed: tuple[bool, bool] = (False, False)
+
+
+@st.composite
+def sizes(draw: st.DrawFn, most: int = 4) -> Sizes:
+    n, m = draw(st.integers(1, most)), draw(st.integers(1, most))
+    predictive = draw(st.booleans()) and n + m <= 64
+    outputs = draw(st.integers(0, min(n, 64 - m)))
+    return Sizes(
+        n, m, outputs,
+        draw(st.integers(1, min((64 - outputs) // m, 3))),
+        draw(st.integers(1, min((64 - n * predictive) // m, 3))),
+        predictive, draw(st.booleans()), draw(st.integers(0, 3)),
+        draw(st.tuples(st.booleans(), st.booleans())),
+    )  # fmt: skip
+
+
+def chance(rng: Rng) -> bool:
+    return bool(rng.random() < 0.5)
+
+
+def policies(rng: Rng, n: int) -> list[Policy]:
+    """A policy of each form."""
+    W = np.eye(n) + 0.1 * rng.normal(size=(n, n)) if chance(rng) else None
+    form, root = rng.normal(size=(2 * n, 2 * n)), rng.normal(size=(n, n))
+    P, Q, BK = root @ root.T + np.eye(n), np.eye(n), rng.normal(size=(n, n))
+    small = float(rng.choice([1e-6, 0.02, 0.5]))
+    absolute = AbsoluteTrigger(small, W)
+    interval_ns = int(rng.integers(1, 80)) * MS
+    forecast = Forecast(0.5, 0.25, small, *rng.uniform(0, 5, 3))
+    return [
+        DecayingTrigger(0.5, 0.25, small, W),
+        absolute,
+        MixedTrigger(0.2, small, W),
+        QuadraticTrigger(form + form.T, interval_ns, small, 3 * chance(rng), W),
+        LyapunovTrigger(np.linalg.cholesky(P).T, 0.7, W),
+        DynamicTrigger(0.3, 0.1, 0.8 * chance(rng), P, Q, BK, initial_dynamic_variable=0.2),
+        PeriodicTrigger(interval_ns, W),
+        DeadlineTrigger(absolute, interval_ns),
+        DwellTrigger(absolute, interval_ns),
+        SelfTrigger(forecast, 1000, interval_ns, W),
+        SendOnAreaTrigger(0.1 * small, W),
+        CodedPolicy(W, lambda: UserTrigger(small), "it is code"),
+    ]
+
+
+@dataclass
+class UserTrigger:
+    """A user's trigger: the policy ``absolute``, in Python."""
+
+    delta: float
+    calls: list[str] = field(default_factory=list)
+
+    def start(self, t_ns: int, x: Vector) -> None:
+        self.calls.append("start")
+
+    def restart(self, t_ns: int, x: Vector) -> None:
+        self.calls.append("restart")
+
+    def change(self, policy: Policy) -> None:
+        """Its settings do not change."""
+
+    def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
+        self.calls.append("test")
+        left = norm(e_s)
+        return TriggerDecision(left > self.delta, left, self.delta)
+
+
+class UserSystem:
+    """A user's system with a state of its own; it may fail at a time."""
+
+    def __init__(self, A: Matrix, B: Matrix, x: Vector, z: Vector, fails_ns: int) -> None:
+        self.A, self.B, self.x, self.z, self._fails_ns = A, B, x, z, fails_ns
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        if t_ns >= self._fails_ns:
+            raise SystemFailedError("the system fails")
+        self.x = product(self.A, self.x) + product(self.B, u[: self.B.shape[1]])
+        self.z = self.z + 1.0
+
+
+@dataclass
+class UserLaw:
+    """A user's law; it may fail."""
+
+    K: Matrix
+    fails_s: float = np.inf
+
+    def update(self, t_s: float, x: Vector) -> None:
+        if t_s > self.fails_s:
+            raise ControlFailedError("the law fails")
+
+    def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
+        self.update(t_s, x_c)
+        return LinearFeedback(self.K).input(t_s, x_c, setpoint)
+
+
+def matrix(rng: Rng, scale: float, *shape: int) -> Matrix:
+    return np.asarray(scale * rng.uniform(-1, 1, shape))
+
+
+def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) -> Plant:
+    """A plant; ``scale`` is that of its matrices and its state."""
+    rng = np.random.default_rng(seed)
+    n, m, (d, w) = of.n, of.m, of.disturbed
+    A, B, x0 = matrix(rng, scale, n, n), matrix(rng, scale, n, m + n * w), matrix(rng, scale, n)
+    if of.internal:
+        fails_ns = int(rng.choice([300 * MS, NEVER_NS]))
+        system: Any = UserSystem(A, B[:, :m], x0, np.zeros(of.internal), fails_ns)
+    else:
+        system = LinearSystem(A, B, x0, step_ns=period_ns)
+    waves = [_waves(rng, m)] * d, [_waves(rng, n)] * w
+    outputs = of.outputs or n
+    C = None if outputs == n and chance(rng) else matrix(rng, 1.0, outputs, n)
+    return Plant(
+        system, m, period_ns, 10**12,
+        Watchdog(int(rng.choice([30 * MS, NEVER_NS])), "model", 35 * MS,
+                 matrix(rng, scale, n, n) * chance(rng), matrix(rng, scale, m, n))
+        if of.predictive else
+        Watchdog(int(rng.choice([0, 30 * MS])), str(rng.choice(["hold", "zero"])), 35 * MS),
+        of.measure_every, of.predictions, int(rng.integers(1, 20)) * MS,
+        Disturbance(*waves, (m * d, n * w)) if d or w else None,
+        MeasurementModel(C, *(chance(rng) * np.ones((2, outputs))), seed),
+        reports_inputs=of.outputs > 0,
+    )  # fmt: skip
+
+
+def _waves(rng: Rng, width: int) -> Callable[[range], Matrix]:
+    hz = rng.uniform(0, 1, width)
+    return lambda steps: np.sin(np.outer(steps, hz))
+
+
+def sensor(seed: int, of: Sizes, form: int, scale: float = 1.0) -> Sensor:
+    """A sensor with a policy of the form of this number."""
+    rng = np.random.default_rng(seed)
+    n, m, steps = of.n, of.m, of.measure_every
+    every = policies(rng, n)
+    H = matrix(rng, scale, n, n) * chance(rng)
+    return Sensor(
+        H, every[form % len(every)], matrix(rng, scale, n) if chance(rng) else None, m,
+        10 * MS, GENERATION * chance(rng), matrix(rng, scale, n) if chance(rng) else None,
+        timeout_ns=int(rng.integers(0, 50)) * MS if of.acknowledged else None,
+        observer=observer(rng, of.outputs, n, m, steps, scale) if of.outputs else None,
+    )  # fmt: skip
+
+
+def observer(rng: Rng, p: int, n: int, m: int, steps: int, scale: float) -> Observer:
+    eye, C = np.eye(n), matrix(rng, 1.0, p, n)
+    Ad, Bd = 0.5 * matrix(rng, scale, n, n), matrix(rng, scale, n, m)
+    model = EstimationModel(Ad, Bd, eye, C, 0.1 * eye, 0.2 * np.eye(p), steps)
+    rows = tuple(tuple(row) for row in matrix(rng, scale, n, p).tolist())
+    if chance(rng):
+        settings: Any = KalmanSettings(kind="kalman", initial_std=(0.5,) * n)
+    else:
+        settings = LuenbergerSettings(kind="luenberger", gain=rows)
+    x, known = matrix(rng, scale, n), chance(rng)
+    return Observer(settings, model, x, steps * m, 10 * MS, known, restarted=chance(rng))
+
+
+def controller(
+    seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS, first_ns: int | None = None
+) -> Controller:
+    rng = np.random.default_rng(seed)
+    n, m = of.n, of.m
+    K = matrix(rng, scale, m, n)
+    laws = [LinearFeedback(K), UserLaw(K), UserLaw(K, float(rng.uniform(0, 0.3)))]
+    constraints = [LossesInWindow(1, 3), DeliveriesBetweenBursts(2)]
+    chosen = [LongestBurst(int(rng.integers(0, 3))), *constraints[: rng.integers(0, 3)]]
+    point = (matrix(rng, scale, n), matrix(rng, scale, m)) if chance(rng) else None
+    return Controller(
+        matrix(rng, scale, n, n) * chance(rng), laws[rng.integers(0, 3)], m, period_ns,
+        int(rng.integers(0, 10)) * MS if first_ns is None else first_ns, 10**12,
+        LossGuarantee(tuple(chosen)), matrix(rng, scale, n) if chance(rng) else None,
+        of.acknowledged, Start(int(chance(rng)), 33 * MS), matrix(rng, scale, m),
+        of.predictive, of.predictions, point,
+    )  # fmt: skip
+
+
+class Inputs:
+    """Random inputs of machines: ticks in time or late, and messages after losses.
+
+    Args:
+        machines: the machines.
+        seed: of the choices.
+        values: what entries of vectors are drawn from; by default from (-1, 1).
+    """
+
+    def __init__(self, machines: LoopMachines, seed: int, values: Sequence[float] = ()) -> None:
+        self._machines, self._rng, self._values = machines, np.random.default_rng(seed), values
+        self._now_ns = max(machines.phases_ns)
+        self._numbers: dict[tuple[int, Flow], int] = {}
+        self._measured_ns = [0] * len(machines.parts)
+        self.sent: list[list[Message]] = [[] for _ in machines.parts]
+        """What each loop's machine has sent; :func:`driven` adds to it."""
+
+    def next(self) -> tuple[Message | None, int]:
+        """Return a message, or None for the next tick, and the time of its arrival."""
+        due_ns = self._machines.next_deadline_ns()
+        if due_ns is not None and chance(self._rng):
+            late_ns = int(self._rng.choice([0, 0, 1, 25 * MS]))
+            self._now_ns = max(self._now_ns, due_ns + late_ns)
+            return None, self._now_ns
+        self._now_ns += int(self._rng.integers(0, 15)) * MS
+        return self._message(int(self._rng.integers(len(self._machines.parts)))), self._now_ns
+
+    def _message(self, loop: int) -> Message:
+        own, part = self._machines, self._machines.parts[loop]
+        own_ns = self._now_ns - own.phases_ns[loop]
+        if part.shape.acknowledged and self.sent[loop] and chance(self._rng):
+            update = self.sent[loop][self._rng.integers(-3, 0) % len(self.sent[loop])]
+            number = update.sequence + int(self._rng.choice([0, 0, 1000]))
+            return Message(Flow.ACKNOWLEDGEMENT, number, update.t_ns, NO_VECTOR, loop)
+        if own.role.receives is Flow.MEASUREMENT:
+            self._measured_ns[loop] += int(self._rng.choice([1, 1, 2, 7])) * 10 * MS
+            own_ns = self._measured_ns[loop]
+        else:
+            own_ns = max(own_ns - int(self._rng.integers(-30, 40)) * MS, 0)
+        number = self._numbers.get((loop, own.role.receives), -1)
+        number += int(self._rng.choice([1, 1, 1, 2, 4]))
+        self._numbers[loop, own.role.receives] = number
+        entries = own.machines[loop].machine.received.entries
+        vector = self._rng.uniform(-1, 1, entries)
+        if self._values:
+            vector = self._rng.choice(self._values, entries)
+        return Message(own.role.receives, number, own_ns, vector, loop)
+
+
+def driven(
+    machines: LoopMachines, inputs: Inputs, count: int
+) -> Iterator[tuple[int, Message | None, int, list[Any]]]:
+    """Give machines inputs; yield the loop, the input, its time and the plain outputs of each."""
+    for _ in range(count):
+        message, now_ns = inputs.next()
+        if message is None:
+            loop = int(machines.core.heap[0])
+            outputs = machines.on_timer(now_ns)
+        else:
+            loop, outputs = message.loop, machines.handle(message, now_ns)
+        sent = [one for one in outputs if isinstance(one, Message)]
+        assert {one.loop for one in sent} <= {loop}
+        inputs.sent[loop] += sent
+        yield loop, message, now_ns, plain(outputs, machines.numbered)
+
+
+def plain(outputs: Sequence[Output], numbered: bool) -> list[Any]:
+    """Outputs to compare bit for bit, without the number of their loop."""
+    return [_plain(output, numbered) for output in outputs]
+
+
+def _plain(output: Output, numbered: bool) -> Any:
+    if isinstance(output, Notice):
+        return output._replace(loop=None)
+    if isinstance(output, Message):
+        return output.flow, output.sequence, output.t_ns, output.vector.tobytes()
+    row = output.row[numbered:]
+    return output.table, [np.asarray(entry).tobytes() for entry in row]
+
+
+def text_of(own: LoopMachines) -> str | None:
+    """What the core refuses; None if nothing."""
+    text = core.noack_process_check(own.core)
+    return None if text == ffi.NULL else ffi.string(text).decode()
+
+
+def set_number(own: LoopMachines, path: str, value: Any) -> None:
+    """Set a field of the process or, if it has none of that name, of its machine."""
+    first, *_ = re.split(r"[.\[]", path)
+    owner = own.core if hasattr(own.core, first) else own.machines[0]
+    *way, last = re.findall(r"\w+", path)
+    for name in way:
+        owner = owner[int(name)] if name.isdigit() else getattr(owner, name)
+    if last.isdigit():
+        owner[int(last)] = value
+    else:
+        setattr(owner, last, value)

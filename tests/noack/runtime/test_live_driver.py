@@ -1,0 +1,267 @@
+"""The live driver does with sockets what the machines do one input at a time.
+
+It also runs with a core that has sanitizers (tests/native/test_sanitized.py).
+"""
+
+import errno
+import os
+import signal
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.core.clock import SlewedRunClock
+from noack.core.clock_offset import ClockOffset, Exchange
+from noack.core.core_library import core
+from noack.core.slewed_clock import SlewedClock
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.runtime.live_driver import LiveDriver
+from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+NOW = "now_ns"
+
+
+def columns(live: Live, table: str) -> Sequence[str]:
+    """Return the columns of a table of its machines."""
+    for number, name in enumerate(live.machines.role.tables):
+        if name == table:
+            names = live.machines._tables[number].dtype.names
+            assert names is not None
+            return names
+    raise KeyError(table)
+
+
+def one_by_one(live: Live, inputs: Sequence[tuple[Message | None, int]]) -> tuple[Any, Any]:
+    """Pass inputs, each with its time, to machines without a driver; return messages and rows."""
+    sent, rows = [], []
+    for message, now_ns in inputs:
+        alone = live.alone
+        for output in alone.on_timer(now_ns) if message is None else alone.handle(message, now_ns):
+            if isinstance(output, Message):
+                sent.append(live.encoder.encode(output))
+            elif isinstance(output, Record):
+                rows.append(plain(output.row))
+    return sent, rows
+
+
+def measurements(count: int, loops: int = 1) -> list[Message]:
+    """Return measurements of an erratic state of each loop."""
+    draw = np.random.default_rng(1)
+    return [
+        measurement(k + 1, draw.normal(size=2).tolist(), loop)
+        for k in range(count) for loop in range(loops)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("loops", "encrypted"), [(1, False), (1, True), (3, False), (70, True)])
+def test_messages_are_handled_in_order_and_answered(
+    content: dict[str, Any], loops: int, encrypted: bool
+) -> None:
+    phases_ns = [1000 * k for k in range(loops)]
+    resolved = [scenario(content)] * loops
+    given = measurements(2000 // loops, loops)
+    with closing(Live("sensor", resolved, phases_ns, encrypted=encrypted)) as live:
+        live.send(*given)
+        live.drive_until_accepted(len(given))
+        names = columns(live, SENSOR_MEASUREMENT)
+        times_ns = live.rows.of(SENSOR_MEASUREMENT, names, NOW)
+        sent, rows = one_by_one(
+            live,
+            [(message, now_ns + phases_ns[message.loop])
+             for message, now_ns in zip(given, times_ns, strict=True)],
+        )  # fmt: skip
+        assert repr(live.rows.tables) == repr({SENSOR_MEASUREMENT: rows})  # with NaN
+        assert received(live.peer) == sent
+        assert len(sent) > 0
+        live.channel.finish(0, live.rows)
+        report = live.channel.report()
+        assert (report["accepted"], report["rejected"]) == (len(given), {})
+        assert (report["sent"], report["send_errors"]) == (len(sent), {})
+        own = "{}:{}".format(*live.peer.getsockname())
+        assert report["received_from"] == {own: len(given)}
+        assert report["lost_in_kernel"] == 0
+        each: Any = report.get("loops", [])
+        assert [one["accepted"] for one in each] == [len(given) // loops] * (loops > 1) * loops
+
+
+@pytest.mark.parametrize("loops", [1, 20])
+@pytest.mark.parametrize("rest_ns", [0, 1_000_000])
+@pytest.mark.parametrize("role", ["plant", "controller"])
+def test_ticks_are_done_in_order_and_never_early(
+    content: dict[str, Any], role: str, loops: int, rest_ns: int
+) -> None:
+    resolved = scenario(content, horizon_s=0.05)
+    phases_ns = [100_000 * k for k in range(loops)]
+    with closing(Live(role, [resolved] * loops, phases_ns, rest_ns=rest_ns)) as live:
+        live.drive(lambda: live.driver.next_deadline_ns() is None)
+        table = PLANT_STEP if role == "plant" else CONTROLLER_STEP
+        names = columns(live, table)
+        due_ns, now_ns = (live.rows.of(table, names, one) for one in ("t_ns", NOW))
+        numbers = live.rows.of(table, names, "loop") if loops > 1 else [0] * len(due_ns)
+        phases = [phases_ns[number] for number in numbers]
+        assert all(now >= due for now, due in zip(now_ns, due_ns, strict=True))
+        in_run = [(due + phase, number)
+                  for due, phase, number in zip(due_ns, phases, numbers, strict=True)]  # fmt: skip
+        assert in_run == sorted(in_run)
+        sent, rows = one_by_one(
+            live, [(None, now + phase) for now, phase in zip(now_ns, phases, strict=True)]
+        )
+        assert repr(live.rows.tables) == repr({table: rows})
+        assert received(live.peer) == sent
+        assert len(sent) > loops
+
+
+def test_messages_and_ticks_of_a_controller_alternate(content: dict[str, Any]) -> None:
+    resolved = scenario(content, horizon_s=0.2)
+    with closing(Live("controller", [resolved])) as live:
+        for number in range(50):
+            live.send(Message(Flow.UPDATE, number, number, np.array([1.0, -1.0])))
+            live.drive_until_accepted(number + 1)
+        live.drive(lambda: live.driver.next_deadline_ns() is None)
+        assert [len(live.rows.tables[one]) for one in (CONTROLLER_DELIVERY, CONTROLLER_STEP)] == [
+            50, live.driver.core.sent,
+        ]  # fmt: skip
+
+
+def test_users_code_is_asked(content: dict[str, Any]) -> None:
+    resolved = resolve(load(SCENARIOS / "lane_python_trigger.toml", ()))
+    draw = np.random.default_rng(1)
+    period_ns = resolved.timing.measurement_period_ns
+    given = [
+        Message(Flow.MEASUREMENT, k, k * period_ns, draw.normal(size=4)) for k in range(1, 200)
+    ]
+    with closing(Live("sensor", [resolved])) as live:
+        live.send(*given)
+        live.drive_until_accepted(len(given))
+        times_ns = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
+        sent, rows = one_by_one(live, list(zip(given, times_ns, strict=True)))
+        assert repr(live.rows.tables) == repr({SENSOR_MEASUREMENT: rows})  # with NaN
+        assert received(live.peer) == sent
+
+
+def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[str, Any]) -> None:
+    network = content["network"] | {"protocol": "ack"}
+    resolved = scenario(content, network=network)
+    with closing(Live("sensor", [resolved], acknowledged=True)) as live:
+        live.send(*measurements(5))
+        live.drive_until_accepted(5)
+        update = live.encoder.encode(Message(Flow.UPDATE, 0, 10**6, np.array([0.0, 0.0])))
+        assert [data[:24] for data in received(live.peer)] == [update[:24]]  # it waits for another
+        answer = Message(Flow.ACKNOWLEDGEMENT, 0, 10**6, NO_VECTOR)
+        live.send(answer)  # from another address than the emulator's
+        live.send(answer, by=live.answers)
+        live.send(answer, by=live.answers)
+        machine = live.machines.machines[0].machine
+        live.drive(lambda: machine.acknowledgements.rejected[core.NOACK_STALE] == 1)
+        report = live.channel.report()
+        assert report["acknowledgements"] == {
+            "accepted": 1, "rejected": {"source": 1, "stale": 1}
+        }  # fmt: skip
+        assert (report["accepted"], report["rejected"]) == (5, {})
+        assert sorted(live.rows.tables) == ["sensor_acknowledgement", SENSOR_MEASUREMENT]
+
+
+def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -> None:
+    network = content["network"] | {"protocol": "ack"}
+    with closing(Live("controller", [scenario(content, network=network)])) as live:
+        live.send(Message(Flow.UPDATE, 3, 0, np.array([1.0, -1.0])))
+        live.drive_until_accepted(1)
+        answer = Message(Flow.ACKNOWLEDGEMENT, 3, 0, NO_VECTOR)
+        assert received(live.answers) == [live.encoder.encode(answer)]
+        assert live.encoder.encode(answer) not in received(live.peer)
+
+
+def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
+    with closing(Live("sensor", [scenario(content)])) as live:
+        live.driver.core.sender = -1
+        live.send(*measurements(1))
+        live.drive_until_accepted(1)
+        report = live.channel.report()
+        text = str(OSError(errno.EBADF, os.strerror(errno.EBADF)))
+        assert (report["sent"], report["send_errors"]) == (0, {text: 1})
+
+
+def test_messages_from_before_the_admission_are_stale(content: dict[str, Any]) -> None:
+    phases_ns = [0, 4_000_000]
+    loops = [scenario(content)] * 2
+    with closing(Live("sensor", loops, phases_ns, admitted_ns=10_000_000)) as live:
+        # In the run's time 9 and 10 ms; of the second loop 9 and 10 ms, too.
+        given = [measurement(k, [1.0, 0.0], loop) for loop in (0, 1)
+                 for k in (9 - 4 * loop, 10 - 4 * loop)]  # fmt: skip
+        live.send(*given)
+        live.drive(lambda: sum(live.driver.rejected.values()) + live.driver.accepted == 4)
+        assert live.driver.reports() == [{"accepted": 1, "rejected": {"stale": 1}}] * 2
+
+
+def test_it_returns_at_once_if_no_tick_is_near_and_after_a_near_one(
+    content: dict[str, Any],
+) -> None:
+    with closing(Live("controller", [scenario(content)], since_ns=-HOUR_NS)) as live:
+        live.driver.drive(live.clock.now_ns() - 1, live.rows)
+        assert live.rows.tables == {}
+    # The first tick, at 1 ms, is nearer than the time that housekeeping may take.
+    with closing(Live("controller", [scenario(content)], since_ns=600_000)) as live:
+        live.driver.drive(live.clock.now_ns() - 1, live.rows)
+        assert len(live.rows.tables[CONTROLLER_STEP]) >= 1
+
+
+def test_a_signal_ends_its_sleep(content: dict[str, Any]) -> None:
+    seen = list[int]()
+    before = signal.signal(signal.SIGALRM, lambda number, frame: seen.append(number))
+    try:
+        with closing(Live("sensor", [scenario(content)])) as live:
+            # Again and again: the first may come before it sleeps.
+            signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
+            live.driver.drive(live.clock.now_ns() + HOUR_NS, live.rows)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert seen
+
+
+def test_it_reads_another_hosts_clock(content: dict[str, Any]) -> None:
+    own_ns, offset = time.monotonic_ns(), ClockOffset()
+    offset.add(Exchange(own_ns, own_ns + HOUR_NS, own_ns + HOUR_NS, own_ns))
+    slewed = SlewedClock(offset, own_ns)
+    clock = SlewedRunClock(own_ns + HOUR_NS, 1.0, slewed)
+    with closing(Live("sensor", [scenario(content)])) as live:
+        live.clock = clock
+        live.driver.set_clock(clock)
+        live.send(*measurements(3))
+        before_ns = clock.now_ns()
+        live.drive_until_accepted(3)
+        after_ns = clock.now_ns()
+        found = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
+        assert before_ns <= found[0] <= found[1] <= found[2] <= after_ns
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("receiver_count", 3, "receiver_count: not from 0 to 2"),
+        ("spin_ns", -1, "spin_ns"),
+        ("rest_ns", 10**9, "rest_ns"),
+    ],
+)
+def test_numbers_that_it_cannot_act_on_are_refused(
+    content: dict[str, Any], field: str, value: int, message: str
+) -> None:
+    with closing(Live("sensor", [scenario(content)])) as live:
+        setattr(live.driver.core, field, value)
+        with pytest.raises(ValueError, match=message):
+            LiveDriver._check(live.driver)

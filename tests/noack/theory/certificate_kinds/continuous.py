@@ -1,0 +1,96 @@
+"""The paper's conditions: continuous time, an instant network, and the bounds from its flow.
+
+The search for bad losses is that of :mod:`tests.noack.theory.certificate_kinds.decaying`.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from noack.theory.certificate_terms import NetworkConditions, VoidError
+from noack.theory.kernel_bounds import NotDecayingError
+from tests.noack.theory.broken_flow import BROKEN_FLOWS
+from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
+from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
+from tests.noack.theory.continuous_runs import ContinuousTrace, simulate_continuous_time
+from tests.noack.theory.loops import System, random_system
+
+_ROUNDED = 1e-12
+"""E is computed from rounded matrices; it is not 0 where it should be."""
+
+
+def _draw(rng: np.random.Generator, **fixed: Any) -> System:
+    given = {"sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "known_start": True}
+    return random_system(rng, **(given | fixed))
+
+
+def _conditions(system: System) -> NetworkConditions:
+    return NetworkConditions(system.guarantee.longest_burst, constraints=system.guarantee.rules[1:])
+
+
+def _bounds(system: System) -> Bounds | None:
+    try:
+        found = system.certify(_conditions(system))
+    except (VoidError, NotDecayingError):
+        return None
+    more = {"x_W": found.state_weighted, "E x": max(found.mismatch, _ROUNDED)}
+    return bounds_of(found, system.beta) | more
+
+
+def _without_one_loss(system: System) -> Bounds | None:
+    return _bounds(replace(system, mansd=system.mansd - 1))
+
+
+def _broken(mistake: Callable[[], AbstractContextManager[Any]], system: System) -> Bounds | None:
+    with mistake():
+        return _bounds(system)
+
+
+def _worst(system: System, trace: ContinuousTrace) -> dict[str, float]:
+    return {
+        "e_s": float(trace.sensor_error.max()),
+        "e_c": float(trace.controller_error.max()),
+        "x": float(trace.state.max()),
+        "x_W": float(trace.state_weighted.max()),
+        "u − Kx": float(trace.input_error.max()),
+        "E x": float(trace.mismatch.max()),
+        "1/δ": 1 / trace.inter_event_s,
+    }
+
+
+def _simulate(system: System, rng: np.random.Generator) -> Observed:
+    return search(system, rng, simulate_continuous_time, _worst)
+
+
+_MISMATCH = partial(_draw, mismatch=0.5, window=(1, 1), recovery=0)
+
+
+def _dominated_by_errors(rng: np.random.Generator) -> System:
+    """A loop near an example in which errors drive x further than x(0) is away.
+
+    Half of the loops start near 0; the others' first events come soon.
+    """
+    near = rng.uniform(0.9, 1.1, (4, 2))
+    K, far = np.array([[-6.0, -3.0]]) * near[:1], rng.uniform() < 0.5
+    return System(
+        A=np.array([[0.0, 1.0], [2.0, -0.5] * near[1]]), B=np.array([[0.0], [1.0]]), K=K,
+        H=np.array([[0.1, 1.0], [-3.6, -3.4] * near[2]]),
+        weight=np.array([[2.0, 0.4], [0.0, 0.5]]),
+        x0=np.array([0.4, -0.2] if far else [0.01, 0.02]) * near[3],
+        alpha=0.3, beta=0.1, known_start=True, mansd=3, step_s=0.03, sample_steps=1,
+        delay_steps=0, hold_steps=0, lag_steps=0,
+    )  # fmt: skip
+
+
+CONTINUOUS = Kind(
+    "continuous time", _draw, _bounds, _simulate,
+    {"one loss less": Broken(_without_one_loss, partial(_MISMATCH, mansd=1, n=1))}
+    | {
+        name: Broken(partial(_broken, mistake), _dominated_by_errors)
+        for name, mistake in BROKEN_FLOWS.items()
+    },
+)  # fmt: skip

@@ -1,0 +1,277 @@
+"""The network of a run in plain Python: datagrams in, surviving datagrams out, maybe later.
+
+The core decides for each packet (native/link.c). What follows from the decisions is stated here
+once more, for native/channel.c: rows, copies, flipped bits, and the order of departures.
+"""
+
+import heapq
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped, link_name
+from netem.link_state import LinkState
+from noack.config.parameter_changes import ChangeSchedule, FixedMachine, ParameterChange
+from noack.config.scenario import Scenario
+from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    NETEM_SETTING,
+    PACKET_HEAD_BYTES,
+    Fate,
+)
+
+
+class _InFlight(NamedTuple):
+    """A delayed datagram or copy; at equal times, datagrams leave in their order of arrival."""
+
+    release_ns: int
+    number: int
+    packet: int
+    copy: bool
+    counts: bool
+    """Whether it is the datagram's first intact copy."""
+    delayed: bool
+    datagram: Datagram
+
+
+T = TypeVar("T", bound=Any)
+
+
+class Link:
+    """The machine of the network emulator.
+
+    Args:
+        settings: the settings; they must not name files.
+        seed: seed of its random streams.
+        name: names of the link and the direction; part of its random streams' names.
+        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        first_number: number of the first input and of the first packet.
+        schedule: announced changes of the settings; None: nothing can be announced.
+        restarted: the link has replaced another in a run; see
+            :class:`netem.link_state.LinkState`.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        decisions: Sequence[Sequence[RecordedDecision]] = (),
+        first_number: int = 0,
+        schedule: ChangeSchedule | None = None,
+        restarted: bool = False,
+    ) -> None:
+        self._state = LinkState(settings, seed, *name, decisions=decisions, restarted=restarted)
+        self._schedule = schedule
+        self._reached_ns = -1
+        self._rows: dict[int, int] = {}
+        self._in_flight: list[_InFlight] = []
+        self._put_in_flight = 0
+        self._inputs = self._first_number = first_number
+
+    @property
+    def counters(self) -> Counters:
+        """Counts so far."""
+        return self._state.counters
+
+    @property
+    def decision(self) -> Any:
+        """The decision for the last datagram, a ``noack_decision``; overwritten by the next."""
+        return self._state.decision
+
+    @property
+    def in_flight(self) -> int:
+        """Number of datagrams and copies in flight."""
+        return int(self._state.core.in_flight)
+
+    def flow(self, flow: int) -> Any:
+        """The state of a flow, a ``noack_flow``; None if none of its datagrams has arrived."""
+        row = self._rows.get(flow)
+        return None if row is None else self._state.flow(row)
+
+    def change(self, settings: LinkSettings) -> None:
+        """Apply other settings; see native/link_change.c."""
+        latest_ns = np.full(self._state.rows, NEVER_NS, np.int64)
+        for leaving in self._in_flight:
+            row = self._rows[leaving.datagram.flow]
+            latest_ns[row] = max(latest_ns[row], leaving.release_ns)
+        self._state.change(settings, latest_ns)
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Accept a change; it applies from the first datagram that arrives at or after its time T.
+
+        A smaller cap applies from that datagram on: if the number of consecutive losses before it
+        has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
+        largest cap that applied during it.
+        """
+        assert self._schedule is not None
+        number, self._inputs = self._inputs, self._inputs + 1
+        return self._schedule.announce(NETEM_SETTING, change, number, now_ns, self._reached_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        """Time of the next departure; None: nothing is in flight."""
+        return self._in_flight[0].release_ns if self._in_flight else None
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Forward the datagram that is due."""
+        due = heapq.heappop(self._in_flight)
+        stale = self._leave(due)
+        row = (
+            self._inputs, self._first_number + due.packet, due.release_ns, now_ns,
+            due.datagram.flow, int(due.copy), int(stale),
+        )  # fmt: skip
+        self._inputs += 1
+        return (due.datagram, Record(NETEM_RELEASE, row))
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Process a datagram; return it if it is neither lost nor delayed."""
+        self.reach(now_ns)
+        decision = self.decide(message.flow, len(message.data), now_ns)
+        head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+        row = (
+            self._inputs, self._first_number + decision.packet, min(message.arrival_ns, now_ns),
+            now_ns, message.flow, Fate(decision.fate), decision.consecutive_losses,
+            decision.release_ns, decision.copy_ns, decision.bit, len(message.data), head,
+        )  # fmt: skip
+        self._inputs += 1
+        record = Record(NETEM_PACKET, row)
+        if decision.release_ns == NEVER_NS:
+            return (record,)
+        leaving = self._release(message, decision.release_ns, decision.bit, copy=False)
+        if decision.copy_ns != NEVER_NS:
+            leaving += self._release(message, decision.copy_ns, decision.copy_bit, copy=True)
+        return (*leaving, record)
+
+    def reach(self, now_ns: int) -> None:
+        """Apply the changes that are due before a datagram of this time."""
+        if self._schedule is not None:
+            for settings in due_settings(self._schedule, self._state.settings, now_ns):
+                self.change(settings)
+            self._reached_ns = now_ns
+
+    def decide(self, flow: int, size_bytes: int, now_ns: int) -> Any:
+        """Decide for a flow's next packet; the next call overwrites the ``noack_decision``."""
+        row = self._rows.get(flow)
+        if row is None:
+            row = self._rows[flow] = len(self._rows)
+            self._state.start_flow(row, flow)
+        return self._state.decide(row, size_bytes, now_ns)
+
+    def _release(
+        self, message: Datagram, release_ns: int, bit: int, *, copy: bool
+    ) -> tuple[Datagram, ...]:
+        """Return a datagram that leaves at once, or keep it until it is due."""
+        decision = self.decision
+        counts = bit < 0 and not (copy and decision.bit < 0)
+        if bit >= 0:
+            message = message._replace(data=flipped(message.data, bit))
+        self._put_in_flight += 1
+        leaving = _InFlight(
+            release_ns, self._put_in_flight, decision.packet, copy, counts,
+            release_ns > decision.arrival_ns, message,
+        )  # fmt: skip
+        # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
+        overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
+        if leaving.delayed or overdue:
+            heapq.heappush(self._in_flight, leaving)
+            return ()
+        self._leave(leaving)
+        return (message,)
+
+    def _leave(self, leaving: _InFlight) -> bool:
+        row, size_bytes = self._rows[leaving.datagram.flow], len(leaving.datagram.data)
+        return self._state.leave(
+            row, leaving.packet, size_bytes, delayed=leaving.delayed, counts=leaving.counts
+        )
+
+
+def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> Link:
+    """Return the link from sensor to controller of a resolved scenario."""
+    schedule = ChangeSchedule(resolved, lambda one: one.network.link)
+    return link_of(resolved.network.link, resolved.seeds.loss, UPDATE_LINK, start, schedule)
+
+
+def link_of(
+    settings: LinkSettings, seed: int, name: str, start: Start,
+    schedule: ChangeSchedule | None = None,
+) -> Link:  # fmt: skip
+    """Return a link of a run."""
+    settings, names = at_start(settings, name, start)
+    return Link(
+        settings, seed, *names, first_number=start.first_number, schedule=schedule,
+        restarted=start.is_restart,
+    )  # fmt: skip
+
+
+class Duplex(FixedMachine):
+    """The machine of a network with a direction from the controller.
+
+    If the forward direction is a link with a schedule of changes, its settings may change.
+    """
+
+    def __init__(
+        self,
+        forward: Machine[Datagram],
+        reverse: Machine[Datagram],
+        *,
+        first_number: int = 0,
+        loops: int = 1,
+    ) -> None:
+        self._links = (forward, reverse)
+        self._loops = loops
+        self._inputs = first_number
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        """Accept a change of the forward direction; see :class:`Link`."""
+        forward = self._links[0]
+        if not isinstance(forward, Link):
+            return super().announce(change, now_ns)
+        return self._numbered(forward.announce(change, now_ns))
+
+    def next_deadline_ns(self) -> int | None:
+        """Time of the next departure in either direction; None: nothing is in flight."""
+        due = (link.next_deadline_ns() for link in self._links)
+        return min((t_ns for t_ns in due if t_ns is not None), default=None)
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Forward the datagram that is due; if one is due in each direction, the forward one."""
+        next_ns = self.next_deadline_ns()
+        link = next(link for link in self._links if link.next_deadline_ns() == next_ns)
+        return self._numbered(link.on_timer(now_ns))
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Process a datagram; return it if it is neither lost nor delayed."""
+        if not 0 <= message.flow < 2 * self._loops:
+            raise ValueError(f"a network of two directions has no flow {message.flow}")
+        if isinstance(forward := self._links[0], Link):
+            forward.reach(now_ns)  # a change is due for both directions at the same datagram
+        return self._numbered(self._links[message.flow // self._loops].handle(message, now_ns))
+
+    def _numbered(self, outputs: Sequence[T]) -> list[T]:
+        """Number the inputs of both directions in one sequence; an input produces one row."""
+        number, self._inputs = self._inputs, self._inputs + 1
+        return [
+            output._replace(row=(number, *output.row[1:])) if isinstance(output, Record) else output
+            for output in outputs
+        ]
+
+
+def network_of(
+    resolved: Scenario,
+    start: Start = BEGINNING,
+    forward: Machine[Datagram] | None = None,
+    loops: int = 1,
+) -> Machine[Datagram]:
+    """Return the network of a resolved scenario; ``forward`` replaces the link of the updates."""
+    forward = update_link_of(resolved, start) if forward is None else forward
+    _, *others = resolved.network.flows
+    if not others:
+        return forward
+    settings, name = resolved.network.link_of(others[0]), link_name(others[0])
+    reverse = link_of(settings, resolved.seeds.loss, name, start)
+    return Duplex(forward, reverse, first_number=start.first_number, loops=loops)

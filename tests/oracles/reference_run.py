@@ -1,0 +1,148 @@
+"""The reference loop of a scenario: its settings, and what happened by chance in a recorded run."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from noack.config.resolution import loop_of, setpoint_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_changes import with_settings
+from noack.core.random_streams import normals, uniforms
+from noack.disturbances.disturbance_settings import SignalSource
+from tests.oracles.trigger_rules import Array, Rule
+from tests.oracles.whole_loop import Chance, Settings, held_input
+
+
+def why_not(scenario: Scenario) -> str | None:
+    """Return why the reference loop cannot run a scenario; None if it can."""
+    if scenario.loops is not None:
+        return "several loops"
+    if not scenario.coverage.is_linear:
+        return f"the plant {scenario.plant.system.kind} is not linear"
+    if not scenario.controller.is_linear:
+        return "a user's controller"
+    return "a user's trigger" if scenario.trigger.policy == "python" else None
+
+
+def settings_of(scenario: Scenario) -> Settings:
+    """Return the settings of a resolved scenario."""
+    loop, timing = loop_of(scenario), scenario.timing
+    known = scenario.network.initial_sync == "known_state"
+    in_force = [(0, scenario)]
+    for change in scenario.changes:
+        changed = with_settings(in_force[-1][1], change.set)
+        in_force.append((round(change.at_s * 1e9), changed))
+    C, safe_input = scenario.plant.measurement.C, scenario.controller.safe_input
+    return Settings(
+        A=loop.A, B=loop.B, A_model=loop.A_model, B_model=loop.B_model, K=loop.K,
+        H=loop.A_model + loop.B_model @ loop.K if scenario.mode == "model" else 0 * loop.A,
+        C=np.eye(loop.n) if C is None else np.array(C),
+        x0=np.array(scenario.plant.initial_state), known_state=known,
+        plant_period_ns=timing.plant_period_ns, measure_every=scenario.plant.measure_every,
+        controller_period_ns=timing.controller_period_ns,
+        controller_phase_ns=timing.controller_phase_ns, horizon_ns=timing.horizon_ns,
+        rules=[(t_ns, rule_of(one)) for t_ns, one in in_force],
+        setpoints=[(t_ns, _x_r(one)) for t_ns, one in in_force],
+        safe_input=np.zeros(loop.m) if safe_input is None else np.array(safe_input),
+        predictions=scenario.controller.predictions,
+        watchdog=scenario.plant.watchdog.policy,
+        watchdog_timeout_ns=timing.actuation_timeout_ns,
+        observer=None if scenario.observer is None else observer_of(scenario),
+        actuations_cross=scenario.network.actuation is not None,
+        acknowledgement_timeout_ns=(
+            timing.acknowledgement_timeout_ns if scenario.network.protocol == "ack" else None
+        ),
+    )  # fmt: skip
+
+
+def rule_of(scenario: Scenario) -> Rule:
+    """Return the table of a scenario's trigger."""
+    rule: Rule = scenario.trigger.model_dump(exclude_none=True)
+    return rule
+
+
+def _x_r(scenario: Scenario) -> Array:
+    setpoint = setpoint_of(scenario)
+    return np.zeros(scenario.model.dimensions[0]) if setpoint is None else setpoint[0]
+
+
+def observer_of(scenario: Scenario) -> Mapping[str, Array]:
+    """Return the first estimate, and L or the covariances of a filter, as docs/scenarios.md says.
+
+    The held noise of a plant step has the covariance diag(std²) of the state or the input.
+    """
+    observer: Any = scenario.observer
+    plant, (n, m) = scenario.plant, scenario.model.dimensions
+    known = scenario.network.initial_sync == "known_state"
+    x = np.array(plant.initial_state) if known else np.zeros(n)
+    if observer.initial_estimate is not None:
+        x = np.array(observer.initial_estimate)
+    if observer.kind == "luenberger":
+        return {"x": x, "L": np.array(observer.gain)}
+    variances = {"state": np.zeros(n), "input": np.zeros(m)}
+    for one in plant.disturbances:
+        if one.kind == "gaussian":
+            variances[one.at] += np.square(one.std)
+        if one.kind == "uniform":
+            variances[one.at] += np.square(one.bound) / 3
+    noise = np.square(plant.measurement.noise_std or 0.0)
+    noise = noise + np.square(plant.measurement.noise_bound or 0.0) / 3
+    A, B = (np.array(matrix) for matrix in scenario.model.matrices)
+    _, both = held_input(A, np.hstack([np.eye(n), B]), scenario.timing.plant_period_ns)
+    process = np.concatenate([
+        variances[at] if std is None else np.square(std)
+        for at, std in (("state", observer.process_std), ("input", observer.input_std))
+    ])  # fmt: skip
+    Q = both @ np.diag(process) @ both.T if observer.Q is None else np.array(observer.Q)
+    R = np.diag(noise if observer.noise_std is None else np.square(observer.noise_std))
+    if observer.R is not None:
+        R = np.array(observer.R)
+    return {"x": x, "P": np.diag(np.square(observer.initial_std)), "Q": Q, "R": R}
+
+
+def chance_of(scenario: Scenario, packets: Any) -> Chance:
+    """Return disturbances and noise of a resolved scenario, and the recorded fates of packets.
+
+    ``packets`` has the columns of the table netem_packet.
+    """
+    n, m = scenario.model.dimensions
+    steps = range(scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1)
+    pushes = {"state": np.zeros((len(steps), n)), "input": np.zeros((len(steps), m))}
+    for number, one in enumerate(scenario.plant.disturbances):
+        name = ("plant", "disturbance", str(number))
+        source = SignalSource(scenario.timing.plant_period_ns, scenario.seeds.disturbance, name)
+        pushes[one.at] += one.signal(steps, source)
+    v = _noise(scenario, steps)
+    return Chance(
+        d=pushes["input"].__getitem__,
+        w=pushes["state"].__getitem__,
+        noise=v.__getitem__,
+        forward=arrivals(packets, 0),
+        reverse=arrivals(packets, 1),
+    )
+
+
+def _noise(scenario: Scenario, numbers: range) -> Array:
+    """Return v of each measurement, (k, p)."""
+    measurement, seed = scenario.plant.measurement, scenario.seeds.noise
+    p = len(measurement.C or scenario.plant.initial_state)
+    normal, uniform = (
+        table(seed, "plant", "measurement", part, rows=numbers, width=p)
+        for part, table in (("normal", normals), ("uniform", uniforms))
+    )
+    std, bound = measurement.noise_std or 0.0, measurement.noise_bound or 0.0
+    return np.multiply(std, normal) + np.multiply(bound, 2 * uniform - 1)
+
+
+def arrivals(packets: Any, flow: int) -> Callable[[int], Sequence[int]]:
+    """Return when each packet of a flow arrives; a packet that is not on record is lost.
+
+    A receiver rejects a packet with a flipped bit.
+    """
+    rows = packets[(packets["flow"] == flow) & (packets["bit"] < 0)]
+    arriving = {
+        packet: [t_ns for t_ns in times if t_ns >= 0]
+        for packet, *times in rows[["sequence", "release_ns", "copy_ns"]].tolist()
+    }
+    return lambda packet: arriving.get(packet, [])
