@@ -148,6 +148,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     for (int i = 0; i < 9; i++)
         *curves[i] = take(&next, curve);
     memory->weighted = rule->weight == NULL ? memory->e_c : memory->own_weighted;
+    memory->one_input = exact->m == 1;
     memory->is_static = 1;
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;

@@ -50,6 +50,7 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int dynamic;
     int is_static; /* H = 0: x_c and d stay as they are between events */
     int apart;     /* d is not 0: the models differ */
+    int one_input; /* m = 1: u and its coefficients are numbers, not vectors */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
     double *H, *K, *H_k;

@@ -26,36 +26,55 @@ static inline lanes weigh(const double *weight, lanes v) {
     return weight == NULL ? v : times(weight, v);
 }
 
-/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. */
-static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
-    const lanes nothing = filled(0.0);
-    int apart = memory->apart, is_static = memory->is_static;
-    memory->error = apart ? memory->own_error : memory->weighted;
+/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last two
+   arguments are constants, each combination of which has code. */
+static inline __attribute__((always_inline)) void expand_with(
+    exact_memory *memory, models state, double factor, int begin, int end, int apart, int moves) {
+    const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *K = memory->K;
+    const double *weight = memory->weight;
+    double *x_cs = memory->x_c, *e_cs = memory->e_c, *ds = memory->d, *xs = memory->x;
+    double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
+    int quadratic = memory->quadratic, one_input = memory->one_input;
     for (int k = begin; k <= end; k++) {
-        int64_t table = k * N * STRIDE, at = k * STRIDE;
-        lanes x_c = nothing, d = nothing, e_c = times(memory->X_k + table, state.x_c);
-        e_c = add(times(memory->A_k + table, state.e_c), e_c);
-        if (k == 0 || !is_static) {
-            x_c = times(memory->H_k + table, state.x_c);
-            store(memory->x_c + at, x_c);
-            store(memory->u + at, times(memory->K, x_c));
-            if (apart)
-                d = times(memory->H_k + table, state.d);
-            store(memory->d + at, d);
+        int table = k * N * STRIDE, at = k * STRIDE;
+        lanes x_c = filled(0.0), d = filled(0.0), e_c = times(X_k + table, state.x_c);
+        e_c = add(times(A_k + table, state.e_c), e_c);
+        if (moves || k == 0) {
+            x_c = times(H_k + table, state.x_c);
+            store(x_cs + at, x_c);
+            if (one_input)
+                us[k] = first_of(K, x_c);
+            else
+                store(us + at, times(K, x_c));
+            if (apart) {
+                d = times(H_k + table, state.d);
+                store(ds + at, d);
+            }
         }
         lanes x = subtract(x_c, e_c), e_s = add(e_c, d);
-        store(memory->e_c + at, e_c);
-        store(memory->x + at, x);
-        if (memory->weight != NULL)
-            store(memory->weighted + at, times(memory->weight, e_c));
-        if (memory->quadratic) {
+        store(e_cs + at, e_c);
+        store(xs + at, x);
+        if (weight != NULL)
+            store(weighted + at, times(weight, e_c));
+        if (!quadratic && apart)
+            store(errors + at, weigh(weight, e_s));
+        if (quadratic) {
             int64_t place = at * memory->blocks;
             put_rows(memory->form, memory->blocks, x, e_s, factor, memory->y + place);
             if (memory->dynamic)
                 put_rows(memory->gain, memory->blocks, x, e_s, factor, memory->w + place);
-        } else if (apart)
-            store(memory->error + at, weigh(memory->weight, e_s));
+        }
     }
+}
+
+static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
+    memory->error = memory->apart ? memory->own_error : memory->weighted;
+    if (memory->is_static)
+        expand_with(memory, state, factor, begin, end, 1, 0);
+    else if (memory->apart)
+        expand_with(memory, state, factor, begin, end, 1, 1);
+    else
+        expand_with(memory, state, factor, begin, end, 0, 1);
 }
 
 /* The rule's span after an event or after the start. */
