@@ -1119,7 +1119,7 @@ int64_t noack_replay_inputs(noack_input_replay *replay);
 /* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
 
    The loop of plant, sensor's model and controller's model, without sampling and without delay.
-   Times are in seconds. A state is (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c. */
+   Times are in seconds. A state is (x, e_s, e_c) with e_s = x_s - x and e_c = x_c - x. */
 
 enum { NOACK_EXACT_ENTRIES = 64 }; /* most states, and most inputs */
 

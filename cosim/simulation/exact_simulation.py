@@ -1,7 +1,7 @@
 """The exact simulator of the core (native/exact/): its structures, filled and read.
 
-Everything is in SI units and in the paper's notation; n states, m inputs. The core's state of a loop
-is (x_c, e_c, d) with e_c = x_c − x and d = x_s − x_c; here it has the shape (3, n).
+Everything is in SI units and in the paper's notation; n states, m inputs. A state of
+the loop is (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, of shape (3, n).
 """
 
 from typing import Any, NamedTuple

@@ -158,10 +158,10 @@ static double last_above(const double *curve, int p, double end_s, double level,
 
 /* Whether |(x, e_s, e_c)| is below limit, and below limit times level if that is > 0. */
 static inline int is_within(models state, double limit, double level) {
-    lanes x = subtract(state.x_c, state.e_c), e_s = add(state.e_c, state.d);
+    lanes x = plant_of(state), e_s = sensor_error(state), e_c = controller_error(state);
     if (level > 0.0)
         limit *= least(level, 1.0);
-    lanes squares = fma_lanes(x, x, fma_lanes(e_s, e_s, multiply(state.e_c, state.e_c)));
+    lanes squares = fma_lanes(x, x, fma_lanes(e_s, e_s, multiply(e_c, e_c)));
     return sum(squares) < limit * limit;
 }
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from cosim.analysis.adversary.objective import Measure, Objective, weight_of
 from cosim.analysis.adversary.pattern_flow import Flags, Segments
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, core_states, signals
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import ContinuousRun
 from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
 from noack.core.core_library import core
@@ -99,12 +99,11 @@ class SegmentFlow:
             CallerError: an event or a supremum cannot be decided.
         """
         loop, measure, n = self.system.loop, self.measure, self.system.loop.n
-        x, e_s, e_c = np.moveaxis(z.reshape(len(z), 3, n), 1, 0)
-        found = self._simulation.segments(loop.A, loop.B, t_s, core_states(x, e_s, e_c))
+        found = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
         if not np.isin(found.statuses, (OK, DIVERGED)).all():
             raise CallerError("trigger: an error stays too close to a level to decide when it passes")
         diverged, is_event = found.statuses == DIVERGED, found.events == 1
-        z = np.concatenate(signals(found.states), axis=1)
+        z = found.states.reshape(-1, 3 * n)
         if measure.objective is Objective.INTER_EVENT:
             between_events = is_event & ((t_s > 0) | (not self.known_start))
             value = np.where(between_events, t_s - found.t_s, -math.inf)
@@ -131,7 +130,7 @@ def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
     first = 1 if len(run.event_s) and run.event_s[0] == 0.0 else 0
     t_s, starts = np.array([0.0, *run.event_s])[first:], run.starts[first:]
     flow = SegmentFlow(run.system, measure, run.horizon_s, known_start=True)
-    found = flow(t_s, np.concatenate(signals(starts), axis=1))
+    found = flow(t_s, starts.reshape(len(starts), -1))
     if measure.objective is Objective.COST:
         return Valued(float(found.value.sum()), None)
     highest = int(found.value.argmax())

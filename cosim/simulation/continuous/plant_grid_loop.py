@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, core_states
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector, discretise
@@ -147,12 +147,12 @@ class SampledLoop:
     def _followed(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
         """Return x at ascending times after now, (k, n), while no other update acts."""
         x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
-        start = core_states(x, np.zeros_like(x), x_c - x)  # e_s does not act on the plant
+        start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
         return self._system.follow(np.zeros(1), start[None], after_s).x
 
     def _modelled(self, x: Vector, age_s: Vector) -> Matrix:
         """Return e^{H age} x for ascending ages, (k, n)."""
-        start = core_states(x, np.zeros_like(x), np.zeros_like(x))
+        start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
         return self._system.follow(np.zeros(1), start[None], age_s).x_c
 
     def _held(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
