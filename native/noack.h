@@ -1153,7 +1153,7 @@ int64_t noack_replay_inputs(noack_input_replay *replay);
 /* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
 
    The loop of plant, sensor's model and controller's model, without sampling and without delay.
-   Times are in seconds. A state is (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c. */
+   Times are in seconds. A state is (x, e_s, e_c) with e_s = x_s - x and e_c = x_c - x. */
 
 enum { NOACK_EXACT_ENTRIES = 64 }; /* most states, and most inputs */
 
@@ -1228,10 +1228,12 @@ void noack_exact_runs(
 
 /* Follow a plant from each of count states, just after an event, to its next event or the horizon.
    In: times t_s, states (count, 3, n), auxiliary variables eta. Out: the same at the end, and events
-   (1: an event, before its reset), values (of the measure), statuses. */
+   (1: an event, before its reset), values (of the measure; NAN if it fails), at_s (the time of a
+   supremum), statuses. */
 void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses);
+    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
+    int64_t *statuses);
 
 /* The states (count, 3, n) of a plant at ascending times t_s, from the first start on. A start is a state
    just after an event, (starts, 3, n), at an ascending time; the last one up to a time applies. NAN
