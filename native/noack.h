@@ -860,6 +860,8 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
+    int64_t only_socket;     /* the one that is watched, if receiving from it waits; -1: epoll waits */
+    int64_t receive_wait_ns; /* how long it waits (SO_RCVTIMEO) */
     noack_clock clock; /* its epoch is the relay's start */
     int64_t unix_ns;   /* Unix time at the relay's start */
     int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
