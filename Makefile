@@ -188,6 +188,8 @@ core: $(VENV)/.dependencies
 
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(EDITABLE)
+	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
+	@$(BIN)/python -m compileall -q noack netem cosim plant_server sensor_node controller_node
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed

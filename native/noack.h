@@ -742,7 +742,7 @@ void noack_driver_open(noack_driver *driver);
    until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
 int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 
-/* Add a datagram as if it had just been received. The driver must have driven all others. */
+/* Add a datagram as if it had just been received; then noack_drive must be called. */
 void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
 
@@ -860,6 +860,8 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
+    int64_t only_socket;     /* the one that is watched, if receiving from it waits; -1: epoll waits */
+    int64_t receive_wait_ns; /* how long it waits (SO_RCVTIMEO) */
     noack_clock clock; /* its epoch is the relay's start */
     int64_t unix_ns;   /* Unix time at the relay's start */
     int64_t now_ns;   /* arrival of the current datagram, or its release time; never decreases */
@@ -1153,7 +1155,7 @@ int64_t noack_replay_inputs(noack_input_replay *replay);
 /* ---- Exact simulation in continuous time: native/exact/ ----------------------------------------
 
    The loop of plant, sensor's model and controller's model, without sampling and without delay.
-   Times are in seconds. A state is (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c. */
+   Times are in seconds. A state is (x, e_s, e_c) with e_s = x_s - x and e_c = x_c - x. */
 
 enum { NOACK_EXACT_ENTRIES = 64 }; /* most states, and most inputs */
 
@@ -1228,10 +1230,12 @@ void noack_exact_runs(
 
 /* Follow a plant from each of count states, just after an event, to its next event or the horizon.
    In: times t_s, states (count, 3, n), auxiliary variables eta. Out: the same at the end, and events
-   (1: an event, before its reset), values (of the measure), statuses. */
+   (1: an event, before its reset), values (of the measure; NAN if it fails), at_s (the time of a
+   supremum), statuses. */
 void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses);
+    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
+    int64_t *statuses);
 
 /* The states (count, 3, n) of a plant at ascending times t_s, from the first start on. A start is a state
    just after an event, (starts, 3, n), at an ascending time; the last one up to a time applies. NAN

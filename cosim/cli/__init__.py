@@ -1,5 +1,6 @@
 """The command line ``noack``: one file per command in :mod:`cosim.cli.commands`."""
 
+import gc
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ else:
 
 __all__ = ["app", "find_scenario", "main"]
 _LIVE = ("run", "demo", "record")
+_NEW_OBJECTS = 100_000
+"""Objects between two garbage collections. With Python's 700, the imports take 0.06 s longer."""
 
 
 def main() -> None:
@@ -29,6 +32,7 @@ def main() -> None:
     from noack.runtime.command_line import failed
     from noack.runtime.signals import stoppable_imports
 
+    gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]
     as_json = "--json" in words
     with stoppable_imports():
@@ -50,10 +54,12 @@ def _fork_server(words: list[str]) -> "ForkServer | None":
     """Start the fork server of a live run, which imports while this process does."""
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
         return None
+    import os
     from contextlib import suppress
 
-    from cosim.live.fork_server import ForkServer
+    from cosim.live.fork_server import QUICK_IMPORTS, ForkServer
 
+    os.environ.update(QUICK_IMPORTS)
     with suppress(OSError):  # the command reports it
         return ForkServer()
     return None

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -59,8 +59,7 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import joint_watcher, launch
-        from cosim.live.progress import PatientConsole, progress_line
+        from cosim.live.launcher import joint_watcher, later_watcher, launch
         from cosim.live.run_log import RunLog
         from noack.protocol.topology import ROLES
 
@@ -69,8 +68,8 @@ def run_processes(
         warn_of_other_runs()
         try:
             with ExitStack() as stack:
-                line = progress_line(PatientConsole(stderr=True), scenario, session)
-                watchers = [stack.enter_context(line), RunLog().watcher()]
+                line = later_watcher(lambda: stack.enter_context(_progress(scenario, session)))
+                watchers = [line, RunLog().watcher()]
                 if metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
                 ending = launch(
@@ -81,6 +80,13 @@ def run_processes(
             if ending is None:
                 raise
     return finalize_run(ending, output)
+
+
+def _progress(scenario: "Scenario", session: str | None) -> "AbstractContextManager[Watcher]":
+    """Give what shows the progress of a run; importing rich takes 0.05 s."""
+    from cosim.live.progress import PatientConsole, progress_line
+
+    return progress_line(PatientConsole(stderr=True), scenario, session)
 
 
 @contextmanager

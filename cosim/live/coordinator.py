@@ -4,6 +4,7 @@ It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. A res
 over the address of the one before it, and numbers its messages above all earlier ones.
 """
 
+import os
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from cosim.live.change_requests import ChangeRequests
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
+from noack.core.python_process import cores
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
     AdmissionRequest,
@@ -26,8 +28,9 @@ from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
 from noack.runtime.zenoh_session import header_of, next_payload
 
-_START_DELAY_NS = 100_000_000
-"""From the last arrival to the common epoch: time for the message to reach all processes."""
+_START_DELAY_NS, _LONG_START_DELAY_NS = 50_000_000, 100_000_000
+"""From the last arrival to the common epoch: time for the message to reach all processes. The
+longer one is for processes on other hosts, and for a loaded machine."""
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
 _REPORT_GRACE_S = 0.3
@@ -328,7 +331,9 @@ class Coordinator:
         return before
 
     def _start(self) -> None:
-        self._clock = RunClock(time.monotonic_ns() + _START_DELAY_NS, self._speed)
+        is_quick = {*self._launched} == {*ROLES} and os.getloadavg()[0] <= cores()
+        delay_ns = _START_DELAY_NS if is_quick else _LONG_START_DELAY_NS
+        self._clock = RunClock(time.monotonic_ns() + delay_ns, self._speed)
         for member in self._members.values():
             self._let_pass(member)
 

@@ -77,14 +77,17 @@ def finalize(
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
-        is_shown = all((run_dir / name).is_file() for name in (REPORTS_FILE, RECORDING_FILE))
+        is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
+        is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         with work_bar("the record of the run") as show:
             run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
         summary = _judged(run, ending)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
-            with _is_optional(run_dir / RECORDING_FILE):
+            # That of an earlier attempt may be complete: it stays if there is no space for another.
+            quiet = (MachineError,) if is_shown else ()
+            with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
                 _write_recording(run, summary, run_dir, None)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []

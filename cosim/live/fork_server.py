@@ -25,11 +25,15 @@ from noack.runtime.command_line import TICKET_ON_STDIN
 
 _IMPORTS = (
     "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__", "netem.__main__",
-    "scipy.linalg", "zenoh",
+    "cosim.live.recorder", "numpy.random", "zenoh",
 )  # fmt: skip
+QUICK_IMPORTS = {
+    "OPENBLAS_NUM_THREADS": "1",  # numpy starts no threads
+    "PYDANTIC_DISABLE_PLUGINS": "__all__",  # no search among all installed packages
+}
 ENVIRONMENT = {
     TICKET_ON_STDIN: "1",
-    "OPENBLAS_NUM_THREADS": "1",
+    **QUICK_IMPORTS,
     "PYTHONUTF8": "1",
     # Return memory to the system after a busy moment. Unless they are set, glibc raises these
     # thresholds with each large block, and keeps an arena for each thread.
@@ -209,14 +213,29 @@ def _fork_twice() -> int:
     return pid
 
 
+def _build_validators() -> None:
+    """Build what would otherwise be built in each process."""
+    from noack.config.scenario_changes import prepare_changes
+    from noack.impairments.kinds.loss import LossOf
+    from noack.impairments.link_settings import LinkSettings
+    from noack.runtime.join_ticket import Ticket
+
+    for section in (Ticket, LinkSettings, LossOf):
+        section.model_rebuild()
+    prepare_changes()
+
+
 def main() -> None:
     """Run the server."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent's "ignore" is inherited
     connection = socket.socket(fileno=int(sys.argv[1]))
+    gc.disable()
     for module in _IMPORTS:
         import_module(module)
-    gc.collect()
+    _build_validators()
+    # What was collected now would leave holes, which each process would fill on pages of its own.
     gc.freeze()
+    gc.enable()
     request = _serve(connection)
     if request is not None:
         module, arguments = request

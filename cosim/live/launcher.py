@@ -12,15 +12,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.coordinator import Coordinator
 from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.remote_access import Listening, open_to_hosts, with_clocks
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.wait_limit import DEFAULT_S, WaitLimit
@@ -46,7 +46,10 @@ from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals, stop_reason
 
-_POLL_S = 0.01
+if TYPE_CHECKING:
+    from cosim.live.remote_access import Listening
+
+_POLL_S, _STARTING_POLL_S = 0.01, 0.002
 _STOP_TIMEOUT_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
@@ -57,7 +60,7 @@ class Watcher:
     """Callbacks of a launched run; each must return at once."""
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
-    listening: Callable[[str, Listening], None] = lambda address, how: None
+    listening: "Callable[[str, Listening], None]" = lambda address, how: None
     started: Callable[[Path], None] = lambda run_dir: None
     failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
     restarted: Callable[[str, float], None] = lambda role, t_s: None
@@ -83,6 +86,16 @@ def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
     return Watcher(*(call(field.name) for field in fields(Watcher)))
 
 
+def later_watcher(open_watcher: Callable[[], Watcher]) -> Watcher:
+    """Return a watcher that is opened at its first callback, after the start of the processes."""
+    opened = cache(open_watcher)
+
+    def call(name: str) -> Callable[..., None]:
+        return lambda *arguments: getattr(opened(), name)(*arguments)
+
+    return Watcher(*(call(field.name) for field in fields(Watcher)))
+
+
 def launch(
     scenario: Scenario,
     runs: Path,
@@ -92,7 +105,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
-    listening: Listening | None = None,
+    listening: "Listening | None" = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -112,6 +125,8 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     if listening is not None:
+        from cosim.live.remote_access import open_to_hosts, with_clocks  # asyncio and TLS
+
         scenario = with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
@@ -129,7 +144,6 @@ def launch(
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
         ticket = new_ticket(resolved, run_dir.resolve(), launched=True)
-        write_environment(run_dir, "live", run_name(ticket.run_id))
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
@@ -152,6 +166,8 @@ def launch(
                 watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
+        # While the processes get ready: the versions of all packages take 0.02 s.
+        write_environment(run_dir, "live", run_name(ticket.run_id))
         run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
@@ -246,7 +262,7 @@ class _Run:
                     self._limit = WaitLimit(_STOP_TIMEOUT_S)
             elif self._limit.is_reached:
                 break
-            time.sleep(_POLL_S)
+            time.sleep(_POLL_S if started else _STARTING_POLL_S)
         self._notify_progress()  # the last report may have arrived with the end
         return (
             result

@@ -324,12 +324,10 @@ _CLAIM_COLOURS = {
 def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     if verdict is None:
         return
-    if verdict.bit_exact is None:
-        word = "not possible"
-    elif verdict.bit_exact:
+    word = "not possible"
+    if verdict.bit_exact:
         word = f"bit-exact, {verdict.inputs:,} inputs"
-    else:
-        first = verdict.first_difference
+    elif (first := verdict.first_difference) is not None:
         word = f"differs: {first.table}, row {first.row}, {first.column}"
     yield "replay", word if verdict.complete else f"{word} (record incomplete)"
 

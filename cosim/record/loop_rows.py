@@ -137,14 +137,6 @@ def count_of(rows: Rows, generation: int) -> int:
     return int((rows["input"] // GENERATION == generation).sum())
 
 
-def network_rows_by_loop(
-    rows: Mapping[str, Rows], phases_ns: Sequence[int]
-) -> Iterator[dict[str, Rows]]:
-    """Yield the rows of each loop, from all rows of the tables of the network."""
-    found = NetworkRows(rows, phases_ns)
-    yield from map(found.of_loop, range(len(phases_ns)))
-
-
 class LoopTables(RecordSource):
     """The tables of a loop in the record of a run; a table that is read as a whole is kept.
 

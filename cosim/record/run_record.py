@@ -164,8 +164,9 @@ class RunRecord:
         """
         rows = DerivedRows(self.source, derive)
         derived = RunRecord(
-            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number
-        )
+            scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number,
+            is_network=self.is_network,
+        )  # fmt: skip
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
 
@@ -250,15 +251,6 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
             f"run.loops[NAME]; they are {few}"
         )
     return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
-
-
-def alone(record: RunRecord) -> RecordedRun:
-    """Return the record of a run whose only loop has the network for itself."""
-    network = RunRecord(
-        record.scenario, record.source, [], record.reports, record.kind, record.earlier,
-        is_network=True,
-    )  # fmt: skip
-    return RecordedRun(network, [record])
 
 
 class _StoredLoops(Sequence[RunRecord]):

@@ -1,7 +1,7 @@
 """The exact simulator of the core (native/exact/): its structures, filled and read.
 
-Everything is in SI units and in the paper's notation; n states, m inputs. The core's state of a loop
-is (x_c, e_c, d) with e_c = x_c − x and d = x_s − x_c; here it has the shape (3, n).
+Everything is in SI units and in the paper's notation; n states, m inputs. A state of
+the loop is (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, of shape (3, n).
 """
 
 from typing import Any, NamedTuple
@@ -52,7 +52,9 @@ class Segments(NamedTuple):
     events: NDArray[np.int64]
     """1: an event, (k,)."""
     values: Vector
-    """Of the measure, (k,)."""
+    """Of the measure, (k,); NaN of a run that fails."""
+    at_s: Vector
+    """When a supremum is attained, (k,)."""
     statuses: NDArray[np.int64]
 
 
@@ -158,10 +160,10 @@ class ExactSimulation:
         found = Segments(
             np.array(t_s, np.float64), np.array(states, np.float64, order="C"),
             np.zeros(k) if auxiliaries is None else np.array(auxiliaries, np.float64),
-            np.zeros(k, np.int64), np.zeros(k), np.zeros(k, np.int64),
+            np.zeros(k, np.int64), np.zeros(k), np.zeros(k), np.zeros(k, np.int64),
         )  # fmt: skip
         plant = (pointer_to(np.ascontiguousarray(part, np.float64), "double *") for part in (A, B))
-        kinds = ("double *", "double *", "double *", "int64_t *", "double *", "int64_t *")
+        kinds = ["double *"] * 3 + ["int64_t *"] + ["double *"] * 2 + ["int64_t *"]
         core.noack_exact_segments(self.core, *plant, k, *map(pointer_to, found, kinds))
         return found
 

@@ -12,6 +12,7 @@
 
 enum {
     BUFFERS = 64,       /* datagrams that are received or sent at once */
+    MOST_RECEIVED = 63, /* the last buffer is for a datagram that Python adds */
     TICKS = 32,         /* that are done before it receives again */
     BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
     QUIET_NS = 500000,  /* housekeeping in Python nearly always takes less time */
@@ -23,13 +24,16 @@ typedef struct {
     struct iovec in_vectors[BUFFERS], out_vectors[BUFFERS];
     uint8_t in_names[BUFFERS][NOACK_NAME_BYTES];
     int64_t in_next, in_end; /* the current datagram, and the end of those received */
-    int64_t out_count;
+    int64_t out_count, sealed_count;
+    int64_t is_sealing;  /* 1: Python encrypts what waits to be sent */
+    int64_t reason;      /* why the driver returns then */
     int64_t is_accepted; /* 1: the current datagram has become the message */
     int64_t is_ticking;  /* 1: a tick waits for an answer */
     int64_t now_ns;      /* time of the message or tick */
     int64_t batch;       /* datagrams that one call receives */
     int64_t worked;      /* 1: something was done since it last slept */
     int64_t has_more;    /* 1: a socket may have more datagrams than were received */
+    int64_t has_asked;   /* 1: the present step has asked Python */
     noack_message message;
     uint8_t in_data[BUFFERS][BUFFER_BYTES], out_data[BUFFERS][BUFFER_BYTES];
 } driver_scratch;
@@ -73,7 +77,7 @@ void noack_driver_open(noack_driver *driver) {
         renew_header(own, k);
     }
     /* A call that has received as many as it may does not look for another one. */
-    own->batch = min_of(driver->process->loops, BUFFERS);
+    own->batch = min_of(driver->process->loops, MOST_RECEIVED);
 }
 
 /* Whether a name is that of a peer: the same family, port and host. */
@@ -91,12 +95,14 @@ void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
     int64_t size_bytes) {
     driver_scratch *own = scratch_of(driver);
+    if (own->in_next == own->in_end)
+        own->in_next = own->in_end = 0;
+    int64_t place = own->in_end;
     size_bytes = min_of(size_bytes, BUFFER_BYTES);
-    memcpy(own->in_data[0], data, (size_t)size_bytes);
-    memcpy(own->in_names[0], name, NOACK_NAME_BYTES);
-    own->in_headers[0].msg_len = (unsigned)size_bytes;
-    own->in_next = 0;
-    own->in_end = 1;
+    memcpy(own->in_data[place], data, (size_t)size_bytes);
+    memcpy(own->in_names[place], name, NOACK_NAME_BYTES);
+    own->in_headers[place].msg_len = (unsigned)size_bytes;
+    own->in_end++;
 }
 
 /* Send the datagrams that wait; a failure is counted. */
@@ -123,35 +129,46 @@ static void send_all(noack_driver *driver) {
             k++;
         }
     }
-    own->out_count = 0;
+    own->out_count = own->sealed_count = 0;
 }
 
-/* Write the datagram of the message that a machine sends, if it sends one. */
-static int64_t put_output(noack_driver *driver) {
+/* Write the datagram of the message that a machine sends, if it sends one. There must be room. */
+static void put_output(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
     const noack_output *output = &driver->process->output;
     own->worked = 1;
     if (!output->sends)
-        return NOACK_DRIVER_NOTHING;
-    if (own->out_count == BUFFERS)
-        send_all(driver);
+        return;
     int64_t place = own->out_count++;
     noack_peer *destination = &driver->destinations[output->message.flow == NOACK_ACKNOWLEDGEMENT];
     struct msghdr *header = &own->out_headers[place].msg_hdr;
     header->msg_name = destination->name;
     header->msg_namelen = (socklen_t)destination->name_bytes;
-    int64_t size_bytes = noack_wire_encode(&driver->wire, &output->message, own->out_data[place]);
-    own->out_vectors[place].iov_len = (size_t)size_bytes;
-    if (!driver->wire.encrypted)
-        return NOACK_DRIVER_NOTHING;
-    driver->datagram = own->out_data[place];
+    own->out_vectors[place].iov_len =
+        (size_t)noack_wire_encode(&driver->wire, &output->message, own->out_data[place]);
+}
+
+/* Show Python the datagram that it opens or seals. */
+static void point_to(noack_driver *driver, uint8_t *datagram, int64_t size_bytes) {
+    driver->datagram = datagram;
     driver->datagram_bytes = size_bytes;
-    return NOACK_DRIVER_SEAL;
+}
+
+/* Whether the next datagram to send must be encrypted. */
+static int must_seal(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    own->is_sealing = driver->wire.encrypted && own->sealed_count < own->out_count;
+    if (own->is_sealing) {
+        int64_t place = own->sealed_count++;
+        point_to(driver, own->out_data[place], (int64_t)own->out_vectors[place].iov_len);
+    }
+    return own->is_sealing != 0;
 }
 
 /* Ask Python for what a step needs. */
 static int64_t ask(noack_driver *driver, int64_t question) {
     driver->question = question;
+    scratch_of(driver)->has_asked = question != NOACK_ROWS_FULL;
     return question == NOACK_ROWS_FULL ? NOACK_DRIVER_ROWS : NOACK_DRIVER_QUESTION;
 }
 
@@ -174,45 +191,46 @@ static int64_t examine(noack_driver *driver) {
             &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
             is_peer(own->in_names[own->in_next], &driver->sources[is_answer]), driver->opened,
             &own->message);
-    if (found == NOACK_ENCRYPTED) {
-        driver->datagram = datagram;
-        driver->datagram_bytes = size_bytes;
+    if (found == NOACK_ENCRYPTED)
         return NOACK_DRIVER_OPEN;
-    }
     driver->opened = NOACK_NOT_OPENED;
     noack_wire_count(reception, found, &own->message);
     own->is_accepted = found == NOACK_ACCEPTED;
     return NOACK_DRIVER_NOTHING;
 }
 
-/* Handle the datagrams received, or as many as Python is not needed for. */
+/* Whether to look at the time and the sockets after a step: Python's answer may have taken long. */
+static int has_asked(noack_driver *driver) {
+    driver_scratch *own = scratch_of(driver);
+    int asked = own->has_asked != 0;
+    own->has_asked = 0;
+    return asked;
+}
+
+/* Handle the datagrams received, up to one that Python was asked about. */
 static int64_t handle_messages(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
-    while (own->in_next < own->in_end) {
-        if (!own->is_accepted) {
-            if (examine(driver) == NOACK_DRIVER_OPEN)
-                return NOACK_DRIVER_OPEN;
-            if (!own->is_accepted) {
-                own->in_next++;
-                continue;
-            }
+    while (own->in_next < own->in_end && own->out_count < BUFFERS) {
+        if (!own->is_accepted && examine(driver) == NOACK_DRIVER_OPEN)
+            return NOACK_DRIVER_OPEN;
+        if (own->is_accepted) {
+            int64_t question = noack_process_handle(driver->process, &own->message, own->now_ns);
+            if (question != NOACK_DONE)
+                return ask(driver, question);
+            put_output(driver);
         }
-        int64_t question = noack_process_handle(driver->process, &own->message, own->now_ns);
-        if (question != NOACK_DONE)
-            return ask(driver, question);
         own->is_accepted = 0;
         own->in_next++;
-        int64_t reason = put_output(driver);
-        if (reason != NOACK_DRIVER_NOTHING)
-            return reason;
+        if (has_asked(driver))
+            break;
     }
     return NOACK_DRIVER_NOTHING;
 }
 
-/* Do the ticks that are due, or the first of them. */
+/* Do ticks that are due, up to one that Python was asked about. */
 static int64_t do_ticks(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
-    for (int count = 0; count < TICKS; count++) {
+    for (int count = 0; count < TICKS && own->out_count < BUFFERS; count++) {
         if (!own->is_ticking) {
             int64_t due_ns = noack_process_due_ns(driver->process);
             if (due_ns == INT64_MAX)
@@ -226,11 +244,18 @@ static int64_t do_ticks(noack_driver *driver) {
         if (question != NOACK_DONE)
             return ask(driver, question);
         own->is_ticking = 0;
-        int64_t reason = put_output(driver);
-        if (reason != NOACK_DRIVER_NOTHING)
-            return reason;
+        put_output(driver);
+        if (has_asked(driver))
+            break;
     }
     return NOACK_DRIVER_NOTHING;
+}
+
+static int64_t do_steps(noack_driver *driver) {
+    int64_t reason = NOACK_DRIVER_NOTHING;
+    if (!scratch_of(driver)->is_ticking)
+        reason = handle_messages(driver);
+    return reason == NOACK_DRIVER_NOTHING ? do_ticks(driver) : reason;
 }
 
 /* Wall time until the next tick, or a little less; INT64_MAX: there is none. */
@@ -267,9 +292,9 @@ static void receive(noack_driver *driver, int64_t ready) {
     driver_scratch *own = scratch_of(driver);
     own->in_next = own->in_end = own->has_more = 0;
     for (int64_t k = 0; k < driver->receiver_count; k++) {
-        if (!(ready >> k & 1) || own->in_end == BUFFERS)
+        unsigned most = (unsigned)min_of(own->batch, MOST_RECEIVED - own->in_end);
+        if (!(ready >> k & 1) || most == 0)
             continue;
-        unsigned most = (unsigned)min_of(own->batch, BUFFERS - own->in_end);
         int taken = recvmmsg(
             (int)driver->receivers[k], &own->in_headers[own->in_end], most, MSG_DONTWAIT, NULL);
         own->in_end += max_of(taken, 0); /* after an ICMP error of a datagram, it fails once */
@@ -287,30 +312,34 @@ static void receive(noack_driver *driver, int64_t ready) {
     }
 }
 
+/* Whether housekeeping, which is overdue, makes no tick late, or has been put off long enough. */
+static int is_housekeeping_time(const noack_driver *driver, int64_t overdue_ns, int64_t tick_ns) {
+    return tick_ns > QUIET_NS || noack_clock_wait_ns(&driver->clock, overdue_ns) >= MOST_PUT_OFF_NS;
+}
+
 int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
     driver_scratch *own = scratch_of(driver);
     for (;;) {
-        int64_t reason = NOACK_DRIVER_NOTHING;
-        if (!own->is_ticking)
-            reason = handle_messages(driver);
-        if (reason == NOACK_DRIVER_NOTHING)
-            reason = do_ticks(driver);
-        if (reason == NOACK_DRIVER_SEAL)
-            return reason;
+        if (!own->is_sealing)
+            own->reason = do_steps(driver);
+        if (must_seal(driver))
+            return NOACK_DRIVER_SEAL;
         if (own->out_count > 0)
             send_all(driver);
-        if (reason != NOACK_DRIVER_NOTHING)
-            return reason;
-        if (until_ns == INT64_MIN)
+        if (own->reason == NOACK_DRIVER_OPEN)
+            point_to(driver, own->in_data[own->in_next], own->in_headers[own->in_next].msg_len);
+        if (own->reason != NOACK_DRIVER_NOTHING)
+            return own->reason;
+        if (until_ns == INT64_MIN && own->in_next == own->in_end)
             return NOACK_DRIVEN;
         int64_t now_ns = run_time_ns(&driver->clock), tick_ns = next_tick_ns(driver, now_ns);
-        int64_t wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
-        if (now_ns >= until_ns) {
-            if (tick_ns > QUIET_NS
-                || noack_clock_wait_ns(&driver->clock, now_ns - until_ns) >= MOST_PUT_OFF_NS)
-                return NOACK_DRIVEN;
-            wait_ns = QUIET_NS;
-        }
+        int64_t wait_ns = QUIET_NS;
+        if (now_ns < until_ns)
+            wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
+        else if (until_ns != INT64_MIN && is_housekeeping_time(driver, now_ns - until_ns, tick_ns))
+            return NOACK_DRIVEN;
+        if (own->in_next < own->in_end)
+            continue;
         int64_t ready = sleep_until_needed(driver, tick_ns, wait_ns);
         if (ready < 0)
             return NOACK_DRIVEN;

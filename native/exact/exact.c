@@ -116,7 +116,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
-    int64_t count = (3 * (TERMS + 1) + 9) * square + 9 * curve
+    int64_t count = (4 * (TERMS + 1) + 10) * square + 10 * curve
                     + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
@@ -140,15 +140,19 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->A = take(&next, square);
     memory->B = take(&next, square);
     memory->E = take(&next, square);
+    memory->minus_BK = take(&next, square);
+    memory->D_k = take(&next, (TERMS + 1) * square);
     memory->H_k = take(&next, (TERMS + 1) * square);
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
     double **curves[] = {
-        &memory->x_c,       &memory->e_c,          &memory->d,        &memory->x,       &memory->u,
-        &memory->own_error, &memory->own_weighted, &memory->x_scaled, &memory->u_scaled};
-    for (int i = 0; i < 9; i++)
+        &memory->r,        &memory->e,       &memory->d,         &memory->q,
+        &memory->x,        &memory->u,       &memory->own_error, &memory->own_weighted,
+        &memory->x_scaled, &memory->u_scaled};
+    for (int i = 0; i < 10; i++)
         *curves[i] = take(&next, curve);
-    memory->weighted = rule->weight == NULL ? memory->e_c : memory->own_weighted;
+    memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;
+    memory->one_input = exact->m == 1;
     memory->is_static = 1;
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;
@@ -188,10 +192,8 @@ void noack_exact_runs(
         code->prepare(&memory, A + number * n * n, B + number * n * m);
         memset(state, 0, sizeof state);
         for (int64_t i = 0; i < n; i++) {
-            if (exact->known_start)
-                state[i] = x0[number * n + i];
-            else
-                state[code->stride + i] = 0.0 - x0[number * n + i];
+            state[i] = x0[number * n + i];
+            state[2 * code->stride + i] = exact->known_start ? 0.0 : 0.0 - state[i];
         }
         run.event = !exact->known_start;
         run.auxiliary = memory.dynamic ? exact->rule.initial : 0.0;
@@ -201,7 +203,8 @@ void noack_exact_runs(
 
 void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
-    double *states, double *auxiliaries, int64_t *events, double *values, int64_t *statuses) {
+    double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
+    int64_t *statuses) {
     const exact_code *code = code_for(max_of(exact->n, exact->m));
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
@@ -210,7 +213,7 @@ void noack_exact_segments(
     code->prepare(&memory, A, B);
     for (int64_t i = 0; i < count; i++, states += 3 * n) {
         noack_exact_row row = {.inter_event_min_s = INFINITY};
-        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .state = state};
+        exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .at_s = t_s[i], .state = state};
         run.auxiliary = auxiliaries[i];
         memset(state, 0, sizeof state);
         for (int64_t j = 0; j < 3 * n; j++)
@@ -222,6 +225,7 @@ void noack_exact_segments(
         auxiliaries[i] = run.auxiliary;
         events[i] = run.event;
         values[i] = exact->measure == NOACK_EXACT_COST ? row.cost : row.sup_e_c_scaled;
+        at_s[i] = run.at_s;
         statuses[i] = row.status;
     }
 }

@@ -48,8 +48,10 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int64_t blocks;            /* of N rows each, of [P; N] and of [P_eta; N_eta] */
     int integrates, quadratic; /* what is compared; otherwise |W e_s| or nothing */
     int dynamic;
-    int is_static; /* H = 0: x_c and d stay as they are between events */
-    int apart;     /* d is not 0: the models differ */
+    int is_static; /* H = 0: r, d and q stay as they are between events */
+    int apart;     /* d is not 0: the models differ, or */
+    int renewed;   /* q is not 0: the reference is not x_c */
+    int one_input; /* m = 1: u and its coefficients are numbers, not vectors */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
     double *H, *K, *H_k;
@@ -58,10 +60,12 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     double inverse[2 * TERMS + 1]; /* 1/k */
     /* of a plant */
     double *A, *B, *E, *A_k, *X_k;
+    double *minus_BK, *D_k;
+    int has_D_k; /* computed when a reference is first renewed */
     double reach_s[DEGREES];    /* time over which a polynomial of each degree is accurate */
     double measured_s[DEGREES]; /* the same, at the accuracy of the measures */
     /* coefficients of curves */
-    double *x_c, *e_c, *d, *x, *u, *x_scaled, *u_scaled, *y, *w;
+    double *r, *e, *d, *q, *x, *u, *x_scaled, *u_scaled, *y, *w;
     double *error, *weighted; /* W e_s and W e_c; of equal curves one may be the other */
     double *own_error, *own_weighted;
     double squares[2 * TERMS], g[MOST_TERMS], eta[MOST_TERMS];
@@ -72,10 +76,11 @@ typedef struct { /* a run, or a part of one */
     int64_t number;       /* of the run */
     int64_t stops;        /* 1: at its first event */
     double t_s;           /* start, then end */
-    double *state;        /* (3, n) x_c, e_c, d at the start, then at the end */
+    double *state;        /* (3, n) x, e_s, e_c at the start, then at the end */
     double auxiliary;     /* likewise */
     int64_t event;        /* likewise: 1: an event at t_s */
     int64_t losses;       /* consecutive ones so far */
+    double at_s;          /* time at which the supremum is attained */
 } exact_run;
 
 /* The code for a number of states; see simulator.h. */

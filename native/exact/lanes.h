@@ -119,6 +119,15 @@ static inline __attribute__((always_inline)) lanes times(const double *matrix, l
     return total;
 }
 
+/* The first entry of times(). */
+static inline double first_of(const double *matrix, lanes v) {
+    double total = matrix[0] * entry(v, 0);
+#pragma GCC unroll 8
+    for (int j = 1; j < N; j++)
+        total = __builtin_fma(matrix[j * STRIDE], entry(v, j), total);
+    return total;
+}
+
 /* The sum of the entries: halves are added to each other. */
 static inline double sum(lanes v) {
 #if N == 3

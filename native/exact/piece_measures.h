@@ -10,7 +10,7 @@
 static const double CERTAINTY = 1e-10; /* the supremum exceeds the returned one by at most this */
 
 /* The sum over i <= p and j <= p of v_i W v_j/(2(i + j + 1)). */
-static inline __attribute__((always_inline)) double double_sum(
+static inline double double_sum(
     const double *vectors, int p, const double *weight, const double *inverse) {
     lanes total = filled(0.0);
     for (int i = 0; i <= p; i++) {
@@ -30,38 +30,64 @@ static inline __attribute__((always_inline)) double double_sum(
     return sum(total);
 }
 
+/* The same for numbers. */
+static inline double double_sum_of_one(
+    const double *numbers, int p, const double *weight, const double *inverse) {
+    double total = 0.0;
+    for (int i = 0; i <= p; i++) {
+        double own = numbers[i] * (0.5 * inverse[2 * i + 1]), more = 0.0;
+        int j = i + 1;
+        for (; j < p; j += 2) {
+            own = __builtin_fma(numbers[j], inverse[i + j + 1], own);
+            more = __builtin_fma(numbers[j + 1], inverse[i + j + 2], more);
+        }
+        if (j == p)
+            more = __builtin_fma(numbers[p], inverse[i + p + 1], more);
+        own += more;
+        total = __builtin_fma(weight == NULL ? own : weight[0] * own, numbers[i], total);
+    }
+    return total;
+}
+
 /* The integral of xQx + uRu over [0, s] of polynomials of degree p, exact up to rounding. With
    v_k = c_k s^k that of xQx is s times the sum of v_i Q v_j/(i + j + 1). */
 static double square_integrals(exact_memory *memory, int p, double s) {
-    const double *inverse = memory->inverse, small_share = 1e-27;
-    double *xs = memory->x_scaled, *us = memory->u_scaled, power = 1.0;
-    int u_terms = memory->is_static ? 0 : p; /* of a constant u */
+    const double *inverse = memory->inverse, *x = memory->x, *u = memory->u, small_share = 1e-27;
+    double *xs = memory->x_scaled, *us = memory->u_scaled, power = 1.0, sizes[TERMS];
+    int one_input = memory->one_input, u_terms = memory->is_static ? 0 : p; /* of a constant u */
     for (int k = 0; k <= p; k++, power *= s) {
-        store(xs + k * STRIDE, scale(load(memory->x + k * STRIDE), power));
-        if (k <= u_terms)
-            store(us + k * STRIDE, scale(load(memory->u + k * STRIDE), power));
+        lanes v = scale(load(x + k * STRIDE), power);
+        store(xs + k * STRIDE, v);
+        sizes[k] = dot(v, v);
+        if (k > u_terms)
+            continue;
+        if (one_input) {
+            us[k] = u[k] * power;
+            sizes[k] += us[k] * us[k];
+        } else {
+            lanes w = scale(load(u + k * STRIDE), power);
+            store(us + k * STRIDE, w);
+            sizes[k] += dot(w, w);
+        }
     }
     /* The last coefficients often contribute nothing to the sum. */
-    lanes v = load(xs), w = load(us);
-    double negligible = small_share * (dot(v, v) + dot(w, w));
-    for (; p > 1; p--) {
-        v = load(xs + p * STRIDE);
-        w = p <= u_terms ? load(us + p * STRIDE) : filled(0.0);
-        if (dot(v, v) + dot(w, w) > negligible)
-            break;
-    }
+    while (p > 1 && !(sizes[p] > small_share * sizes[0]))
+        p--;
     u_terms = u_terms < p ? u_terms : p;
-    return 2.0 * s
-           * (double_sum(xs, p, memory->Q, inverse) + double_sum(us, u_terms, memory->R, inverse));
+    double u_sum = one_input ? double_sum_of_one(us, u_terms, memory->R, inverse)
+                             : double_sum(us, u_terms, memory->R, inverse);
+    return 2.0 * s * (double_sum(xs, p, memory->Q, inverse) + u_sum);
 }
 
-/* |y(s)| e^(rate s) at or near a maximum to the right of low_s. */
-static double climb(const double *curve, int p, double low_s, double high_s, double rate) {
+/* |y(s)| e^(rate s) at or near a maximum to the right of low_s; *at_s is the time. */
+static double climb(
+    const double *curve, int p, double low_s, double high_s, double rate, double *at_s) {
     const int climbs = 12;
     lanes y, dy;
     value_and_slope(curve, p, low_s, &y, &dy);
     double low = dot(y, dy) + rate * dot(y, y);
     double best = sqrt(dot(y, y)) * exp(rate * low_s);
+    *at_s = low_s;
     value_and_slope(curve, p, high_s, &y, &dy);
     double high = dot(y, dy) + rate * dot(y, y);
     for (int i = 0; i < climbs; i++) {
@@ -72,6 +98,7 @@ static double climb(const double *curve, int p, double low_s, double high_s, dou
         value_and_slope(curve, p, s, &y, &dy);
         double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * exp(rate * s);
         int rises = slope > 0.0 && size >= best;
+        *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);
         if (rises) {
             low_s = s;
@@ -92,7 +119,7 @@ static double climb(const double *curve, int p, double low_s, double high_s, dou
    oscillation, is searched again as the scalar |y|^2, in which cancelling terms vanish. */
 static double raise_supremum(
     exact_memory *memory, double best, const double *curve, int p, double end_s, double rate,
-    double growth) {
+    double growth, double *at_s) {
     const double smallest = 1e-150, too_large = 1e150;
     const int few_steps = 50, most_rises = 10000; /* each passes a maximum or rises by CERTAINTY */
     for (int rise = 0; rise < most_rises; rise++) {
@@ -111,7 +138,7 @@ static double raise_supremum(
             return best;
         if (s == UNRESOLVED)
             return UNRESOLVED;
-        double found = climb(curve, p, s, end_s, rate);
+        double found = climb(curve, p, s, end_s, rate, at_s);
         best = largest_of(best * (1.0 + CERTAINTY), found * growth);
     }
     return UNRESOLVED;
@@ -131,10 +158,10 @@ static double last_above(const double *curve, int p, double end_s, double level,
 
 /* Whether |(x, e_s, e_c)| is below limit, and below limit times level if that is > 0. */
 static inline int is_within(models state, double limit, double level) {
-    lanes x = subtract(state.x_c, state.e_c), e_s = add(state.e_c, state.d);
+    lanes x = plant_of(state), e_s = sensor_error(state), e_c = controller_error(state);
     if (level > 0.0)
         limit *= least(level, 1.0);
-    lanes squares = fma_lanes(x, x, fma_lanes(e_s, e_s, multiply(state.e_c, state.e_c)));
+    lanes squares = fma_lanes(x, x, fma_lanes(e_s, e_s, multiply(e_c, e_c)));
     return sum(squares) < limit * limit;
 }
 

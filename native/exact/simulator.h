@@ -26,41 +26,84 @@ static inline lanes weigh(const double *weight, lanes v) {
     return weight == NULL ? v : times(weight, v);
 }
 
-/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. */
-static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
-    const lanes nothing = filled(0.0);
-    int apart = memory->apart, is_static = memory->is_static;
-    memory->error = apart ? memory->own_error : memory->weighted;
+/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
+   three arguments are constants, each combination of which has code. */
+static inline __attribute__((always_inline)) void expand_with(
+    exact_memory *memory, models state, double factor, int begin, int end, int moves, int apart,
+    int renewed) {
+    const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
+    const double *K = memory->K, *weight = memory->weight;
+    double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
+    double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
+    int quadratic = memory->quadratic, one_input = memory->one_input;
     for (int k = begin; k <= end; k++) {
-        int64_t table = k * N * STRIDE, at = k * STRIDE;
-        lanes x_c = nothing, d = nothing, e_c = times(memory->X_k + table, state.x_c);
-        e_c = add(times(memory->A_k + table, state.e_c), e_c);
-        if (k == 0 || !is_static) {
-            x_c = times(memory->H_k + table, state.x_c);
-            store(memory->x_c + at, x_c);
-            store(memory->u + at, times(memory->K, x_c));
-            if (apart)
-                d = times(memory->H_k + table, state.d);
-            store(memory->d + at, d);
+        int table = k * N * STRIDE, at = k * STRIDE;
+        lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
+        e = add(times(A_k + table, state.e), e);
+        if (renewed)
+            e = add(e, times(D_k + table, state.q));
+        if (moves || k == 0) {
+            r = times(H_k + table, state.r);
+            d = apart ? times(H_k + table, state.d) : d;
+            q = renewed ? times(H_k + table, state.q) : q;
+            store(rs + at, r);
+            store(ds + at, d);
+            store(qs + at, q);
+            lanes x_c = renewed ? subtract(r, q) : r;
+            if (one_input)
+                us[k] = first_of(K, x_c);
+            else
+                store(us + at, times(K, x_c));
         }
-        lanes x = subtract(x_c, e_c), e_s = add(e_c, d);
-        store(memory->e_c + at, e_c);
-        store(memory->x + at, x);
-        if (memory->weight != NULL)
-            store(memory->weighted + at, times(memory->weight, e_c));
-        if (memory->quadratic) {
+        lanes x = subtract(r, e), e_s = add(e, d);
+        store(es + at, e);
+        store(xs + at, x);
+        if (weight != NULL || renewed)
+            store(weighted + at, weigh(weight, renewed ? subtract(e, q) : e));
+        if (!quadratic && apart)
+            store(errors + at, weigh(weight, e_s));
+        if (quadratic) {
             int64_t place = at * memory->blocks;
             put_rows(memory->form, memory->blocks, x, e_s, factor, memory->y + place);
             if (memory->dynamic)
                 put_rows(memory->gain, memory->blocks, x, e_s, factor, memory->w + place);
-        } else if (apart)
-            store(memory->error + at, weigh(memory->weight, e_s));
+        }
     }
+}
+
+static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
+    int own = memory->weight != NULL || memory->renewed;
+    memory->weighted = own ? memory->own_weighted : memory->e;
+    memory->error = memory->apart ? memory->own_error : memory->weighted;
+    if (memory->renewed && !memory->has_D_k) {
+        driven(memory->A, memory->minus_BK, memory->H_k, memory->D_k);
+        memory->has_D_k = 1;
+    }
+    if (memory->renewed)
+        expand_with(memory, state, factor, begin, end, 1, 1, 1);
+    else if (memory->is_static)
+        expand_with(memory, state, factor, begin, end, 0, 1, 0);
+    else if (memory->apart)
+        expand_with(memory, state, factor, begin, end, 1, 1, 0);
+    else
+        expand_with(memory, state, factor, begin, end, 1, 0, 0);
+}
+
+/* The same state with the plant's own as the reference, if that is small beside the present one: their
+   difference would lose its digits. */
+static models renewed(exact_memory *memory, models state) {
+    const double small = 1e-8; /* of a square */
+    lanes x = plant_of(state);
+    if (dot(x, x) < small * dot(state.r, state.r)) {
+        state = (models){x, filled(0.0), sensor_error(state), subtract(state.q, state.e)};
+        memory->renewed = 1;
+    }
+    return state;
 }
 
 /* The rule's span after an event or after the start. */
 static rule_span next_span(const exact_memory *memory, models state, double t_s) {
-    lanes x = subtract(state.x_c, state.e_c);
+    lanes x = plant_of(state);
     double left = memory->quadratic ? left_side(memory, x) : 0.0;
     double size
         = memory->rule->forecasts ? size_of(weigh(memory->forecast_weight, x)) : 0.0;
@@ -73,7 +116,7 @@ static comparison comparison_at(
     if (!memory->quadratic)
         return (comparison){phase, 1.0, 0.0, auxiliary};
     double size = sqrt(
-        dot(state.x_c, state.x_c) + dot(state.e_c, state.e_c) + dot(state.d, state.d));
+        dot(state.r, state.r) + dot(state.e, state.e) + dot(state.d, state.d));
     double scale = largest_of(largest_of(size, phase.threshold), sqrt(fabs(auxiliary)));
     scale = largest_of(scale, 1e-150);
     double level = phase.threshold / scale;
@@ -117,40 +160,42 @@ static double find_event(
 
 /* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. */
 static int measure_supremum(
-    exact_memory *memory, noack_exact_row *row, models end, int q, double t_s, double length_s,
+    exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
     double ceiling) {
     const noack_exact *exact = memory->exact;
     int of_state = exact->measure == NOACK_EXACT_STATE;
     const double *curve = of_state ? memory->x : memory->weighted;
-    lanes last = of_state ? subtract(end.x_c, end.e_c) : weigh(memory->weight, end.e_c);
+    lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
     double rate = t_s < exact->fading_until_s ? exact->fading_per_s : 0.0;
     double growth = exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
-    double best = row->sup_e_c_scaled;
-    best = largest_of(best, size_of(last) * growth * exp(rate * length_s));
+    double before = run->row->sup_e_c_scaled, at_s = length_s;
+    double best = largest_of(before, size_of(last) * growth * exp(rate * length_s));
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
-        best = raise_supremum(memory, best, curve, q, length_s, rate, growth);
+        best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
     if (best == UNRESOLVED)
         return 0;
-    row->sup_e_c_scaled = best;
+    run->at_s = best > before ? t_s + at_s : run->at_s;
+    run->row->sup_e_c_scaled = best;
     return 1;
 }
 
 /* Add a piece's contribution to a row; settled is a level of |x|, and ceiling a bound on the
    measured norm. Return the last time on the piece at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
-    exact_memory *memory, noack_exact_row *row, models end, double t_s, double length_s,
-    double settled, double ceiling) {
+    exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
+    double ceiling) {
+    noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
     int q = degree_for(memory->measured_s, length_s);
     if (measure == NOACK_EXACT_ROW || measure == NOACK_EXACT_COST)
         row->cost += square_integrals(memory, q, length_s);
     if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
         return NONE;
-    if (!measure_supremum(memory, row, end, q, t_s, length_s, ceiling))
+    if (!measure_supremum(memory, run, end, q, t_s, length_s, ceiling))
         return UNRESOLVED;
     if (measure != NOACK_EXACT_ROW)
         return NONE;
-    lanes x = subtract(end.x_c, end.e_c);
+    lanes x = plant_of(end);
     double within_s = last_above(memory->x, q, length_s, settled, x);
     if (within_s >= 0.0)
         row->settling_s = t_s + within_s;
@@ -169,15 +214,15 @@ static int count_event(
         exact->delivered[at] = (uint8_t)delivered;
         for (int64_t i = 0; exact->states != NULL && i < exact->n; i++) {
             double *to = exact->states + 3 * exact->n * at + i;
-            to[0] = entry(state.x_c, (int)i);
-            to[exact->n] = entry(state.e_c, (int)i);
-            to[2 * exact->n] = entry(state.d, (int)i);
+            to[0] = entry(plant_of(state), (int)i);
+            to[exact->n] = entry(sensor_error(state), (int)i);
+            to[2 * exact->n] = entry(controller_error(state), (int)i);
         }
     }
     if (row->transmissions > 0)
         row->inter_event_min_s = least(row->inter_event_min_s, t_s - last_s);
     else if (t_s == 0.0 && !delivered)
-        row->sup_e_c_scaled = size_of(weigh(memory->weight, state.e_c));
+        row->sup_e_c_scaled = size_of(weigh(memory->weight, controller_error(state)));
     row->transmissions += 1;
     row->deliveries += delivered;
     return delivered;
@@ -187,8 +232,8 @@ static int count_event(
 static models updated(models state, int delivered) {
     lanes nothing = filled(0.0);
     if (delivered)
-        return (models){subtract(state.x_c, state.e_c), nothing, nothing};
-    return (models){state.x_c, state.e_c, subtract(nothing, state.e_c)};
+        return (models){plant_of(state), nothing, nothing, nothing};
+    return (models){state.r, state.e, subtract(nothing, state.e), state.q};
 }
 
 static void finish_row(
@@ -205,17 +250,24 @@ static void finish_row(
     row->status = status;
 }
 
+/* A state from x, e_s and e_c: the reference is x_c. */
+static models state_of(const double *signals) {
+    lanes x = load(signals), e_s = load(signals + STRIDE), e_c = load(signals + 2 * STRIDE);
+    return (models){add(x, e_c), e_c, subtract(e_s, e_c), filled(0.0)};
+}
+
 /* Follow a run to its end, or to its first event. */
 static void follow(exact_memory *memory, exact_run *run) {
     const noack_exact *exact = memory->exact;
     noack_exact_row *row = run->row;
     double horizon_s = exact->horizon_s, farthest_s = memory->reach_s[DEGREES - 1];
-    models state = {load(run->state), load(run->state + STRIDE), load(run->state + 2 * STRIDE)};
-    double start = size_of(subtract(state.x_c, state.e_c)), settled = exact->settle * start;
+    models state = state_of(run->state);
+    double start = size_of(plant_of(state)), settled = exact->settle * start;
     double t_s = run->t_s, last_s = -1.0, first_s = 0.0, auxiliary = run->auxiliary;
     int64_t status = NOACK_EXACT_UNDECIDED, point = 0;
     int first_degree = memory->quadratic ? 2 : 1, event = run->event != 0;
     int above = start > settled, fresh = 1, looked = 0, agree = size_of(state.d) == 0.0;
+    memory->renewed = 0;
     rule_span span = {0};
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
         farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
@@ -234,6 +286,7 @@ static void follow(exact_memory *memory, exact_run *run) {
             last_s = t_s;
             fresh = 1;
             state = updated(state, agree);
+            memory->renewed &= !agree;
         }
         if (t_s >= horizon_s) {
             status = NOACK_EXACT_OK;
@@ -245,10 +298,11 @@ static void follow(exact_memory *memory, exact_run *run) {
             point = span.point;
             auxiliary = memory->integrates ? 0.0 : auxiliary;
         }
+        state = renewed(memory, state);
         rule_phase phase = phase_at(memory, &span, t_s);
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
-        memory->apart = !agree;
+        memory->apart = !agree || memory->renewed;
         expand(memory, state, 1.0 / now.scale, 0, first_degree);
         if (phase.compares && !looked) {
             if (!is_within(state, LARGEST, phase.threshold)) {
@@ -285,7 +339,7 @@ static void follow(exact_memory *memory, exact_run *run) {
             ceiling = phase.threshold
                       * exp(exact->fading_per_s
                             * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
-        double within_s = measure_piece(memory, row, state, t_s, spent_s, settled, ceiling);
+        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
         if (within_s == UNRESOLVED)
             break;
         above = within_s == spent_s;
@@ -293,13 +347,13 @@ static void follow(exact_memory *memory, exact_run *run) {
         event = event || t_s >= span.due_s;
     }
     finish_row(
-        row, status, t_s, last_s - first_s, above, size_of(subtract(state.x_c, state.e_c)));
+        row, status, t_s, last_s - first_s, above, size_of(plant_of(state)));
     run->t_s = t_s;
     run->event = event;
     run->auxiliary = auxiliary;
-    store(run->state, state.x_c);
-    store(run->state + STRIDE, state.e_c);
-    store(run->state + 2 * STRIDE, state.d);
+    store(run->state, plant_of(state));
+    store(run->state + STRIDE, sensor_error(state));
+    store(run->state + 2 * STRIDE, controller_error(state));
 }
 
 /* Compute what all runs share. */
@@ -313,11 +367,13 @@ static void prepare(exact_memory *memory, const double *A, const double *B) {
     for (int j = 0; j < N; j++) {
         lanes BK = times(memory->B, load(memory->K + j * STRIDE));
         lanes column = add(load(memory->A + j * STRIDE), BK);
+        store(memory->minus_BK + j * STRIDE, subtract(filled(0.0), BK));
         store(memory->E + j * STRIDE, subtract(column, load(memory->H + j * STRIDE)));
     }
     powers(memory->A, memory->A_k);
     driven(memory->A, memory->E, memory->H_k, memory->X_k);
     find_reaches(memory);
+    memory->has_D_k = 0;
 }
 
 /* The states (count, 3, n) at ascending times from a state (3, n) on, without events in between; NAN
@@ -326,26 +382,31 @@ static void sample(
     exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
     double *states) {
     int64_t n = memory->exact->n, pieces = 0, expanded = 0;
-    models at = {load(state), load(state + STRIDE), load(state + 2 * STRIDE)};
+    models at = state_of(state);
     double farthest_s = memory->reach_s[DEGREES - 1];
     memory->apart = 1;
+    memory->renewed = 0;
     for (int64_t i = 0; i < count; i++, states += 3 * n) {
         while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
-            if (!expanded)
+            if (!expanded) {
+                at = renewed(memory, at);
                 expand(memory, at, 1.0, 0, HIGHEST);
+            }
             at = state_at(memory, HIGHEST, farthest_s);
             start_s += farthest_s;
             expanded = 0;
         }
-        if (!expanded)
+        if (!expanded) {
+            at = renewed(memory, at);
             expand(memory, at, 1.0, 0, HIGHEST);
+        }
         expanded = 1;
         double after_s = t_s[i] - start_s;
         models there = state_at(memory, HIGHEST, after_s);
         for (int j = 0; j < n; j++) {
-            states[j] = after_s <= farthest_s ? entry(there.x_c, j) : NAN;
-            states[n + j] = after_s <= farthest_s ? entry(there.e_c, j) : NAN;
-            states[2 * n + j] = after_s <= farthest_s ? entry(there.d, j) : NAN;
+            states[j] = after_s <= farthest_s ? entry(plant_of(there), j) : NAN;
+            states[n + j] = after_s <= farthest_s ? entry(sensor_error(there), j) : NAN;
+            states[2 * n + j] = after_s <= farthest_s ? entry(controller_error(there), j) : NAN;
         }
     }
 }

@@ -1,26 +1,29 @@
 /* The loop between events as Taylor polynomials with a bound on the truncation error.
 
-   In the coordinates (x_c, e_c, d) with e_c = x_c - x and d = x_s - x_c = e_s - e_c,
+   In the coordinates (r, e, d, q), relative to a reference r that follows the models, the plant is
+   x = r - e, the sensor's model x_s = r + d, the controller's x_c = r - q. With E = A + BK - H,
 
-       x_c' = H x_c        d' = H d        e_c' = A e_c - E x_c        E = A + BK - H,
+       r' = H r        d' = H d        q' = H q        e' = A e - E r + BK q,
 
-   since A e_c - E x_c = H x_c - A x - BK x_c. Only e_c depends on the plant; x_c drives it. x_c and
-   d follow the models, which all plants share. x = x_c - e_c and e_s = e_c + d. After an event e_s
-   is exactly 0, since d = -e_c or both are 0. No small quantity is the difference of large ones: a
-   small mismatch E and the errors that it drives keep their relative accuracy.
+   since x' = A x + BK x_c. The reference is x_c, and q is 0, unless x has become small beside it: then
+   the reference is x itself from there on (renewed()). e_s = e + d and e_c = e - q. After an event e_s
+   is exactly 0, since d = -e or both are 0. A small mismatch E and the errors that it drives keep
+   their relative accuracy.
 
-   The Taylor coefficients of degree k are H_k x_c, H_k d and A_k e_c + X_k x_c. Their tables are
-   computed once per plant:
+   The Taylor coefficients of degree k are H_k r, H_k d, H_k q and A_k e + X_k r + D_k q. Their tables
+   are computed once per plant:
 
-       H_k = H^k/k!    A_k = A^k/k!    X_(k+1) = (A X_k - E H_k)/(k + 1),  X_0 = 0.
+       H_k = H^k/k!    A_k = A^k/k!    X_(k+1) = (A X_k - E H_k)/(k + 1),  X_0 = 0,
+       D_(k+1) = (A D_k + BK H_k)/(k + 1),  D_0 = 0.
 
    Truncation error. The powers of G = [[H, 0], [-E/s, A]] have the blocks k! H_k, k! A_k and
    k! X_k/s. After a time of at most w, the polynomial of degree p omits the sum over k > p of
-   G^k w^k/k! applied to (s x_c, e_c), and |G^(p+1+j)| <= |G^(p+1)| q z^j with z = |G^4|^(1/4) and
+   G^k w^k/k! applied to (s r, e), and |G^(p+1+j)| <= |G^(p+1)| q z^j with z = |G^4|^(1/4) and
    q = max over r < 4 of |G^r|/z^r. For z w <= (p + 2)/2 the sum is at most
    2 q |G^(p+1)| w^(p+1)/(p + 1)!. It is kept below 2^-53, the rounding error of the state itself.
    s = |E|/max(|A|, |H|) balances the blocks, so that the truncation error of the part that a small E
-   drives is relative to E. All norms are Frobenius norms, which bound the 2-norms from above. */
+   drives is relative to E. D_k = H_k - A_k - X_k has no larger terms. All norms are Frobenius norms,
+   which bound the 2-norms from above. */
 #ifndef NOACK_EXACT_TAYLOR_H
 #define NOACK_EXACT_TAYLOR_H
 
@@ -33,8 +36,12 @@ static const double LESS_STRICT[DEGREES] = { /* (1e-12/2^-53)^(1/(p + 1)) */
     1.5428148079652244, 1.4857258704959437, 1.4394069351299323};
 
 typedef struct {
-    lanes x_c, e_c, d;
+    lanes r, e, d, q;
 } models;
+
+static inline lanes plant_of(models state) { return subtract(state.r, state.e); }
+static inline lanes sensor_error(models state) { return add(state.e, state.d); }
+static inline lanes controller_error(models state) { return subtract(state.e, state.q); }
 
 static inline int degree_of(int i) { return 4 + 2 * i; }
 
@@ -48,7 +55,7 @@ static void powers(const double *H, double *table) {
             store(table + N * STRIDE, scale(times(H, load(table)), 1.0 / (k + 1)));
 }
 
-/* Fill a table with X_k, k = 0 ... HIGHEST + 1. */
+/* Fill a table with X_k, k = 0 ... HIGHEST + 1; with -BK instead of E, with D_k. */
 static void driven(const double *A, const double *E, const double *H_k, double *table) {
     memset(table, 0, N * STRIDE * sizeof *table);
     for (int k = 0; k <= HIGHEST; k++)
@@ -116,25 +123,15 @@ static inline lanes value(const double *curve, int p, double s) {
 
 /* The state at a time on a piece. */
 static inline models state_at(const exact_memory *memory, int p, double s) {
-    models state = {
-        load(memory->x_c + p * STRIDE), load(memory->e_c + p * STRIDE),
-        load(memory->d + p * STRIDE)};
-    if (memory->is_static) {
-        state = (models){load(memory->x_c), state.e_c, load(memory->d)};
-        for (int k = p - 1; k >= 0; k--)
-            state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
+    models state
+        = {load(memory->r), value(memory->e, p, s), load(memory->d), load(memory->q)};
+    if (memory->is_static)
         return state;
-    }
-    for (int k = p - 1; k >= 0; k--) {
-        state.x_c = fma_scaled(state.x_c, s, load(memory->x_c + k * STRIDE));
-        state.e_c = fma_scaled(state.e_c, s, load(memory->e_c + k * STRIDE));
-    }
-    if (!memory->apart) {
-        state.d = filled(0.0);
-        return state;
-    }
-    for (int k = p - 1; k >= 0; k--)
-        state.d = fma_scaled(state.d, s, load(memory->d + k * STRIDE));
+    state.r = value(memory->r, p, s);
+    if (memory->apart)
+        state.d = value(memory->d, p, s);
+    if (memory->renewed)
+        state.q = value(memory->q, p, s);
     return state;
 }
 

@@ -3,7 +3,11 @@
 
 #include <string.h>
 
-enum { IPV4 = AF_INET, FEW = 512 }; /* the data of so few clients fits into the caches */
+enum {
+    IPV4 = AF_INET,
+    KEY_BYTES = 32,
+    FEW = 512 /* the data of so few clients fits into the caches */
+};
 
 /* A client's key in four words: family, port, host, scope and link. */
 static void key_of(const uint8_t name[NOACK_NAME_BYTES], int64_t link, int64_t key[4]) {
@@ -31,15 +35,20 @@ static int64_t home_of(const noack_relay *relay, const int64_t key[4]) {
     return (int64_t)(mixed & (uint64_t)(relay->table_places - 1));
 }
 
-int64_t noack_client_find(
-    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
-    int64_t key[4], mask = relay->table_places - 1;
-    key_of(name, link, key);
+static int64_t find_key(const noack_relay *relay, const int64_t key[4]) {
+    int64_t mask = relay->table_places - 1;
     for (int64_t place = home_of(relay, key);; place = (place + 1) & mask) {
         int64_t row = relay->table[place];
-        if (row < 0 || memcmp(relay->clients[row].key, key, sizeof key) == 0)
+        if (row < 0 || memcmp(relay->clients[row].key, key, KEY_BYTES) == 0)
             return row;
     }
+}
+
+int64_t noack_client_find(
+    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
+    int64_t key[4];
+    key_of(name, link, key);
+    return find_key(relay, key);
 }
 
 /* The table must have room. */
@@ -68,10 +77,23 @@ void noack_client_remove(noack_relay *relay, int64_t row) {
         }
     }
     table[gap] = -1;
+    relay->clients[row].key[0] = -1; /* no sender's */
+}
+
+/* The row of the current datagram's sender; -1: there is none. */
+int64_t find_sender(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    int64_t key[4], k = own->batch_next, row = own->hints[k];
+    key_of(own->in_names[k], own->batch_socket, key);
+    if (row < 0 || memcmp(relay->clients[row].key, key, KEY_BYTES) != 0)
+        row = find_key(relay, key);
+    if (relay->client_rows <= FEW) /* the next datagram often has the same sender */
+        own->hints[(k + 1) % BUFFERS] = (int32_t)row;
+    return row;
 }
 
 /* The row that the table has first for the sender of datagram k; -1: none. */
-static int64_t row_of(const noack_relay *relay, int64_t k) {
+static int32_t row_of(const noack_relay *relay, int64_t k) {
     const relay_scratch *own = scratch_of(relay);
     int64_t key[4];
     key_of(own->in_names[k], own->batch_socket, key);
@@ -89,15 +111,15 @@ void touch_clients(noack_relay *relay) {
         return;
     const noack_link *link = relay->directions[2 * own->batch_socket].link;
     for (int64_t k = own->batch_next; k < own->batch_end; k++)
-        loaded += row_of(relay, k);
+        own->hints[k] = row_of(relay, k);
     for (int64_t k = own->batch_next; k < own->batch_end; k++) {
-        int64_t row = row_of(relay, k);
+        int64_t row = own->hints[k];
         if (row >= 0)
             loaded += relay->clients[row].key[0] + relay->clients[row].place
                       + relay->sockets[first_path + row].fd;
     }
     for (int64_t k = own->batch_next; k < own->batch_end; k++) {
-        int64_t row = row_of(relay, k);
+        int64_t row = own->hints[k];
         if (row >= 0 && relay->clients[row].link == own->batch_socket)
             loaded += noack_link_touch(link, relay->clients[row].place);
     }

@@ -38,6 +38,7 @@ void noack_relay_open(noack_relay *relay) {
             .msg_iovlen = 1,
             .msg_control = &own->in_controls[k],
         };
+        own->hints[k] = -1;
         renew_header(relay, k);
     }
     struct timespec at_once = {0, 0};
@@ -161,7 +162,7 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
     }
     int64_t row = own->batch_socket - 2 * relay->links;
     if (!(number & 1)) {
-        row = noack_client_find(relay, own->in_names[own->batch_next], number >> 1);
+        row = find_sender(relay);
         if (row < 0 && !direction->full)
             return NO_CLIENT;
         if (row < 0) {
@@ -329,16 +330,15 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     return found >= 0;
 }
 
-/* Receive datagrams from the next socket that is ready, as far as there are buffers. */
-static void receive(noack_relay *relay) {
+/* Receive datagrams from a socket, as far as there are buffers; return 0, or errno if there are
+   none. */
+static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *own = scratch_of(relay);
-    const struct epoll_event *event = &own->ready[own->ready_next++];
-    int64_t socket = (int64_t)event->data.u64, begin = own->batch_end;
-    if (event->events & EPOLLERR)
-        take_errors(relay, socket);
+    int64_t begin = own->batch_end;
     int taken = recvmmsg(
-        relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin),
-        MSG_DONTWAIT, NULL);
+        relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags,
+        NULL);
+    int error = taken > 0 ? 0 : errno;
     relay->read_ns = run_time_ns(&relay->clock);
     if (own->stamps)
         own->real_ns = clock_ns(CLOCK_REALTIME);
@@ -346,13 +346,40 @@ static void receive(noack_relay *relay) {
         own->batch_socket = socket;
         own->batch_next = begin;
         own->batch_end = begin + taken;
+        touch_clients(relay);
     }
+    return error;
+}
+
+/* Receive from the next socket that is ready. */
+static void receive_ready(noack_relay *relay) {
+    relay_scratch *own = scratch_of(relay);
+    const struct epoll_event *event = &own->ready[own->ready_next++];
+    if (event->events & EPOLLERR)
+        take_errors(relay, (int64_t)event->data.u64);
+    receive(relay, (int64_t)event->data.u64, MSG_DONTWAIT);
+}
+
+/* Whether the receiving call is to wait, which saves the call of epoll: it ends late by up to a
+   tick of the kernel, hence not if a datagram is delayed or housekeeping is due before. */
+static int receiving_waits(const noack_relay *relay, int64_t until_ns) {
+    return relay->only_socket >= 0 && relay->heap_length == 0
+           && noack_clock_wait_ns(&relay->clock, until_ns - relay->read_ns)
+                  >= relay->receive_wait_ns;
+}
+
+/* Wait in the receiving call; return 0 if a signal interrupted it. */
+static int wait_and_receive(noack_relay *relay) {
+    int error = receive(relay, relay->only_socket, MSG_WAITFORONE);
+    if (error != 0 && error != EAGAIN && error != EINTR)
+        take_errors(relay, relay->only_socket);
+    return error != EINTR;
 }
 
 int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
     for (;;) {
-        int64_t reason = NOACK_CARRY_ON;
+        int64_t reason = NOACK_CARRY_ON, sent_ns = -1;
         if (own->batch_next < own->batch_end)
             reason = decide_batch(relay);
         if (reason == NOACK_CARRY_ON)
@@ -360,7 +387,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         int all_taken = own->ready_next >= own->ready_count;
         if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
             if (own->leaving_count > 0)
-                send_all(relay);
+                sent_ns = send_all(relay);
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
@@ -368,7 +395,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             own->batch_next = own->batch_end = 0;
         }
         if (all_taken) {
-            relay->read_ns = run_time_ns(&relay->clock);
+            relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = until_ns;
             if (relay->read_ns >= until_ns) {
                 if (!is_soon_due(relay, until_ns)) {
@@ -377,12 +404,11 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
                 }
                 wait_until_ns = relay->read_ns + (int64_t)(HOUSEKEEPING_NS * relay->clock.speed);
             }
-            if (!wait_for_datagrams(relay, wait_until_ns))
+            int in_receive = receiving_waits(relay, wait_until_ns);
+            if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_HOUSEKEEPING;
         }
-        if (own->ready_next < own->ready_count) {
-            receive(relay);
-            touch_clients(relay);
-        }
+        if (own->ready_next < own->ready_count)
+            receive_ready(relay);
     }
 }

@@ -52,6 +52,7 @@ typedef struct {
     int32_t order[LEAVING];     /* the sockets that have something to send */
     int64_t ready_count, ready_next;
     int64_t batch_socket, batch_next, batch_end; /* the receive buffers that are filled */
+    int32_t hints[BUFFERS]; /* rows that the senders in the buffers may have; -1: none */
     int64_t leaving_count, leaving_bytes;
     int64_t arrival_ns; /* arrival of the datagram in the current receive buffer */
     int64_t real_ns;    /* the real-time clock at the last receiving of datagrams */
@@ -74,6 +75,7 @@ void free_payload(noack_relay *relay, int64_t slot);
 
 /* clients.c */
 void touch_clients(noack_relay *relay);
+int64_t find_sender(noack_relay *relay);
 
 /* events.c */
 int has_room(const noack_relay *relay, int64_t size_bytes);
@@ -87,7 +89,7 @@ void record_packet(
 void record_release(noack_relay *relay, const departure *leaving, int64_t now_ns);
 
 /* send.c */
-void send_all(noack_relay *relay);
+int64_t send_all(noack_relay *relay);
 int64_t take_errors(noack_relay *relay, int64_t socket);
 
 #endif

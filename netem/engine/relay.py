@@ -21,7 +21,7 @@ from netem.engine.relay_interface import (
     Tap,
 )
 from netem.engine.relay_memory import RelayDirection, RelayMemory
-from netem.engine.relay_sockets import raise_file_limit, stamp_arrivals
+from netem.engine.relay_sockets import let_wait, raise_file_limit, stamp_arrivals
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
@@ -254,6 +254,8 @@ class Relay:
         forward.set_server(link.server, sends)
         reverse.set_server(link.server, core.NOACK_CLIENT_NAME)
         forward.row.listen, _ = packed_name(link.name)
+        if len(self.specs) == 1 and not link.spec.return_path:
+            self._memory.wait_for_only(number, let_wait(link.endpoint))
 
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""

@@ -51,7 +51,7 @@ class RelayMemory:
         self.releases: Array = np.zeros(row_count, RELEASE_ROW)
         self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
         self.core: Any = ffi.new("noack_relay *", {
-            "links": links, "epoll": self._epoll.fileno(), "clock": {"speed": 1.0},
+            "links": links, "epoll": self._epoll.fileno(), "only_socket": -1, "clock": {"speed": 1.0},
             "change_ns": 2**63 - 1, "segment": segment, "segment_below": 2**16, "taps": taps,
             "records": row_count > 0, "directions": self.directions,
             "event_count": len(self.events), "data_bytes": len(self.data),
@@ -85,6 +85,15 @@ class RelayMemory:
         self.sockets["fd"][number] = fd
         if error := core.noack_relay_watch(self.core, fd, number):
             raise OSError(error, "epoll_ctl")
+
+    def wait_for_only(self, number: int, wait_ns: int) -> None:
+        """Let the core wait in the receiving call of a socket: it is the only one that is watched.
+
+        Args:
+            number: its place among the sockets.
+            wait_ns: how long receiving from it waits.
+        """
+        self.core.only_socket, self.core.receive_wait_ns = number, wait_ns
 
     def add_room(self) -> None:
         """Make room for one more delayed datagram and its copy, if there is memory."""

@@ -18,6 +18,8 @@ from noack.runtime.address import text_of
 from noack.runtime.peer_sockets import enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
+RECEIVE_WAIT_NS = 8_000_000
+"""Much less than the time between two turns of housekeeping."""
 _SO_SNDBUFFORCE = 32
 _SO_ATTACH_FILTER = 26
 _BPF_RETURN = 6
@@ -136,6 +138,15 @@ def stamp_arrivals(endpoint: Endpoint) -> None:
     """Enable kernel timestamps of arrival, if the system supports them."""
     with suppress(OSError):
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+
+def let_wait(endpoint: Endpoint) -> int:
+    """Let receiving from a socket wait; return how long, in ns."""
+    endpoint.setblocking(True)
+    endpoint.setsockopt(
+        socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, RECEIVE_WAIT_NS // 1000)
+    )
+    return RECEIVE_WAIT_NS
 
 
 def has_data(endpoint: Endpoint) -> bool:

@@ -28,5 +28,6 @@ else:
     AnyObserver = union_of(OBSERVERS)
     AnyPlant = union_of(PLANTS, default="linear")
     AnyTrigger = union_of(POLICIES, "policy", default="decaying")
-    for _settings in POLICIES.values():  # a policy may combine others
-        _settings.model_rebuild(_types_namespace={"AnyTrigger": AnyTrigger})
+    for _settings in POLICIES.values():
+        if not _settings.__pydantic_fields_complete__:  # a policy that combines others
+            _settings.model_rebuild(_types_namespace={"AnyTrigger": AnyTrigger})

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,8 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
     The folder's name depends on the content of all sources, because numba checks only the file of
     the outermost function. Only the user and root can change the folder and the folders above it.
     """
+    from importlib.metadata import version  # slow to import
+
     digest = hashlib.blake2b(version("numba").encode(), digest_size=8)
     for source in sources:
         digest.update(source.read_bytes())

@@ -1,19 +1,28 @@
 """Locking a process's memory, so that its loop does not wait for a page.
 
 All mappings are locked, but only those of up to 16 MiB are loaded beforehand. The larger ones are
-mostly unused: buffers of BLAS (32 MiB each) and the compiler's library (150 MiB), of which the loop
-uses some pages. These are locked when they are first used.
+mostly unused: buffers of BLAS (32 MiB each), of which the loop uses some pages. These are locked
+when they are first used.
+
+What this process shares with the fork server is not copied beforehand: a page of it is in memory,
+and the loop writes to few of them, each of which then takes a microsecond. Nor are the stacks of
+other threads (2 MiB each) loaded, most of which is never used.
 """
 
 import ctypes
 import os
+import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
 _LARGE_BYTES = 16 * 2**20
-_MAPS = Path("/proc/self/maps")
+_MAPPINGS = Path("/proc/self/smaps")
+_MAPPING = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (.).*\n((?:[A-Z].*\n)*)", re.MULTILINE)
+_SHARED = re.compile(r"^Shared_Dirty: +[1-9]", re.MULTILINE)
 
 
 def lock_memory() -> None:
@@ -28,10 +37,30 @@ def lock_memory() -> None:
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
-    for mapping in _MAPS.read_text().splitlines():
-        place, permissions = mapping.split(maxsplit=2)[:2]
-        first, end = (int(address, 16) for address in place.split("-"))
-        if permissions[0] == "r" and end - first <= _LARGE_BYTES:
-            advice = _MADV_POPULATE_WRITE if permissions[1] == "w" else _MADV_POPULATE_READ
+    for mapping in _mappings():
+        if mapping.bytes <= _LARGE_BYTES:
             # Fails for special mappings, and before Linux 5.14: then each page is locked at its use
-            libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), advice)
+            libc.madvise(
+                ctypes.c_void_p(mapping.first), ctypes.c_size_t(mapping.bytes), mapping.advice
+            )
+
+
+class _Mapping(NamedTuple):
+    """Readable memory of this process."""
+
+    first: int
+    bytes: int
+    advice: int
+
+
+def _mappings() -> Iterator[_Mapping]:
+    guard_end = 0
+    for found in _MAPPING.finditer(_MAPPINGS.read_text()):
+        first, end = int(found[1], 16), int(found[2], 16)
+        writable, is_stack = found[0].split(maxsplit=2)[1][1] == "w", guard_end == first
+        if found[3] == "-":  # without any access; a thread's stack begins with such a guard
+            guard_end = end
+            continue
+        own = writable and not is_stack and not _SHARED.search(found[4])
+        advice = _MADV_POPULATE_WRITE if own else _MADV_POPULATE_READ
+        yield _Mapping(first, end - first, advice)

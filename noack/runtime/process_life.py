@@ -19,6 +19,7 @@ from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolved_loops, run_tables
 from noack.config.scenario import Scenario
+from noack.config.scenario_changes import prepare_changes
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
@@ -110,6 +111,7 @@ class RunProcess:
         self._reference = reference_clock(self.ticket)
         if self._reference is not None:
             self._reference.wait_until_known(lambda: self.stopping)
+        prepare_changes()
         self.life.apply(Event.JOIN)
         begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
         epoch_ns, speed = begin["epoch_ns"], self.scenario.speed

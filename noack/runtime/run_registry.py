@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import zenoh
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
@@ -32,7 +32,7 @@ class OpenRun(NamedTuple):
     session: str | None  # session name for processes started by hand; None if all were launched
 
 
-_OPEN_RUN = TypeAdapter(OpenRun)
+_OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
 
 
 @contextmanager

@@ -19,7 +19,6 @@ from zenoh.handlers import FifoChannel
 
 from noack.core.errors import CallerError, NoAnswerError
 from noack.runtime.address import text_of
-from noack.runtime.coordinator_link import Destination, coordinator_link
 from noack.runtime.join_ticket import RemoteAccess
 from noack.runtime.private_folder import open_private
 
@@ -29,6 +28,8 @@ for seconds."""
 _CONNECT_MS = 5000
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
 """Of a connection whose other end does not answer."""
+_FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
+"""Time between two looks for a reply: at first, and as a share of the time waited so far."""
 _FOLDERS: dict[Path, int] = {}
 """Descriptors of folders with sockets; they stay open, because zenoh may connect again."""
 
@@ -51,6 +52,9 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
         MachineError: the link to the coordinator cannot be started.
         CallerError: other users have access to the user's runtime directory.
     """
+    # Processes on the coordinator's host need neither TLS nor asyncio.
+    from noack.runtime.coordinator_link import Destination, coordinator_link
+
     destination = Destination(
         remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
         key.hex(),
@@ -131,15 +135,19 @@ def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float)
 def first_reply(
     replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
 ) -> zenoh.Reply | None:
-    """Return the first reply before a reading of the monotonic clock; None without one."""
-    while time.monotonic() < until_s and not give_up():
+    """Return the first reply before a reading of the monotonic clock; None without one.
+
+    ``poll_s`` is the longest time between two looks, which are more frequent in the beginning.
+    """
+    began_s = time.monotonic()
+    while (now_s := time.monotonic()) < until_s and not give_up():
         try:
             reply: zenoh.Reply | None = replies.try_recv()
         except zenoh.ZError:  # the query ended without an answer
             return None
         if reply is not None:
             return reply
-        time.sleep(poll_s)
+        time.sleep(min(poll_s, _FIRST_POLL_S + _POLL_SHARE * (now_s - began_s)))
     return None
 
 

@@ -24,7 +24,8 @@ _LEAST_RATE_HZ = 1e-9  # lowest rate; its period in nanoseconds fits into 64 bit
 class ScenarioSection(BaseModel):
     """A frozen table of a settings file that refuses unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    # Validators are built at their first use, that of a scenario with those of all its tables.
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     @classmethod
     def key_descriptions(cls) -> dict[str, str]:

@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, ClassVar, Self
@@ -106,6 +106,8 @@ def _class(settings: ClassSettings, place: str) -> tuple[Any, str]:
     module, colon, name = settings.name.partition(":")
     if colon:
         return _attribute(import_module(module), name), f"class {settings.name}"
+    from importlib import metadata  # slow to import
+
     known = metadata.entry_points(group=settings.group)
     if settings.name not in known.names:
         there = ", ".join(sorted(known.names)) or "none"

@@ -1,4 +1,4 @@
-"""Summaries of runs for tests: of a record of one loop, and with other values."""
+"""Records and summaries of runs of one loop for tests."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,16 @@ from typing import Any
 from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary, RunSummary
-from cosim.record.run_record import RunRecord, alone
+from cosim.record.run_record import RecordedRun, RunRecord
+
+
+def alone(record: RunRecord) -> RecordedRun:
+    """Return the record of a run whose only loop has the network for itself."""
+    network = RunRecord(
+        record.scenario, record.source, [], record.reports, record.kind, record.earlier,
+        is_network=True,
+    )  # fmt: skip
+    return RecordedRun(network, [record])
 
 
 def summary_of(record: RunRecord, **more: Any) -> RunSummary:

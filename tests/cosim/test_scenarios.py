@@ -18,7 +18,7 @@ from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.model_comparison import linearisation, linearisation_rows
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ClaimVerdict
+from cosim.analysis.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.link_load import require_capacity
@@ -273,34 +273,33 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
 
 def test_a_summary_compares_the_cars_linearisation_with_the_model() -> None:
     found = linearisation(shipped("lane_vehicle"))
-    assert found is not None
-    assert found["in_box"] is True
-    assert max(real for real, _ in found["eigenvalues"]) == pytest.approx(-1.157, abs=2e-3)
+    assert isinstance(found, LinearisationPart)
+    assert found.in_box is True
+    assert max(real for real, _ in found.eigenvalues) == pytest.approx(-1.157, abs=2e-3)
     believed = loop("lane_vehicle")
-    np.testing.assert_allclose(np.array(found["A"]) - found["off_A"], believed.A_model, atol=1e-12)
-    np.testing.assert_allclose(np.array(found["B"]) - found["off_B"], believed.B_model, atol=1e-12)
+    np.testing.assert_allclose(np.array(found.A) - found.off_A, believed.A_model, atol=1e-12)
+    np.testing.assert_allclose(np.array(found.B) - found.off_B, believed.B_model, atol=1e-12)
     assert linearisation_rows(found)[1][1].endswith("inside the box")
 
 
 def test_another_car_is_reported_outside_the_box_with_its_entries() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.parameters=vw_vanagon"))
-    assert found is not None
-    assert found["in_box"] is False
-    worst = np.abs(np.array(found["off_B"])).max()
+    assert isinstance(found, LinearisationPart)
+    assert found.in_box is False
+    worst = np.abs(np.array(found.off_B)).max()
     assert linearisation_rows(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
 
 
 def test_a_plant_without_a_box_and_a_linear_plant_have_no_box_check() -> None:
     found = linearisation(shipped("cart_pole"))
-    assert found is not None
-    assert found["in_box"] is None
+    assert isinstance(found, LinearisationPart)
+    assert found.in_box is None
     assert linearisation(shipped("lane_following")) is None
 
 
 def test_the_summary_reports_a_plant_without_a_linearisation() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
-    assert found is not None
-    assert set(found.values()) == {None}
+    assert isinstance(found, NoLinearisationPart)
     assert linearisation_rows(found) == (
         ("the plant, linearised", "none: x is not its whole state, or it is not smooth"),
     )

@@ -18,12 +18,11 @@ from cosim.analysis.adversary.beam_search import search_beam
 from cosim.analysis.adversary.cost_bound import cost_ceiling
 from cosim.analysis.adversary.loss_patterns import guess, improve
 from cosim.analysis.adversary.objective import Objective, measure_of
-from cosim.analysis.adversary.pattern_evaluation import evaluate
 from cosim.analysis.adversary.pattern_tree import search_tree
 from cosim.analysis.adversary.sampled_flow import SampledFlow
 from cosim.analysis.adversary.sampled_run import SampledRun, run_of
 from cosim.analysis.adversary.search_nodes import Pattern, PatternSearch, SearchReport
-from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.analysis.adversary.segments import SegmentFlow, evaluate
 from cosim.analysis.adversary.worst_disturbance import Bounds, bounds_of, worst_causes
 from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.analysis.adversary.objective import Measure, Objective
-from cosim.analysis.adversary.pattern_evaluation import Valued
+from cosim.analysis.adversary.segments import Valued
 from cosim.analysis.adversary.search_nodes import Pattern
 from noack.config.scenario import Scenario
 from noack.core.number_format import number

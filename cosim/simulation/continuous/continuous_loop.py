@@ -112,14 +112,13 @@ class ContinuousLoop:
             CallerError: the loop diverges, or its events cannot be decided.
         """
         simulation = self.simulation(until_s, known_start=True)
-        t_s, start = np.array([state.t_s]), core_states(state.x, state.e_s, state.e_c)
+        t_s, start = np.array([state.t_s]), np.array(state[1:])
         found = simulation.segments(self.loop.A, self.loop.B, t_s, start[None])
         if found.statuses[0] != OK:
             raise CallerError(f"trigger: no event after {state.t_s:g} s: the loop diverges")
         if not found.events[0]:
             return None
-        (x,), (e_s,), (e_c,) = signals(found.states)
-        return LoopState(float(found.t_s[0]), x, e_s, e_c)
+        return LoopState(float(found.t_s[0]), *found.states[0])
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
         """Return the state at ``t_s`` ≥ ``state.t_s``, without events in between."""
@@ -128,11 +127,10 @@ class ContinuousLoop:
 
     def sample(self, state: LoopState, t_s: Vector) -> Samples:
         """Return the states at ascending times ≥ ``state.t_s``, without events in between."""
-        start = core_states(state.x, state.e_s, state.e_c)
-        return self.follow(np.array([state.t_s]), start[None], t_s)
+        return self.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
 
     def follow(self, start_s: Vector, starts: NDArray[np.float64], t_s: Vector) -> Samples:
-        """Return the states at ascending times, of parts that begin at states of the core.
+        """Return the states at ascending times, of parts that begin just after events.
 
         Args:
             start_s: ascending, (k,).
@@ -141,18 +139,7 @@ class ContinuousLoop:
         """
         t_s = np.asarray(t_s, dtype=np.float64)
         states = self._between.sample(self.loop.A, self.loop.B, start_s, starts, t_s)
-        return Samples(t_s, *signals(states))
-
-
-def core_states(x: Matrix, e_s: Matrix, e_c: Matrix) -> NDArray[np.float64]:
-    """Return the core's states (x_c, e_c, d) of signals of shape (…, n), (…, 3, n)."""
-    return np.stack([x + e_c, e_c, e_s - e_c], axis=-2)
-
-
-def signals(states: NDArray[np.float64]) -> tuple[Matrix, Matrix, Matrix]:
-    """Return x, e_s and e_c, (…, n), of the core's states, (…, 3, n)."""
-    x_c, e_c, d = np.moveaxis(states, -2, 0)
-    return x_c - e_c, e_c + d, e_c
+        return Samples(t_s, *np.moveaxis(states, 1, 0))
 
 
 def reset(state: LoopState, delivered: bool) -> LoopState:

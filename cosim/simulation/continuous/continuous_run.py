@@ -12,7 +12,6 @@ from cosim.simulation.continuous.continuous_loop import (
     LoopState,
     Samples,
     reset,
-    signals,
     vanished,
     vanishes_s,
 )
@@ -49,13 +48,16 @@ class ContinuousRun:
     """Whether the update of each event arrived, (k,)."""
     diverged_at_s: float | None
     """Time at which the state exceeded 1e100, or None; the run is computed up to this time."""
-    starts: NDArray[np.float64]
-    """The core's states at the start and just after each event, (k + 1, 3, n)."""
 
     @cached_property
     def event_s(self) -> Vector:
         """Times of the events, (k,)."""
         return np.array([state.t_s for state in self.before])
+
+    @cached_property
+    def starts(self) -> NDArray[np.float64]:
+        """(x, e_s, e_c) at the start and just after each event, (k + 1, 3, n)."""
+        return np.array([state[1:] for state in (self.start, *self.after)])
 
     @property
     def reached_s(self) -> float:
@@ -156,13 +158,7 @@ def _run(
     assert log.states is not None
     delivered, zero = log.delivered[0, :events], np.zeros_like(x0)
     times_s, states = log.event_s[0, :events].tolist(), log.states[0, :events]
-    before = tuple(map(LoopState, times_s, *signals(states)))
-    x_c, e_c, _ = np.moveaxis(states, 1, 0)
-    lost = ~delivered[:, None]
-    first = [x0, zero, zero] if known_start else [zero, zero - x0, zero]
-    after = np.stack([np.where(lost, x_c, x_c - e_c), lost * e_c, 0.0 - lost * e_c], axis=1)
-    return ContinuousRun(
-        system, horizon_s, LoopState(0.0, x0, zero, zero if known_start else -x0), before,
-        tuple(map(reset, before, delivered.tolist())), delivered, diverged_at_s,
-        np.concatenate([np.array(first)[None], after]),
-    )  # fmt: skip
+    start = LoopState(0.0, x0, zero, zero if known_start else -x0)
+    before = tuple(map(LoopState, times_s, *np.moveaxis(states, 1, 0)))
+    after = tuple(map(reset, before, delivered.tolist()))
+    return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)  # fmt: skip

@@ -10,9 +10,9 @@ A real loop differs from the paper's loop by these effects:
   model time t'_k of the actuation applied at step k. An update acts from the first step that
   applies an actuation computed from it.
 
-Without held actuation the plant follows u = K x_c(t) continuously, by e^{Gt} of
+Without held actuation the plant follows u = K x_c(t) continuously, as in
 :mod:`cosim.simulation.continuous.continuous_loop`; with it, by the exact zero-order hold that the
-live plant uses.
+live plant uses. The trigger is that of the core, which the sensor has, too.
 """
 
 from collections.abc import Callable
@@ -23,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
+from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.trigger.trigger_policy import Trigger
+from noack.trigger.core_rule import fill_rule, rule_rows
+from noack.trigger.trigger_policy import Policy
 
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""
 _BLOCK = 64
-_LONGEST_CELL_S = 1e3
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,6 @@ class SampledLoop:
         self._known_start = known_start
         self._steps_s = np.arange(len(schedule.measured), dtype=np.float64)
         self._steps_s *= schedule.period_ns * 1e-9
-        H = system.loop.H
-        self._model = ExactFlow(H, 1.0 / max(growth_rate(H), 1.0 / _LONGEST_CELL_S))
-        self._model_steps = _transitions(self._model, self._steps_s[: _BLOCK + 1])
-        self._loop_steps = _transitions(system.flow, self._steps_s[: _BLOCK + 1])
         self._one_step = discretise(system.loop.A, system.loop.B, schedule.period_ns)
 
     @np.errstate(all="ignore")
@@ -85,7 +82,7 @@ class SampledLoop:
         last = len(schedule.measured) - 1
         states = np.empty((last + 1, len(x0)))
         states[0] = x_s = x0
-        trigger, in_common = Trigger(self._system.trigger), self._known_start
+        trigger, in_common = _CoreTrigger(self._system.trigger, len(x0)), self._known_start
         if in_common:
             trigger.start(0, x0)
         newest = _Update(-1, 0, 0, x0 if in_common else np.zeros_like(x0))
@@ -93,7 +90,7 @@ class SampledLoop:
         events: list[int] = []
         step, event = 0, bool(schedule.measured[0])
         if event and in_common:
-            event = trigger.test(0, x0, np.zeros_like(x0)).event
+            event = trigger.test(0, x0[None], np.zeros_like(x0)[None]) is not None
         while True:
             x, now_ns = states[step], step * period_ns
             if event:
@@ -117,11 +114,11 @@ class SampledLoop:
                 states[following] = self._held(x, newest, step, until)
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
-            x_s_block = self._model_steps[1 : until - step + 1] @ x_s
+            x_s_block = self._modelled(x_s, self._steps_s[1 : until - step + 1])
             measured = np.flatnonzero(schedule.measured[following])
             if in_common:
                 block = states[following][measured]
-                found = trigger.first_event(
+                found = trigger.test(
                     (step + 1 + measured) * period_ns, block, x_s_block[measured] - block
                 )
             else:
@@ -138,29 +135,31 @@ class SampledLoop:
 
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
         """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
-        n, now_ns, newest = len(x), step * self._schedule.period_ns, updates[0]
-        z = self._state(x, newest, now_ns)
-        if len(updates) == 1:
-            states: Matrix = self._loop_steps[1 : until - step + 1, :n] @ z
-            return states
+        now_ns, newest = step * self._schedule.period_ns, updates[0]
         for update in updates[1:]:
-            x = self._system.flow.advance(z, (update.acts_ns - now_ns) * 1e-9)[:n]
-            newest = max(newest, update, key=lambda update: update.number)
-            now_ns = update.acts_ns
-            z = self._state(x, newest, now_ns)
+            x = self._followed(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
+            newest, now_ns = max(newest, update, key=lambda one: one.number), update.acts_ns
+        if len(updates) == 1:
+            return self._followed(x, newest, now_ns, self._steps_s[1 : until - step + 1])
         end_ns = until * self._schedule.period_ns
-        return self._system.flow.advance(z, (end_ns - now_ns) * 1e-9)[None, :n]
+        return self._followed(x, newest, now_ns, np.array([(end_ns - now_ns) * 1e-9]))
 
-    def _state(self, x: Vector, newest: "_Update", now_ns: int) -> Vector:
-        """Return (x, e_s, e_c) with e_s = 0; e_s does not act on the plant."""
-        x_c = self._model.advance(newest.x, (now_ns - newest.event_ns) * 1e-9)
-        return np.concatenate([x, np.zeros_like(x), x_c - x])
+    def _followed(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
+        """Return x at ascending times after now, (k, n), while no other update acts."""
+        x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
+        start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
+        return self._system.follow(np.zeros(1), start[None], after_s).x
+
+    def _modelled(self, x: Vector, age_s: Vector) -> Matrix:
+        """Return e^{H age} x for ascending ages, (k, n)."""
+        start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
+        return self._system.follow(np.zeros(1), start[None], age_s).x_c
 
     def _held(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
         """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
         model_ns = self._schedule.model_ns[step:until]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)
-        inputs = self._model.sample(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
+        inputs = self._modelled(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
         inputs[model_ns == NO_ACTUATION] = 0.0
         Ad, Bd = self._one_step
         states = np.empty((until - step, len(x)))
@@ -178,7 +177,32 @@ class _Update(NamedTuple):
     x: Vector
 
 
-def _transitions(flow: ExactFlow, dt_s: Vector) -> Matrix:
-    """e^{G dt} for each dt, shape (len(dt_s), N, N)."""
-    columns = np.eye(flow.powers.shape[1])
-    return np.stack([flow.sample(column, dt_s) for column in columns], axis=2)
+class _CoreTrigger:
+    """Tests measurements as the sensor does: the core's trigger."""
+
+    def __init__(self, policy: Policy, n: int) -> None:
+        self._n, self._memory, rule = n, CoreMemory(), policy.trigger_rule(n)
+        start = policy.initial_dynamic_variable
+        self._rule, self._sides = ffi.new("noack_trigger_rule *"), ffi.new("double[2]")
+        fill_rule(self._rule, rule, policy.weight, start, self._memory)
+        self._state = ffi.new("noack_trigger_state *", {"auxiliary": start, "event_ns": -1})
+        self._scratch = self._memory.zeros(4 * n + rule_rows(rule))
+
+    def start(self, t_ns: int, x: Vector) -> None:
+        """Begin, or begin again after an event, at a state of shape (n,)."""
+        x = np.ascontiguousarray(x)
+        core.noack_trigger_start(
+            self._rule, self._state, self._n, t_ns, pointer_to(x, "double *"), self._scratch
+        )
+
+    def test(self, t_ns: NDArray[np.int64] | int, x: Matrix, e_s: Matrix) -> int | None:
+        """Test k successive measurements, (k, n), up to the first event; return its index."""
+        x, e_s = np.ascontiguousarray(x), np.ascontiguousarray(e_s)
+        states, errors = pointer_to(x, "double *"), pointer_to(e_s, "double *")
+        for i, at_ns in enumerate(np.atleast_1d(t_ns).tolist()):
+            if core.noack_trigger_test(
+                self._rule, self._state, self._n, at_ns, states + i * self._n,
+                errors + i * self._n, self._sides, self._scratch,
+            ):  # fmt: skip
+                return i
+        return None

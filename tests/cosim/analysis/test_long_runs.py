@@ -14,11 +14,12 @@ from cosim.analysis.run_summary import summarise
 from cosim.record import run_record
 from cosim.record.align import align_tables
 from cosim.record.run_directory import write_scenario
-from cosim.record.run_record import RunRecord, alone, load_record, write_run
+from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from tests.cosim.summaries import alone
 
 PART_ROWS = 37
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}

@@ -48,7 +48,7 @@ def test_a_signal_before_the_record_is_complete_leaves_no_simulated_run(
     def signalled(*_: Any, **__: Any) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("cosim.live.simulated_run.write_record", signalled)
+    monkeypatch.setattr("cosim.live.simulated_run.write_run", signalled)
     done = CliRunner().invoke(app, ["simulate", *SHORT, "--runs", str(tmp_path)])
     assert done.exit_code == 143
     assert done.stderr.splitlines()[-1] == "noack: stopped on request (SIGTERM)"

@@ -22,7 +22,7 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from cosim.record.run_record import alone, load_record, write_run
+from cosim.record.run_record import load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
@@ -32,6 +32,7 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
 from tests.cosim.record.changed_records import changed
+from tests.cosim.summaries import alone
 
 
 @pytest.fixture(scope="module")

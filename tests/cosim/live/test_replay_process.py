@@ -16,13 +16,14 @@ from cosim.live.replay_process import ReplayProcess
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import SUMMARY_FILE, write_scenario
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import alone, load_record, write_run
+from cosim.record.run_record import load_record, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import PLANT_STEP
+from tests.cosim.summaries import alone
 from tests.integration.conftest import wait_for
 
 

@@ -15,7 +15,7 @@ from cosim.record.collection import collect
 from cosim.record.environment import write_environment
 from cosim.record.loop_rows import with_loop
 from cosim.record.run_directory import PROCESSES_FILE, REPORTS_FILE, write_scenario
-from cosim.record.run_record import Rows, RunRecord, alone, load_record, write_run
+from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve, run_tables
@@ -24,6 +24,7 @@ from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.record_handover import OwnSpool
 from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
+from tests.cosim.summaries import alone
 
 RUN = "0123456789abcdef"
 SECRETS = {"controller": "known to the controller", "plant": "known to the plant"}

@@ -15,7 +15,7 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
 from cosim.output.all_certificates import Certificates
 from cosim.record.align import align_tables
-from cosim.record.run_record import RunRecord, alone, load_record, write_run
+from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -41,6 +41,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.wire_format import Flow, read_header
 from noack.theory.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
+from tests.cosim.summaries import alone
 from tests.oracles.link import Datagram, Duplex, Link, network_of
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

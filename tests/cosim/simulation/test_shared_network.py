@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loop_rows import NetworkRows
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.loops import loops_of, phases_ns
@@ -164,7 +164,8 @@ def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -
         rows[table]["input"][half] += GENERATION - first
     for missing in (0, 2):
         rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
-        for own in network_rows_by_loop(rows, phases_ns(scenario)):
+        found = NetworkRows(rows, phases_ns(scenario))
+        for own in map(found.of_loop, range(len(phases_ns(scenario)))):
             inputs = np.sort(np.concatenate([one["input"] for one in own.values()]))
             for generation in (0, 1):
                 numbers = inputs[inputs // GENERATION == generation] % GENERATION

@@ -28,13 +28,14 @@ from cosim.record.run_directory import (
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import Rows, RunRecord, alone, load_record, write_run
+from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, validate
 from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import SPOOL, SpoolWriter
+from tests.cosim.summaries import alone
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace

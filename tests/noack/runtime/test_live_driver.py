@@ -154,6 +154,30 @@ def test_users_code_is_asked(content: dict[str, Any]) -> None:
         assert received(live.peer) == sent
 
 
+@pytest.mark.parametrize("encrypted", [False, True])
+def test_slow_users_code_leaves_time_for_datagrams_and_housekeeping(
+    encrypted: bool, tmp_path: Path
+) -> None:
+    """Each step takes twice its time, so that the plant is late from the first step on."""
+    (tmp_path / "slow.py").write_text(
+        "import time\n"
+        "class Slow:\n"
+        "    def start(self, x0): self.x = x0\n"
+        "    def advance(self, u, t_s, dt_s): time.sleep(2 * dt_s)\n"
+    )
+    system = f'{{kind="python", file="{tmp_path / "slow.py"}", name="Slow"}}'
+    settings = [f"plant.system={system}", 'plant.draw="nominal"', "horizon_s=1.0"]
+    resolved = resolve(load(SCENARIOS / "lane_following.toml", settings))
+    with closing(Live("plant", [resolved], encrypted=encrypted)) as live:
+        inputs = np.zeros(resolved.message_sizes.entries(Flow.ACTUATION))
+        live.send(Message(Flow.ACTUATION, 0, 0, inputs))
+        live.driver.drive(live.clock.now_ns() + 10_000_000, live.rows)
+        steps = len(live.rows.tables[PLANT_STEP])
+        assert 0 < steps < 250  # of 500 until the horizon
+        assert live.driver.accepted == 1
+        assert len(received(live.peer)) == live.driver.core.sent == steps
+
+
 def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[str, Any]) -> None:
     network = content["network"] | {"protocol": "ack"}
     resolved = scenario(content, network=network)

@@ -1,4 +1,4 @@
-"""Segments, objectives and polynomial curves against the reference simulator and quadrature."""
+"""Segments and objectives against single runs, quadrature and dense samples."""
 
 import math
 from itertools import pairwise
@@ -10,9 +10,7 @@ from scipy.integrate import quad
 
 from cosim.analysis.adversary.loss_patterns import follow
 from cosim.analysis.adversary.objective import Objective, measure_of
-from cosim.analysis.adversary.pattern_evaluation import evaluate
-from cosim.analysis.adversary.polynomial_curves import Stack, curve_stack, peak_squares, powers
-from cosim.simulation.continuous.bernstein import curve_basis
+from cosim.analysis.adversary.segments import evaluate
 from cosim.simulation.continuous.continuous_loop import LoopState
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LossAutomaton
@@ -20,7 +18,6 @@ from tests.cosim.analysis.adversary.scenarios import flow_of, scenarios, simulat
 
 STATES = 10
 POINTS = 4001
-DEGREE = 18
 
 
 @given(resolved=scenarios(12))
@@ -35,8 +32,7 @@ def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
     found = flow(t_s, z)
     for i in range(STATES):
         start = LoopState(t_s[i], *np.split(z[i], 3))
-        crossing = system.next_crossing(start, resolved.horizon_s, system.condition(start))
-        expected = None if crossing is None else crossing[0]
+        expected = system.next_event(start, resolved.horizon_s)
         assert found.is_event[i] == (expected is not None)
         if expected is not None:
             assert found.end_s[i] == pytest.approx(expected.t_s, rel=1e-9)
@@ -101,47 +97,3 @@ def test_cost_and_inter_event_time_are_those_of_the_run(resolved: Scenario) -> N
     between_s = [b - a for a, b in pairwise(run.event_s)]
     assert -found.value == min(between_s, default=math.inf)
     assert (found.at_s is None) == (not between_s)
-
-
-def curves(seed: int, count: int, size: float) -> Stack:
-    """Smooth curves that cross the unit sphere never, once or several times."""
-    falling = 1.0 / np.cumprod([1.0, *(np.arange(1.0, DEGREE + 1) / 6)])
-    rng = np.random.default_rng(seed)
-    return np.asarray(size * falling[:, None] * rng.normal(size=(count, DEGREE + 1, 2)))
-
-
-@pytest.mark.parametrize("size", [0.2, 0.5, 1.0])
-def test_first_exits_are_those_of_single_curves(size: float) -> None:
-    taylor = curves(0, 300, size)
-    found = curve_stack(DEGREE).first_exits(taylor)
-    expected = [curve_basis(DEGREE).first_exit(one) for one in taylor]
-    assert np.isnan(found).tolist() == [u is None for u in expected]
-    crossed = ~np.isnan(found)
-    assert crossed.any()
-    reference = [u for u in expected if u is not None]
-    np.testing.assert_allclose(found[crossed], reference, rtol=0, atol=1e-9)
-
-
-def test_a_peak_is_the_maximum_of_its_neighbourhood() -> None:
-    """Against 10,001 points; their squared spacing times the curvature is below 1e-8."""
-    taylor = curves(1, 100, 1.0)
-    grid = np.linspace(0.0, 1.0, 10_001)
-    squares = ((powers(grid, DEGREE) @ taylor) ** 2).sum(axis=2)
-    at, reach = grid[squares[:, ::100].argmax(axis=1) * 100], 0.01
-    near = np.abs(grid - at[:, None]) <= reach
-    expected = np.where(near, squares, 0.0).max(axis=1)
-    found = peak_squares(taylor, at, reach)
-    assert (found >= expected * (1 - 1e-12)).all()
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_bernstein_coefficients_enclose_and_halve() -> None:
-    stack = curve_stack(DEGREE)
-    for one in curves(2, 20, 1.0):
-        coefficients = stack.squares(one[None])[0]
-        squares = ((powers(np.linspace(0.0, 1.0, 101), DEGREE) @ one) ** 2).sum(axis=1)
-        assert coefficients.max() >= squares.max() * (1 - 1e-12)
-        assert coefficients[[0, -1]] == pytest.approx(squares[[0, -1]])
-        left, right = stack.halves(coefficients)
-        assert left[-1] == right[0] == pytest.approx(squares[50])
-        assert max(left.max(), right.max()) <= coefficients.max() * (1 + 1e-12)

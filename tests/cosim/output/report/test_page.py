@@ -22,12 +22,12 @@ from cosim.output.report.report_page import page, write_report
 from cosim.output.report.run_figures import BOUNDED, pictures
 from cosim.record.run_directory import REPORT_FILE
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord, alone
+from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
 from tests.cosim.output.report.conftest import HOSTILE, make_record, scenario_of
 from tests.cosim.record.changed_records import changed
-from tests.cosim.summaries import summary_of
+from tests.cosim.summaries import alone, summary_of
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]

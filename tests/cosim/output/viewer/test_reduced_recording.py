@@ -15,7 +15,7 @@ from cosim.record import decimate, run_record
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
 from cosim.record.run_ending import RunEnding
-from cosim.record.run_record import RunRecord, alone, write_run
+from cosim.record.run_record import RunRecord, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -24,6 +24,7 @@ from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.cosim.record.changed_records import changed, copied
+from tests.cosim.summaries import alone
 
 PART_STEPS, COLUMNS = 500, 10
 S = 1_000_000_000
