@@ -26,7 +26,7 @@ class NetworkChannel(CountingSocket):
         network: the network; a datagram's flow is that of :mod:`netem.channel`.
         clock: the run's clock.
         spin_ns: busy-wait for this time before a departure.
-        loops: number of loops; None in a run of one loop without numbers.
+        loops: number of loops.
 
     Raises:
         PeerError: the system refused a socket for a peer.

@@ -32,6 +32,11 @@ SCENARIO = resolve(
 EARLY, LATER, FOREIGN = 3, 700, 5
 
 
+def update(sequence: int, loop: int = 0) -> bytes:
+    message = Message(Flow.UPDATE, sequence, 0, np.zeros(2), loop)
+    return Encoder(1, bytes(32)).encode(message)
+
+
 def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> None:
     published: list[tuple[str, bytes]] = []
     tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
@@ -43,7 +48,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
     ):
         sensor_name, foreign_name = text_of(name_of(sensor)), text_of(name_of(foreign))
         for number in range(EARLY):  # before there is a socket for the sensor
-            sensor.sendto(b"%d" % number, endpoint.getsockname())
+            sensor.sendto(update(number), endpoint.getsockname())
         for _ in range(FOREIGN):
             foreign.sendto(b"?", endpoint.getsockname())
         clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
@@ -54,7 +59,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
         def news(now_ns: int) -> list[Notice]:
             for _ in range(100):
                 if (number := next(sent, None)) is not None:
-                    sensor.sendto(b"%d" % number, endpoint.getsockname())
+                    sensor.sendto(update(number), endpoint.getsockname())
             return []
 
         def stop() -> bool:
@@ -67,7 +72,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
             shell.finish(clock.now_ns(), telemetry)
             telemetry.flush()
             report = shell.report()
-    assert [int(data) for data, _ in received] == list(range(EARLY + LATER))
+    assert [data for data, _ in received] == [update(number) for number in range(EARLY + LATER)]
     assert {text_of(source) for _, source in received} == {report["local"]}
     assert report["sent"] == EARLY + LATER
     assert report["send_errors"] == {}
@@ -79,11 +84,7 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
 
 
 def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed() -> None:
-    def datagram(loop: int, sequence: int) -> bytes:
-        message = Message(Flow.UPDATE, sequence, 0, np.zeros(2), loop)
-        return Encoder(1, bytes(32)).encode(message)
-
-    sent = [datagram(loop, k) for k, loop in itertools.product(range(5), (0, 1, 2, 65_534))]
+    sent = [update(k, loop) for k, loop in itertools.product(range(5), (0, 1, 2, 65_534))]
     tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
               if OWNER[table] == "netem"}  # fmt: skip
     flows: list[int] = []
@@ -122,7 +123,7 @@ def opened(
     controller: socket.socket,
     sensor: socket.socket,
     clock: RunClock,
-    loops: int | None = None,
+    loops: int = 1,
 ) -> tuple[RunNetwork, NetworkChannel]:
     ways = [(name_of(sensor), name_of(controller))]
     network = RunNetwork(SCENARIO, BEGINNING, loops)

@@ -90,7 +90,6 @@ class Live:
         self.endpoint, self.peer, self.other, self.answers = (
             self._stack.enter_context(bind(0, "test")) for _ in range(4)
         )
-        self.numbered = len(loops) > 1
         self.machines = self.new_machines(role, loops, phases_ns)
         self.alone = self.new_machines(role, loops, phases_ns)
         """The same machines, to which a test passes the inputs one by one."""
@@ -105,7 +104,6 @@ class Live:
             self.endpoint, self.driver, SENDS[role], source=own, destination=own,
             acknowledged_by=self.answers.getsockname() if acknowledged else None,
             acknowledges_to=self.answers.getsockname() if role == "controller" else None,
-            by_loop=self.numbered,
         )  # fmt: skip
         self.clock = RunClock(time.monotonic_ns() - since_ns)
         self.driver.set_clock(self.clock)
@@ -113,7 +111,7 @@ class Live:
     def new_machines(
         self, role: str, loops: Sequence[Scenario], phases_ns: Sequence[int] | None
     ) -> LoopMachines:
-        return MAKERS[role](loops, phases_ns, numbered=self.numbered)
+        return MAKERS[role](loops, phases_ns, numbered=True)
 
     def send(self, *messages: Message, by: socket.socket | None = None) -> None:
         """Send messages, by default from the peer."""

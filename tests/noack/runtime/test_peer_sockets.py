@@ -157,7 +157,7 @@ def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any
         live.drive_until_accepted(early + 1)
         assert not any(live.driver.rejected.values())
         assert live.rows.notices == []
-        numbers = [row[1] for row in live.rows.tables[SENSOR_MEASUREMENT]]
+        numbers = [row[2] for row in live.rows.tables[SENSOR_MEASUREMENT]]
         assert numbers == list(range(early + 1))
 
 
