@@ -12,11 +12,10 @@ from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import Gathered, Progress, Shuttle, drive, reports_of
 from netem.duplex_link import network_of
 from noack.config.loops import loops_of, phases_ns
-from noack.config.resolution import network_tables, resolve, tables_of
+from noack.config.resolution import is_of_network, network_tables, resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.protocol.fleet import Fleet
 from noack.protocol.machine_interface import Machine, Notice, Record
-from noack.protocol.record_tables import OWNER
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
@@ -31,7 +30,7 @@ class _GatheredByLoop:
         self.network = Gathered(network_tables())
         self.loops = [
             Gathered(
-                {table: one for table, one in tables_of(loop).items() if OWNER[table] != "netem"},
+                {table: one for table, one in tables_of(loop).items() if not is_of_network(table)},
                 _BATCH_ROWS,
             )
             for loop in loops
@@ -45,7 +44,7 @@ class _GatheredByLoop:
             )
             for gathered in chosen:
                 gathered.take(role, output)
-        elif OWNER[output.table] == "netem":
+        elif is_of_network(output.table):
             self.network.take(role, output)
         else:
             number, *row = output.row
