@@ -19,9 +19,9 @@ from cosim.record.record_source import (
     RowsInMemory,
     with_columns,
 )
-from noack.config.resolution import has_loop, network_tables
+from noack.config.resolution import has_loop, is_of_network, network_tables
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import LOOP, NETEM_SETTING, OWNER
+from noack.protocol.record_tables import LOOP, NETEM_SETTING
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
@@ -66,7 +66,7 @@ def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[t
     """
     names = [name for name in rows.dtype.names or () if name != LOOP]
     own = np.dtype([(name, rows.dtype[name]) for name in names])
-    shared, numbers = OWNER[table] == "netem", np.zeros(len(rows), np.int64)
+    shared, numbers = is_of_network(table), np.zeros(len(rows), np.int64)
     if shared:
         numbers = rows["flow"] % len(phases_ns) if "flow" in names else numbers
     elif has_loop(table):
@@ -161,7 +161,7 @@ class LoopTables(RecordSource):
 
     def whole(self, table: str) -> Rows:
         """Return all rows of a table."""
-        if OWNER[table] == "netem":
+        if is_of_network(table):
             return self._network.whole(table)
         if table not in self._whole:
             empty = np.zeros(0, self.types[table])
@@ -170,7 +170,7 @@ class LoopTables(RecordSource):
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        if OWNER[table] == "netem":
+        if is_of_network(table):
             return self._network.count(table)
         if table not in self._counts:
             self._counts[table] = self._stored.count_of_loop(table, self._number)
@@ -178,7 +178,7 @@ class LoopTables(RecordSource):
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order; a short one is kept."""
-        if OWNER[table] == "netem":
+        if is_of_network(table):
             yield from self._network.batches(table, columns)
         elif table in self._whole or self.count(table) <= BATCH_ROWS:
             self.whole(table)

@@ -106,7 +106,10 @@ def joint_reports(
     network: Mapping[str, dict[str, Any]], loops: Sequence[Mapping[str, dict[str, Any]]]
 ) -> dict[str, Any]:
     """Return the reports of a run from those of its loops; the emulator's are of all loops."""
-    found: dict[str, Any] = {role: network[role] for role in ("netem",) if role in network}
+    found: dict[str, Any] = {}
+    if "netem" in network:
+        own = loops[0].get("netem", network["netem"])["rows"]  # also those of its clock
+        found["netem"] = network["netem"] | {"rows": own | network["netem"]["rows"]}
     for role in [one for one in loops[0] if one != "netem"]:
         of_loops = [one[role] for one in loops]
         tables = dict.fromkeys(table for one in of_loops for table in one["rows"])

@@ -35,6 +35,7 @@ from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE
 from noack.config.loops import loop_names, loop_scenario, loop_sections, loops_of, phases_ns
 from noack.config.resolution import (
     LoopMatrices,
+    is_of_network,
     loop_of,
     network_tables,
     resolve,
@@ -373,7 +374,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     types = run_tables(run.scenario)
 
     def rows(table: str) -> Iterator[Rows]:
-        if OWNER[table] == "netem":
+        if is_of_network(table):
             yield from run.network.source.batches(table)
             return
         for number, record in enumerate(run.loops):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import controllers_of
-from cosim.record.loop_rows import network_rows_by_loop
+from cosim.record.loop_rows import NetworkRows
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.loops import loops_of, phases_ns
@@ -271,7 +271,7 @@ def _simulated(
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
-    by_loop = network_rows_by_loop(of_network, run.phases_ns)
+    packets = NetworkRows(of_network, run.phases_ns)
     own = [dict[str, Rows]() for _ in loops]
     for numbers in run.groups:
         for table, dtype in tables_of(loops[numbers[0]]).items():
@@ -280,8 +280,9 @@ def _simulated(
                 for number, of_loop in _split(rows, dtype, numbers):
                     own[number][table] = of_loop
     records = []
-    for number, (loop, packets) in enumerate(zip(loops, by_loop, strict=True)):
-        tables = {table: (own[number] | packets)[table] for table in tables_of(loop)}
+    for number, loop in enumerate(loops):
+        found = own[number] | packets.of_loop(number)
+        tables = {table: found[table] for table in tables_of(loop)}
         reports = _reports(run, tables, scenario, number)
         notices = run.record.notices(number)
         shared = number if len(loops) > 1 else None

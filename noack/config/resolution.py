@@ -243,6 +243,11 @@ def has_loop(table: str) -> bool:
     return OWNER[table] != "netem" and table not in CLOCK_TABLES
 
 
+def is_of_network(table: str) -> bool:
+    """Whether a table has the rows of the network, which its loops share."""
+    return OWNER[table] == "netem" and table not in CLOCK_TABLES
+
+
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
     """Return the observer with its gain; refuse it if an unstable mode is unobservable."""
     observer = scenario.observer

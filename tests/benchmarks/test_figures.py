@@ -25,7 +25,8 @@ def test_each_benchmark_is_declared_under_its_files_name() -> None:
 
 def summary(**changes: Any) -> dict[str, Any]:
     late = {"p50": 16.0, "p99": 40.0, "max": 150.0, "steps": 10_000, "late_steps": 10}
-    return {"missing_samples": 0, "unintended_losses": 0, "lateness_us": {"plant": late}} | changes
+    loop = {"missing_samples": 0, "unintended_losses": 0, "lateness_us": {"plant": late}}
+    return {"loops": [loop | changes]}
 
 
 def test_a_complete_and_punctual_demo_reaches_all_goals() -> None:
@@ -34,7 +35,7 @@ def test_a_complete_and_punctual_demo_reaches_all_goals() -> None:
 
 
 def test_a_missing_sample_or_too_many_late_steps_miss_their_goals() -> None:
-    late = summary()["lateness_us"]["plant"] | {"late_steps": 11}
+    late = summary()["loops"][0]["lateness_us"]["plant"] | {"late_steps": 11}
     rows = demo_run.rows_of(summary(missing_samples=1, lateness_us={"plant": late}))
     assert [row.holds for row in rows[:3]] == [False, True, False]
 
