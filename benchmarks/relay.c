@@ -3,8 +3,8 @@
  * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
  * socket, to one destination on loopback. With "segment", successive datagrams of equal size are
  * sent as one message, which the kernel segments (UDP_SEGMENT). With "paths", each source has a
- * connected socket of its own, which the last 16 bits of its address select. Prints its listening
- * port.
+ * connected socket of its own, which the last 16 bits of its address select, and whose answers go
+ * back to the source: as in our relay, epoll waits for them. Prints its listening port.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -16,6 +16,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/resource.h>
 #include <sys/socket.h>
 
@@ -59,32 +60,81 @@ static void forward_segments(int out, int count)
 }
 
 static struct sockaddr_in names[BATCH];
+static struct sockaddr_in clients[1 << 16]; /* the addresses of the sources with a socket */
 
-/* The socket of the source of datagram k; the first time, open it. */
-static int path_of(int k, const struct sockaddr_in *server)
+/* The socket of the source of datagram k; the first time, open it and wait for its answers, too. */
+static int path_of(int k, int epoll, const struct sockaddr_in *server)
 {
     static int paths[1 << 16];
-    int *path = &paths[ntohl(names[k].sin_addr.s_addr) & 0xffff];
+    uint32_t number = ntohl(names[k].sin_addr.s_addr) & 0xffff;
+    int *path = &paths[number];
     if (*path == 0) {
         *path = socket(AF_INET, SOCK_DGRAM, 0);
         if (*path < 0 || connect(*path, (const struct sockaddr *)server, sizeof *server) != 0)
             fail("path");
+        struct epoll_event answers = {.events = EPOLLIN,
+                                      .data.u64 = (uint64_t)number << 32 | (uint32_t)*path};
+        if (epoll_ctl(epoll, EPOLL_CTL_ADD, *path, &answers) != 0)
+            fail("epoll_ctl");
+        clients[number] = names[k];
     }
     return *path;
 }
 
-static void forward_paths(const struct sockaddr_in *server, int count)
+static void forward_paths(int epoll, const struct sockaddr_in *server, int count)
 {
     for (int k = 0; k < count; k++)
         batch[k].msg_hdr.msg_name = NULL;
     for (int first = 0, next; first < count; first = next) {
-        int path = path_of(first, server);
-        for (next = first + 1; next < count && path_of(next, server) == path;)
+        int path = path_of(first, epoll, server);
+        for (next = first + 1; next < count && path_of(next, epoll, server) == path;)
             next++;
         if (next - first == 1)
             send(path, parts[first].iov_base, parts[first].iov_len, 0);
         else
             sendmmsg(path, batch + first, (unsigned)(next - first), 0);
+    }
+}
+
+/* Receive up to BATCH datagrams; return their number. */
+static int receive(int in, int flags, bool with_names)
+{
+    for (int k = 0; k < BATCH; k++) {
+        parts[k].iov_len = MAX_BYTES;
+        batch[k].msg_hdr.msg_name = with_names ? &names[k] : NULL;
+        batch[k].msg_hdr.msg_namelen = with_names ? sizeof names[k] : 0;
+    }
+    int taken = recvmmsg(in, batch, BATCH, flags, NULL);
+    if (taken < 0 && errno != EINTR && errno != EAGAIN && errno != ECONNREFUSED)
+        fail("recvmmsg");
+    for (int k = 0; k < taken; k++)
+        parts[k].iov_len = batch[k].msg_len;
+    return taken;
+}
+
+/* Forward by a socket for each client, and return the answers. */
+static void relay_paths(int in, const struct sockaddr_in *server)
+{
+    int epoll = epoll_create1(0);
+    struct epoll_event listening = {.events = EPOLLIN, .data.u64 = (uint32_t)in}, ready[BATCH];
+    if (epoll < 0 || epoll_ctl(epoll, EPOLL_CTL_ADD, in, &listening) != 0)
+        fail("epoll");
+    for (;;) {
+        int count = epoll_wait(epoll, ready, BATCH, -1);
+        for (int i = 0; i < count; i++) {
+            int from = (int)(uint32_t)ready[i].data.u64;
+            int taken = receive(from, MSG_DONTWAIT, from == in);
+            if (from == in) {
+                forward_paths(epoll, server, taken);
+                continue;
+            }
+            for (int k = 0; k < taken; k++) {
+                batch[k].msg_hdr.msg_name = &clients[ready[i].data.u64 >> 32];
+                batch[k].msg_hdr.msg_namelen = sizeof clients[0];
+            }
+            if (taken > 0)
+                forward(in, taken);
+        }
     }
 }
 
@@ -124,24 +174,12 @@ int main(int argc, char **argv)
         batch[k].msg_hdr.msg_iov = &parts[k];
         batch[k].msg_hdr.msg_iovlen = 1;
     }
+    if (by_path)
+        relay_paths(in, &there);
     for (;;) {
-        for (int k = 0; k < BATCH; k++) {
-            parts[k].iov_len = MAX_BYTES;
-            batch[k].msg_hdr.msg_name = by_path ? &names[k] : NULL;
-            batch[k].msg_hdr.msg_namelen = by_path ? sizeof names[k] : 0;
-        }
-        int taken = recvmmsg(in, batch, BATCH, MSG_WAITFORONE, NULL);
-        if (taken < 0) {
-            if (errno == EINTR)
-                continue;
-            fail("recvmmsg");
-        }
-        for (int k = 0; k < taken; k++)
-            parts[k].iov_len = batch[k].msg_len;
+        int taken = receive(in, MSG_WAITFORONE, false);
         if (segment)
             forward_segments(out, taken);
-        else if (by_path)
-            forward_paths(&there, taken);
         else
             forward(out, taken);
     }

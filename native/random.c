@@ -5,7 +5,7 @@
 
 /* Philox4x32-10 (Salmon, Moraes, Dror & Shaw, SC 2011): four random words of 32 bits for a counter
    of four words and a key of two. */
-void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]) {
+static inline void philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]) {
     uint32_t c0 = (uint32_t)counter[0], c1 = (uint32_t)counter[1];
     uint32_t c2 = (uint32_t)counter[2], c3 = (uint32_t)counter[3];
     uint32_t k0 = (uint32_t)key[0], k1 = (uint32_t)key[1];
@@ -25,6 +25,10 @@ void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[
     words[3] = c3;
 }
 
+void noack_philox(const int64_t counter[4], const int64_t key[2], int64_t words[4]) {
+    philox(counter, key, words);
+}
+
 /* Two numbers in [0, 1), multiples of 2^-53, of a pair for a datagram. They are a function of the
    stream's key and of the numbers of flow (below 2^32), packet (below 2^63) and pair: they do not
    depend on time, on other flows, or on batches. */
@@ -32,7 +36,7 @@ void noack_uniforms(
     int64_t key0, int64_t key1, int64_t flow, int64_t packet, int64_t block, double uniform[2]) {
     int64_t counter[4] = {packet & 0xFFFFFFFF, packet >> 32, flow, block};
     int64_t key[2] = {key0, key1}, words[4];
-    noack_philox(counter, key, words);
+    philox(counter, key, words);
     for (int i = 0; i < 2; i++) {
         int64_t high = words[2 * i] >> 5, low = words[2 * i + 1] >> 6;
         uniform[i] = (double)(high * 67108864 + low) * (1.0 / 9007199254740992.0);

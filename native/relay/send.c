@@ -12,7 +12,6 @@
 #include <unistd.h>
 
 enum {
-    MOST_SEGMENTS = 64,
     CALLS_PER_READING = 8, /* of the clock */
     MOST_SEGMENTED_BYTES = 65507,
     TRIES = 3,
@@ -146,7 +145,8 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
         vectors = add_vectors(relay, vectors, first);
         number = first->next;
         if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
-            while (number >= 0 && segments < MOST_SEGMENTS && last_bytes == first->size_bytes) {
+            while (number >= 0 && segments < own->most_segments
+                   && last_bytes == first->size_bytes) {
                 const departure *other = &own->leaving[number];
                 if (!may_join(relay, first, other, all_bytes)
                     || vectors + vectors_of(other) > VECTORS)
@@ -194,6 +194,13 @@ static void mark_failed(relay_scratch *own, int64_t number, int64_t end, int err
         own->leaving[number].error = error;
 }
 
+static int64_t segments_of(const relay_scratch *own, int64_t number, int64_t end) {
+    int64_t segments = 0;
+    for (; number != end; number = own->leaving[number].next)
+        segments++;
+    return segments;
+}
+
 /* Send a number of messages; return the number of messages that were sent or failed.
 
    If it is smaller than headers, the kernel does not segment the next message: the headers of the
@@ -222,9 +229,15 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
             tries++;
             if (tries < (take_errors(relay, socket) > 0 ? MOST_TRIES : TRIES))
                 continue;
-            if (own->out_headers[done].msg_hdr.msg_controllen > 0) {
-                relay->segment_below =
-                    min_of(relay->segment_below, own->leaving[number].size_bytes);
+            const struct msghdr *message = &own->out_headers[done].msg_hdr;
+            if (message->msg_controllen > 0) {
+                if (segments_of(
+                        own, number, done < headers - 1 ? own->out_first[done + 1] : following)
+                    > FEW_SEGMENTS)
+                    own->most_segments = FEW_SEGMENTS;
+                else
+                    relay->segment_below =
+                        min_of(relay->segment_below, own->leaving[number].size_bytes);
                 return done;
             }
         }

@@ -194,10 +194,10 @@ class Relay:
     def _keep_house(self, now_ns: int) -> None:
         """Remove idle clients, open return paths again, check for losses."""
         self._memory.core.no_memory = 0  # check again
-        self._update_losses()
         self._clients.query_some_drops()
         if now_ns >= self._rarely_ns:
             self._rarely_ns = now_ns + _RARE_PERIOD_NS
+            self._update_losses()
             self._clients.expire(now_ns)
             self._clients.reconnect()
 
