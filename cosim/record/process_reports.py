@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -93,8 +94,11 @@ def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
     channel = dict(report["channel"])
-    of_loops = channel.pop("loops", [])
+    of_loops, rejected = channel.pop("loops", []), Counter(channel.get("rejected"))
     channel |= of_loops[number] if number < len(of_loops) else {}
+    of_none = rejected - sum((Counter(one.get("rejected")) for one in of_loops), Counter())
+    if number == 0 and of_loops and of_none:  # such as datagrams of others that a socket dropped
+        channel["rejected"] = channel.get("rejected", {}) | of_none
     answers = channel.get("acknowledgements")
     if answers and "loops" in answers:
         channel["acknowledgements"] = answers["loops"][number]
