@@ -3,7 +3,8 @@
 Flows differ in the sender's address (127.1.0.0 and on); datagrams come from them in turn. The cost
 is the relay's CPU time per datagram while it empties a full receive buffer, as in
 :mod:`benchmarks.relays`. The C relay, which ignores addresses, shows the kernel's share of it; with
-a socket per client, it shows that of our relay with the reverse direction.
+a socket per client, it does what our relay with the reverse direction does: it also waits for
+answers at all sockets and returns them. (To wait for a socket by epoll costs when sending, too.)
 """
 
 import argparse

@@ -51,9 +51,10 @@ class RelayMemory:
         self.releases: Array = np.zeros(row_count, RELEASE_ROW)
         self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
         self.core: Any = ffi.new("noack_relay *", {
-            "links": links, "epoll": self._epoll.fileno(), "only_socket": -1, "clock": {"speed": 1.0},
-            "change_ns": 2**63 - 1, "segment": segment, "segment_below": 2**16, "taps": taps,
-            "records": row_count > 0, "directions": self.directions,
+            "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
+            "clock": {"speed": 1.0}, "change_ns": 2**63 - 1, "segment": segment,
+            "segment_below": 2**16, "taps": taps, "records": row_count > 0,
+            "directions": self.directions,
             "event_count": len(self.events), "data_bytes": len(self.data),
             "row_count": row_count, "free_slot": -1, "free_block": -1,
         })  # fmt: skip

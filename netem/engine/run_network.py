@@ -11,7 +11,7 @@ import numpy as np
 
 from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.engine.relay_memory import PACKET_ROW, Array, RelayDirection, RelayMemory, name_array
-from netem.engine.relay_sockets import stamp_arrivals
+from netem.engine.relay_sockets import let_wait, stamp_arrivals
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
@@ -95,6 +95,8 @@ class RunNetwork:
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
             self._memory.watch(endpoint.fileno(), place)
+            if len(receivers) == 1:
+                self._memory.wait_for_only(place, let_wait(endpoint))
         core.noack_relay_read_stamps(relay)
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
         clients["name_bytes"][: self._loops] = name_bytes
