@@ -1,7 +1,7 @@
 /* Exact simulation in continuous time: what Python calls.
 
-   A size of vectors that has code serves all smaller loops, which are padded with states that stay 0;
-   the last bits of a loop do not depend on the size chosen. */
+   A size of vectors that has code serves all smaller loops, which are padded with states that stay
+   0; the last bits of a loop do not depend on the size chosen. */
 #include "exact.h"
 
 enum { CACHE_LINE = 8 }; /* doubles */
@@ -49,7 +49,8 @@ int arrives(const noack_exact *exact, exact_run *run) {
 }
 
 static int64_t blocks_of(const noack_trigger_rule *rule, const exact_code *code) {
-    int64_t rows = max_of(rule->up_rows + rule->down_rows, rule->gain_up_rows + rule->gain_down_rows);
+    int64_t rows =
+        max_of(rule->up_rows + rule->down_rows, rule->gain_up_rows + rule->gain_down_rows);
     return max_of(2, (rows + code->n - 1) / code->n);
 }
 
@@ -82,8 +83,7 @@ static double *take(double **next, int64_t count) {
 }
 
 /* Take a matrix, or NULL for NULL. */
-static double *take_square(
-    double **next, const exact_code *code, int64_t n, const double *matrix) {
+static double *take_square(double **next, const exact_code *code, int64_t n, const double *matrix) {
     if (matrix == NULL)
         return NULL;
     double *taken = take(next, code->n * code->stride);
@@ -110,7 +110,8 @@ static double *take_form(
     return form;
 }
 
-/* Lay a simulation's memory out in the scratch, from next on; with exact->scratch NULL only count. */
+/* Lay a simulation's memory out in the scratch, from next on; with exact->scratch NULL only count.
+ */
 static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_memory *memory) {
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
@@ -145,8 +146,9 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
     double **curves[] = {
-        &memory->r, &memory->e, &memory->d, &memory->q, &memory->x, &memory->u, &memory->own_error,
-        &memory->own_weighted, &memory->x_scaled, &memory->u_scaled};
+        &memory->r,        &memory->e,       &memory->d,         &memory->q,
+        &memory->x,        &memory->u,       &memory->own_error, &memory->own_weighted,
+        &memory->x_scaled, &memory->u_scaled};
     for (int i = 0; i < 10; i++)
         *curves[i] = take(&next, curve);
     memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;

@@ -1,5 +1,5 @@
-/* Checks the numbers of an exact simulation once, where they enter the core: all that the other files
-   assume. */
+/* Checks the numbers of an exact simulation once, where they enter the core: all that the other
+   files assume. */
 #include "exact.h"
 
 static const int64_t NEVER_NS = INT64_C(1) << 62; /* longer times never end */

@@ -34,8 +34,8 @@ rule_span span_after(const exact_memory *memory, double t_s, double left, double
     if (memory->grid_s > 0.0) {
         span.point = last_point(memory->grid_s, t_s) + 1;
         if (span.begin_s > t_s)
-            span.point
-                = max_of(span.point, whole(ceil(span.begin_s / memory->grid_s - GRID_SLACK)));
+            span.point =
+                max_of(span.point, whole(ceil(span.begin_s / memory->grid_s - GRID_SLACK)));
     }
     return span;
 }
