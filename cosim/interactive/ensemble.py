@@ -1,6 +1,6 @@
 """Many runs of one scenario: bands that contain most of them, over time.
 
-The events are those of the compiled batch engine. Between them the state z = (x, e_s, e_c) follows
+The events are those of exact runs. Between them the state z = (x, e_s, e_c) follows
 dz/dt = G z (:mod:`cosim.simulation.continuous.continuous_loop`), with a matrix G for each draw,
 because each draw has its own plant. All draws advance together on a grid of times.
 """

@@ -1,4 +1,8 @@
-/* The code for N states. With FUSED it is for processors of the kind x86-64 that have AVX2 and FMA. */
+/* The code for N states. With FUSED it is for processors of the kind x86-64 that have AVX2 and FMA.
+ */
+#if defined(__SANITIZE_ADDRESS__) && !defined(__clang__)
+#pragma GCC optimize("O0") /* vectors with checks take minutes to optimise */
+#endif
 #ifdef FUSED
 #ifdef __clang__
 #pragma clang attribute push(__attribute__((target("avx2,fma"))), apply_to = function)

@@ -8,18 +8,18 @@
 #include "../core.h"
 
 enum {
-    HIGHEST = 24,           /* largest degree of a state's Taylor polynomial */
-    TERMS = HIGHEST + 1,    /* coefficients of a curve */
-    DEGREES = 11,           /* possible degrees: 4, 6, ..., 24 */
-    MORE = 20,              /* coefficients of eta after those that its gain reaches */
+    HIGHEST = 24,        /* largest degree of a state's Taylor polynomial */
+    TERMS = HIGHEST + 1, /* coefficients of a curve */
+    DEGREES = 11,        /* possible degrees: 4, 6, ..., 24 */
+    MORE = 20,           /* coefficients of eta after those that its gain reaches */
     MOST_TERMS = 2 * HIGHEST + 2 + MORE,
-    MOST_STEPS = 1000000    /* of a search */
+    MOST_STEPS = 1000000 /* of a search */
 };
 
-#define NONE (-1.0)       /* results of searches, instead of a time */
+#define NONE (-1.0) /* results of searches, instead of a time */
 #define UNRESOLVED (-2.0)
 
-typedef struct { /* a rule between two events; times in seconds since the run's start */
+typedef struct {           /* a rule between two events; times in seconds since the run's start */
     double since_s, level; /* t_0 and c of the threshold */
     double floor_from_s;   /* from this time on the floor is the threshold */
     double begin_s;        /* the comparison counts from this time on */
@@ -33,7 +33,7 @@ typedef struct { /* an interval in which the forms of comparison and threshold d
     double threshold, rate_per_s; /* at its start; its decay */
 } rule_phase;
 
-typedef struct { /* a search on [0, end_s] for the first crossing of c e^(-rs) */
+typedef struct {               /* a search on [0, end_s] for the first crossing of c e^(-rs) */
     double level, rate, end_s; /* c > 0, r >= 0 */
     int backward;              /* search y(end_s - s) instead of y(s); then r = 0 */
 } level_search;
@@ -61,7 +61,7 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     /* of a plant */
     double *A, *B, *E, *A_k, *X_k;
     double *minus_BK, *D_k;
-    int has_D_k; /* computed when a reference is first renewed */
+    int has_D_k;                /* computed when a reference is first renewed */
     double reach_s[DEGREES];    /* time over which a polynomial of each degree is accurate */
     double measured_s[DEGREES]; /* the same, at the accuracy of the measures */
     /* coefficients of curves */
@@ -73,14 +73,14 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
 
 typedef struct { /* a run, or a part of one */
     noack_exact_row *row;
-    int64_t number;       /* of the run */
-    int64_t stops;        /* 1: at its first event */
-    double t_s;           /* start, then end */
-    double *state;        /* (3, n) x, e_s, e_c at the start, then at the end */
-    double auxiliary;     /* likewise */
-    int64_t event;        /* likewise: 1: an event at t_s */
-    int64_t losses;       /* consecutive ones so far */
-    double at_s;          /* time at which the supremum is attained */
+    int64_t number;   /* of the run */
+    int64_t stops;    /* 1: at its first event */
+    double t_s;       /* start, then end */
+    double *state;    /* (3, n) x, e_s, e_c at the start, then at the end */
+    double auxiliary; /* likewise */
+    int64_t event;    /* likewise: 1: an event at t_s */
+    int64_t losses;   /* consecutive ones so far */
+    double at_s;      /* time at which the supremum is attained */
 } exact_run;
 
 /* The code for a number of states; see simulator.h. */
@@ -90,8 +90,8 @@ typedef struct {
     void (*prepare)(exact_memory *memory, const double *A, const double *B);
     void (*follow)(exact_memory *memory, exact_run *run);
     void (*sample)(
-        exact_memory *memory, const double *state, double start_s, int64_t count,
-        const double *t_s, double *states);
+        exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
+        double *states);
 } exact_code;
 
 #if defined(__x86_64__)
@@ -101,7 +101,8 @@ extern const exact_code exact_fused_2, exact_fused_3, exact_fused_4, exact_fused
 extern const exact_code exact_plain_2, exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16,
     exact_plain_64;
 
-/* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of STRIDE numbers for each of the matrix. */
+/* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of
+ * STRIDE numbers for each of the matrix. */
 int is_quadratic(const noack_exact *exact);
 int arrives(const noack_exact *exact, exact_run *run);
 void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result);

@@ -1,5 +1,5 @@
-/* Vectors of N numbers in the processor's registers; N is a constant of the file that includes this:
-   3, or a power of 2.
+/* Vectors of N numbers in the processor's registers; N is a constant of the file that includes
+   this: 3, or a power of 2.
 
    Every product is added with fused rounding: x y + z is rounded once. The order of each sum is
    fixed. So results have the same bits on every processor, with instructions for vectors or without

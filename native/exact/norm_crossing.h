@@ -4,11 +4,11 @@
 
        h(s + q) <= phi(q) = |y(s) + y'(s) q| + b q^2/2 - c_s (1 - r q),    c_s = c e^(-rs).
 
-   phi is convex. If phi(0) < 0 and phi(q) <= 0, then phi and h are negative in between, so a step of
-   length q skips no crossing, however short. Newton's method from the right stays right of phi's
-   root. The chord from its last point to (0, phi(0)) is zero at a point left of the root: this point
-   is the step. A chord of phi lies above phi, so Newton's method may stop at any iteration: the step
-   is then shorter and equally safe.
+   phi is convex. If phi(0) < 0 and phi(q) <= 0, then phi and h are negative in between, so a step
+   of length q skips no crossing, however short. Newton's method from the right stays right of phi's
+   root. The chord from its last point to (0, phi(0)) is zero at a point left of the root: this
+   point is the step. A chord of phi lies above phi, so Newton's method may stop at any iteration:
+   the step is then shorter and equally safe.
 
    If y is not 0, h'' = (|y'|^2 - (y.y'/|y|)^2 + y.y'')/|y| - r^2 c_s >= -(b + r^2 c_s) =: -L. If
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
@@ -39,8 +39,7 @@ static inline void look(
         *dy = subtract(filled(0.0), *dy);
 }
 
-static inline search_point look_at_norm(
-    const void *curve, const level_search *search, double s) {
+static inline search_point look_at_norm(const void *curve, const level_search *search, double s) {
     const vector_curve *own = curve;
     lanes y, dy;
     look(own->c, own->p, search, s, &y, &dy);
@@ -56,8 +55,7 @@ static double safe_length(
     double span) {
     double length = span, below = level - sqrt(square), above = 0.0;
     for (int step = 0; step < NEWTON_STEPS; step++) {
-        double straight
-            = sqrt(largest_of(square + length * (2.0 * mixed + length * speed), 0.0));
+        double straight = sqrt(largest_of(square + length * (2.0 * mixed + length * speed), 0.0));
         above = straight + level * (rate * length - 1.0) + 0.5 * most * length * length;
         if (above <= 0.0)
             return length;
@@ -74,8 +72,8 @@ static double safe_length(
     return length * (below / (below + above));
 }
 
-/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. ends_below: it is known
-   that h(end_s) < 0. */
+/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. ends_below: it is
+   known that h(end_s) < 0. */
 static double first_exit(
     const double *curve, int p, const level_search *search, int ends_below, int most_steps) {
     const double ahead = 3.0, nearer = 0.6;

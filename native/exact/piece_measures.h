@@ -113,10 +113,11 @@ static double climb(
     return best;
 }
 
-/* The larger of best, which is at least the value at end_s, and the supremum of |y(s)| e^(rate s) growth over [0, end_s], or UNRESOLVED. The
-   value is attained, and the supremum exceeds it by at most the share CERTAINTY (values below 1e-150
-   are ignored; values above 1e150 are infinite). A curve that stays close to one level, such as an
-   oscillation, is searched again as the scalar |y|^2, in which cancelling terms vanish. */
+/* The larger of best, which is at least the value at end_s, and the supremum of |y(s)| e^(rate s)
+   growth over [0, end_s], or UNRESOLVED. The value is attained, and the supremum exceeds it by at
+   most the share CERTAINTY (values below 1e-150 are ignored; values above 1e150 are infinite). A
+   curve that stays close to one level, such as an oscillation, is searched again as the scalar
+   |y|^2, in which cancelling terms vanish. */
 static double raise_supremum(
     exact_memory *memory, double best, const double *curve, int p, double end_s, double rate,
     double growth, double *at_s) {

@@ -8,12 +8,12 @@
        eta_(k+1) = (psi_k - l eta_k)/(k + 1).
 
    From degree D = 2p + 1 on, eta_(k+1) = -l eta_k/(k + 1), as psi is a polynomial of degree 2p. The
-   truncation error after degree q >= D is at most |eta_q| s^q (l s/(q+1))/(1 - l s/(q+2)). Pieces are
-   so short that l s <= 2. Then each further term is at most 2/(q + 1) times the one before, and for
-   D >= 9 MORE terms reduce the error below 2^-53 |eta_D| s^D: 2^20 9!/29! < 1e-19.
+   truncation error after degree q >= D is at most |eta_q| s^q (l s/(q+1))/(1 - l s/(q+2)). Pieces
+   are so short that l s <= 2. Then each further term is at most 2/(q + 1) times the one before, and
+   for D >= 9 MORE terms reduce the error below 2^-53 |eta_D| s^D: 2^20 9!/29! < 1e-19.
 
-   All terms are divided by the square of a number of the state's magnitude, so that values that have
-   decayed to 1e-150 keep their relative accuracy. */
+   All terms are divided by the square of a number of the state's magnitude, so that values that
+   have decayed to 1e-150 keep their relative accuracy. */
 #ifndef NOACK_EXACT_QUADRATIC_CROSSING_H
 #define NOACK_EXACT_QUADRATIC_CROSSING_H
 

@@ -6,7 +6,7 @@
 #include "piece_measures.h"
 #include "quadratic_crossing.h"
 
-enum { MOST_PIECES = 1000000 }; /* of a run */
+enum { MOST_PIECES = 1000000 };      /* of a run */
 static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
 static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
 /* Length of the first search after an event, in units of the time that the error would need at its
@@ -89,8 +89,8 @@ static void expand(exact_memory *memory, models state, double factor, int begin,
         expand_with(memory, state, factor, begin, end, 1, 0, 0);
 }
 
-/* The same state with the plant's own as the reference, if that is small beside the present one: their
-   difference would lose its digits. */
+/* The same state with the plant's own as the reference, if that is small beside the present one:
+   their difference would lose its digits. */
 static models renewed(exact_memory *memory, models state) {
     const double small = 1e-8; /* of a square */
     lanes x = plant_of(state);
@@ -105,8 +105,7 @@ static models renewed(exact_memory *memory, models state) {
 static rule_span next_span(const exact_memory *memory, models state, double t_s) {
     lanes x = plant_of(state);
     double left = memory->quadratic ? left_side(memory, x) : 0.0;
-    double size
-        = memory->rule->forecasts ? size_of(weigh(memory->forecast_weight, x)) : 0.0;
+    double size = memory->rule->forecasts ? size_of(weigh(memory->forecast_weight, x)) : 0.0;
     return span_after(memory, t_s, left, size);
 }
 
@@ -115,8 +114,7 @@ static comparison comparison_at(
     const exact_memory *memory, rule_phase phase, models state, double auxiliary) {
     if (!memory->quadratic)
         return (comparison){phase, 1.0, 0.0, auxiliary};
-    double size = sqrt(
-        dot(state.r, state.r) + dot(state.e, state.e) + dot(state.d, state.d));
+    double size = sqrt(dot(state.r, state.r) + dot(state.e, state.e) + dot(state.d, state.d));
     double scale = largest_of(largest_of(size, phase.threshold), sqrt(fabs(auxiliary)));
     scale = largest_of(scale, 1e-150);
     double level = phase.threshold / scale;
@@ -124,8 +122,7 @@ static comparison comparison_at(
 }
 
 /* The length of the first search after an event, from the first coefficients. */
-static double first_window(
-    exact_memory *memory, const comparison *now, int64_t point, double t_s) {
+static double first_window(exact_memory *memory, const comparison *now, int64_t point, double t_s) {
     double threshold = now->phase.threshold;
     if (memory->quadratic) {
         compare(memory, 2, now->auxiliary / (now->scale * now->scale));
@@ -336,9 +333,9 @@ static void follow(exact_memory *memory, exact_run *run) {
         double ceiling = INFINITY; /* while both models agree, e_c = e_s */
         if (agree && !memory->quadratic && phase.compares && !memory->integrates
             && exact->measure != NOACK_EXACT_STATE)
-            ceiling = phase.threshold
-                      * exp(exact->fading_per_s
-                            * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
+            ceiling =
+                phase.threshold
+                * exp(exact->fading_per_s * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
         double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
         if (within_s == UNRESOLVED)
             break;
@@ -346,8 +343,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         t_s = event || window_s < left_s ? t_s + spent_s : least(phase.until_s, horizon_s);
         event = event || t_s >= span.due_s;
     }
-    finish_row(
-        row, status, t_s, last_s - first_s, above, size_of(plant_of(state)));
+    finish_row(row, status, t_s, last_s - first_s, above, size_of(plant_of(state)));
     run->t_s = t_s;
     run->event = event;
     run->auxiliary = auxiliary;
@@ -376,8 +372,8 @@ static void prepare(exact_memory *memory, const double *A, const double *B) {
     memory->has_D_k = 0;
 }
 
-/* The states (count, 3, n) at ascending times from a state (3, n) on, without events in between; NAN
-   where no polynomial reaches. */
+/* The states (count, 3, n) at ascending times from a state (3, n) on, without events in between;
+   NAN where no polynomial reaches. */
 static void sample(
     exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
     double *states) {

@@ -5,13 +5,13 @@
 
        r' = H r        d' = H d        q' = H q        e' = A e - E r + BK q,
 
-   since x' = A x + BK x_c. The reference is x_c, and q is 0, unless x has become small beside it: then
-   the reference is x itself from there on (renewed()). e_s = e + d and e_c = e - q. After an event e_s
-   is exactly 0, since d = -e or both are 0. A small mismatch E and the errors that it drives keep
-   their relative accuracy.
+   since x' = A x + BK x_c. The reference is x_c, and q is 0, unless x has become small beside it:
+   then the reference is x itself from there on (renewed()). e_s = e + d and e_c = e - q. After an
+   event e_s is exactly 0, since d = -e or both are 0. A small mismatch E and the errors that it
+   drives keep their relative accuracy.
 
-   The Taylor coefficients of degree k are H_k r, H_k d, H_k q and A_k e + X_k r + D_k q. Their tables
-   are computed once per plant:
+   The Taylor coefficients of degree k are H_k r, H_k d, H_k q and A_k e + X_k r + D_k q. Their
+   tables are computed once per plant:
 
        H_k = H^k/k!    A_k = A^k/k!    X_(k+1) = (A X_k - E H_k)/(k + 1),  X_0 = 0,
        D_(k+1) = (A D_k + BK H_k)/(k + 1),  D_0 = 0.
@@ -21,17 +21,18 @@
    G^k w^k/k! applied to (s r, e), and |G^(p+1+j)| <= |G^(p+1)| q z^j with z = |G^4|^(1/4) and
    q = max over r < 4 of |G^r|/z^r. For z w <= (p + 2)/2 the sum is at most
    2 q |G^(p+1)| w^(p+1)/(p + 1)!. It is kept below 2^-53, the rounding error of the state itself.
-   s = |E|/max(|A|, |H|) balances the blocks, so that the truncation error of the part that a small E
-   drives is relative to E. D_k = H_k - A_k - X_k has no larger terms. All norms are Frobenius norms,
-   which bound the 2-norms from above. */
+   s = |E|/max(|A|, |H|) balances the blocks, so that the truncation error of the part that a small
+   E drives is relative to E. D_k = H_k - A_k - X_k has no larger terms. All norms are Frobenius
+   norms, which bound the 2-norms from above. */
 #ifndef NOACK_EXACT_TAYLOR_H
 #define NOACK_EXACT_TAYLOR_H
 
 #include "lanes.h"
 
 static const double NEGLIGIBLE = 0x1p-53, ROUNDED_UP = 1.0 + 1e-9;
-static const double LESS_STRICT[DEGREES] = { /* (1e-12/2^-53)^(1/(p + 1)) */
-    6.178996568622248, 3.6723274229378378, 2.750419024561364, 2.2882747106619057,
+static const double LESS_STRICT[DEGREES] = {
+    /* (1e-12/2^-53)^(1/(p + 1)) */
+    6.178996568622248,  3.6723274229378378, 2.750419024561364, 2.2882747106619057,
     2.0146481673225165, 1.8350137296621136, 1.708531253776262, 1.614865304156447,
     1.5428148079652244, 1.4857258704959437, 1.4394069351299323};
 
@@ -123,8 +124,7 @@ static inline lanes value(const double *curve, int p, double s) {
 
 /* The state at a time on a piece. */
 static inline models state_at(const exact_memory *memory, int p, double s) {
-    models state
-        = {load(memory->r), value(memory->e, p, s), load(memory->d), load(memory->q)};
+    models state = {load(memory->r), value(memory->e, p, s), load(memory->d), load(memory->q)};
     if (memory->is_static)
         return state;
     state.r = value(memory->r, p, s);
@@ -168,8 +168,8 @@ static inline double largest(const double *curve, int p, double s) {
     return ROUNDED_UP * dot(total, total);
 }
 
-/* Write the coefficients of y'Sy, of degree 2p: the sum over i + j = k of c_i S c_j. A coefficient of
-   y is (blocks, N), and S is diagonal with as many signs. */
+/* Write the coefficients of y'Sy, of degree 2p: the sum over i + j = k of c_i S c_j. A coefficient
+   of y is (blocks, N), and S is diagonal with as many signs. */
 static inline void squared(
     const double *curve, int p, int64_t blocks, const double *signs, double *out) {
     int64_t size = blocks * STRIDE;

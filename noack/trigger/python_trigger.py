@@ -1,7 +1,7 @@
 """A user's trigger: a class in a Python file or in an installed package.
 
 The class decides measurement by measurement, in the sensor's process. It is code, not a trigger
-rule: exact simulation, the batch engine and the theory do not cover it.
+rule: exact simulation and the theory do not cover it.
 """
 
 from functools import partial

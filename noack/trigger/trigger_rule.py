@@ -1,6 +1,6 @@
 """A policy's trigger rule, as data: from each event it makes the condition of the next one.
 
-The live sensor, exact simulation and the compiled batch engine all read this one description.
+The live sensor and exact simulation both read this one description.
 """
 
 import math

@@ -45,6 +45,10 @@ def test_random_links_run_clean() -> None:
     run_tests("tests/native/links_under_sanitizers.py")
 
 
+def test_random_exact_simulations_run_clean() -> None:
+    run_tests("tests/native/exact_under_sanitizers.py")
+
+
 def test_links_of_any_numbers_are_refused_or_run_clean() -> None:
     run_tests("tests/fuzz/test_parsers.py", "-k", "link_numbers")
 

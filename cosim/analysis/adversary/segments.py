@@ -101,7 +101,9 @@ class SegmentFlow:
         loop, measure, n = self.system.loop, self.measure, self.system.loop.n
         found = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
         if not np.isin(found.statuses, (OK, DIVERGED)).all():
-            raise CallerError("trigger: an error stays too close to a level to decide when it passes")
+            raise CallerError(
+                "trigger: an error stays too close to a level to decide when it passes"
+            )
         diverged, is_event = found.statuses == DIVERGED, found.events == 1
         z = found.states.reshape(-1, 3 * n)
         if measure.objective is Objective.INTER_EVENT:

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.analysis.adversary.objective import Measure, Objective
-from cosim.analysis.adversary.segments import Valued
 from cosim.analysis.adversary.search_nodes import Pattern
+from cosim.analysis.adversary.segments import Valued
 from noack.config.scenario import Scenario
 from noack.core.number_format import number
 from noack.impairments.loss_guarantee import outcome_letters

@@ -161,4 +161,4 @@ def _run(
     start = LoopState(0.0, x0, zero, zero if known_start else -x0)
     before = tuple(map(LoopState, times_s, *np.moveaxis(states, 1, 0)))
     after = tuple(map(reset, before, delivered.tolist()))
-    return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)  # fmt: skip
+    return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)

@@ -23,6 +23,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from tests.cosim.simulation.batch.exact import (
+    check_events,
     check_independence,
     compare,
     one,
@@ -37,17 +38,20 @@ SIZE = (4, 2)
 
 def test_events_fates_and_measures_are_those_of_the_exact_simulator() -> None:
     rng = np.random.default_rng(4)
-    events = lost = settled = 0
+    events = lost = settled = checked = 0
     for _ in range(15):
         setting = random_setting(rng, *SIZE)
         population = random_population(rng, setting, 2)
         for i, row in enumerate(run_batch(setting, population)):
             run = reference(setting, one(population, i))
             compare(setting, row, run_events(setting, one(population, i)), run)
+            if i == 0:
+                checked += check_events(run, setting)
             events += len(run.event_s)
             lost += int((~run.delivered).sum())
             settled += not math.isnan(row["settling_s"])
     assert events > 150
+    assert checked > 50
     assert lost > 30
     assert settled > 1
 

@@ -29,6 +29,7 @@ from noack.trigger.self_triggered import SelfTrigger
 from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_policy import Policy
 from tests.cosim.simulation.batch.exact import (
+    check_events,
     check_independence,
     compare,
     one,
@@ -135,6 +136,8 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
                 assert row["status"] == TOO_MANY_EVENTS
                 continue
             compare(setting, row, run_events(setting, draw), run)
+            if i == 0 and events < 30:
+                check_events(run, setting)
             events += len(run.event_s)
             finished += 1
     assert events > (2 if name == "lyapunov" else 15)
