@@ -91,7 +91,6 @@ def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding
         _control(machine),
         _disk(machine, wanted),
         _runtime_folder(machine),
-        _cache(machine),
         _viewer(machine),
         *_extras(machine),
         _versions(machine),
@@ -251,15 +250,6 @@ def _runtime_folder(machine: MachineFacts) -> MachineFinding:
     means = "`noack record` cannot open a run for other terminals, and `noack set` finds no run"
     remedy = "set XDG_RUNTIME_DIR to a folder that you own"
     return MachineFinding(what, LIMITED, problem, means, remedy)
-
-
-def _cache(machine: MachineFacts) -> MachineFinding:
-    what = "compiled code"
-    if machine.cache:
-        return MachineFinding(what, GOOD, "cached for this user")
-    means = "campaigns, netem alone, and vehicles with tyres are compiled at each start"
-    remedy = "set XDG_CACHE_HOME to a folder that only you can write to"
-    return MachineFinding(what, LIMITED, "cannot be cached", means, remedy)
 
 
 def _viewer(machine: MachineFacts) -> MachineFinding:

@@ -115,8 +115,6 @@ class MachineFacts:
     disk: Disk | str
     runtime_folder: str | None
     """Why the folder for the user's private files cannot be used; None if it can."""
-    cache: bool
-    """Whether compiled code is cached between runs."""
     display: bool
     viewer: str | None
     """Version of rerun; None if it cannot be imported."""

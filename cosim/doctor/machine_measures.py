@@ -33,7 +33,6 @@ from cosim.output.viewer.live_viewer import has_display
 from cosim.record.environment import environment
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.code_cache import cache_folder
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.python_process import python_command
 from noack.runtime.address import LOOPBACK
@@ -87,7 +86,6 @@ def measure(
         control=_or_why(_control),
         disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
         runtime_folder=_runtime_folder(),
-        cache=_cache(),
         display=has_display(),
         viewer=about["packages"].get("rerun-sdk") if find_spec("rerun") else None,
         extras={name: find_spec(module) is not None for name, module in EXTRAS.items()},
@@ -253,17 +251,6 @@ def _runtime_folder() -> str | None:
     except CallerError as error:
         return str(error)
     return None
-
-
-def _cache() -> bool:
-    try:
-        folder = cache_folder("doctor", [Path(__file__)])
-    except ImportError:  # no numba: there is nothing to cache
-        return False
-    if folder is not None:
-        with suppress(OSError):
-            folder.rmdir()
-    return folder is not None
 
 
 def _timer_slack_ns() -> int | None:

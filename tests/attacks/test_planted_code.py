@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from noack.core.code_cache import cache_folder, compiler
+from noack.plants.systems.code_cache import cache_folder, compiler
 from tests.attacks.other_user import NOBODY, needs_root
 
 SOURCES = [Path(__file__)]

@@ -13,8 +13,10 @@ from scipy.linalg import expm
 import cosim
 import netem
 import noack
+from noack.core.core_library import SOURCES
 
 _PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
+"""The last two, if they are installed, compile the equations of vehicles with tyres."""
 _CODE = (noack, netem, cosim)
 _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
@@ -27,9 +29,10 @@ def arithmetic() -> Mapping[str, str]:
     instructions by the processor.
     """
     return {
-        **{name: metadata.version(name) for name in _PACKAGES},
+        **{name: _version(name) for name in _PACKAGES},
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "noack's code": _code(),
+        "noack's core": SOURCES,
         "machine": platform.machine(),
         "rounding": _rounding(),
     }
@@ -41,6 +44,13 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
         if there.get(name) != here[name]:
             return f"{name} is {there.get(name, 'unknown')} there, {here[name]} here"
     return None
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _code() -> str:

@@ -20,9 +20,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler, is_kept, while_compiling
 from noack.core.linear_systems import Vector
 from noack.plants.systems import jump_integrator
+from noack.plants.systems.code_cache import (
+    CALLED_BY_CODE,
+    cache_folder,
+    compiler,
+    is_kept,
+    while_compiling,
+)
 from noack.plants.systems.jump_integrator import Work, advance, buffers
 
 _LIBRARY = "vehiclemodels"

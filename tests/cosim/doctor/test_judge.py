@@ -32,7 +32,7 @@ IDEAL = MachineFacts(
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
-    cache=True, display=True, viewer="0.41.0", extras={"fmi": True, "vehicle": True},
+    display=True, viewer="0.41.0", extras={"fmi": True, "vehicle": True},
     versions={"python": "3.12.1", "noack": "0.1.0"},
 )  # fmt: skip
 
@@ -66,7 +66,6 @@ def test_a_machine_without_limits_is_good() -> None:
     ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, FindingStatus.BAD),
     ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, FindingStatus.LIMITED),
     ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, FindingStatus.LIMITED),
-    ("compiled code", {"cache": False}, FindingStatus.LIMITED),
     ("viewer", {"display": False}, FindingStatus.LIMITED),
     ("viewer", {"viewer": None}, FindingStatus.BAD),
     ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),

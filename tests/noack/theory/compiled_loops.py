@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from noack.core.code_cache import CALLED_BY_CODE, cache_folder, compiler
+from noack.plants.systems.code_cache import CALLED_BY_CODE, cache_folder, compiler
 
 COMPILED = compiler(cache_folder("tests", [Path(__file__)]))
 """Its lock keeps two processes of the tests from compiling the same."""

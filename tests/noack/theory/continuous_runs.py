@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from noack.core.code_cache import cache_folder, compiler
 from noack.core.linear_systems import Matrix, Vector
+from noack.plants.systems.code_cache import cache_folder, compiler
 from tests.noack.theory.compiled_loops import PART
 from tests.noack.theory.loops import STEPS, Flags, Reals, Steps, System
 

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 import numba
 import pytest
 
-from noack.core.code_cache import _one_at_a_time, cache_folder, compiler
+from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
 
 SOURCES = [Path(__file__)]
 
