@@ -94,9 +94,10 @@ def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
     channel = dict(report["channel"])
-    of_loops, rejected = channel.pop("loops", []), Counter(channel.get("rejected"))
+    of_loops = channel.pop("loops", [])
+    rejected = Counter[str](channel.get("rejected"))
     channel |= of_loops[number] if number < len(of_loops) else {}
-    of_none = rejected - sum((Counter(one.get("rejected")) for one in of_loops), Counter())
+    of_none = rejected - sum((Counter(one.get("rejected")) for one in of_loops), Counter[str]())
     if number == 0 and of_loops and of_none:  # such as datagrams of others that a socket dropped
         channel["rejected"] = channel.get("rejected", {}) | of_none
     answers = channel.get("acknowledgements")

@@ -17,7 +17,7 @@ HEADER = LIBRARY.with_name("_core_header.py")
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
-    from noack.core._core_header import SOURCES
+    from noack.core._core_header import SOURCES as SOURCES
     from noack.core._core_header import ffi as ffi
 except ImportError:
     raise CallerError(f"noack's core in C has not been built; {_REMEDY}") from None
