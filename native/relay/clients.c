@@ -106,7 +106,8 @@ static int32_t row_of(const noack_relay *relay, int64_t k) {
    together. */
 void touch_clients(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
-    int64_t first_path = 2 * relay->links, loaded = 0;
+    int64_t first_path = 2 * relay->links;
+    uint64_t loaded = 0;
     if (relay->client_rows <= FEW || own->batch_socket >= first_path)
         return;
     const noack_link *link = relay->directions[2 * own->batch_socket].link;
@@ -115,13 +116,13 @@ void touch_clients(noack_relay *relay) {
     for (int64_t k = own->batch_next; k < own->batch_end; k++) {
         int64_t row = own->hints[k];
         if (row >= 0)
-            loaded += relay->clients[row].key[0] + relay->clients[row].place
-                      + relay->sockets[first_path + row].fd;
+            loaded += (uint64_t)relay->clients[row].key[0] + (uint64_t)relay->clients[row].place
+                      + (uint64_t)relay->sockets[first_path + row].fd;
     }
     for (int64_t k = own->batch_next; k < own->batch_end; k++) {
         int64_t row = own->hints[k];
         if (row >= 0 && relay->clients[row].link == own->batch_socket)
-            loaded += noack_link_touch(link, relay->clients[row].place);
+            loaded += (uint64_t)noack_link_touch(link, relay->clients[row].place);
     }
     own->loaded = loaded;
 }

@@ -14,6 +14,8 @@
 enum {
     CALLS_PER_READING = 8, /* of the clock */
     MOST_SEGMENTED_BYTES = 65507,
+    /* With more than FEW_SEGMENTS. A queue on the way may refuse larger messages, or lose them. */
+    MANY_SEGMENTS_BYTES = 32768,
     TRIES = 3,
     /* Maximum number of tries. An ICMP error of an earlier datagram makes one send fail. A send
        that fails without an ICMP error in the error queue, or this often, is expected to fail
@@ -98,11 +100,12 @@ static int64_t add_vectors(const noack_relay *relay, int64_t count, const depart
 
 /* Whether a datagram may follow others of size_bytes in one message that the kernel segments. */
 static int may_join(
-    const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes) {
+    const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes,
+    int64_t segments) {
+    int64_t most_bytes = segments < FEW_SEGMENTS ? MOST_SEGMENTED_BYTES : MANY_SEGMENTS_BYTES;
     int to_client = relay->directions[first->direction].sends == NOACK_CLIENT_NAME;
     return 0 < other->size_bytes && other->size_bytes <= first->size_bytes
-           && all_bytes + other->size_bytes <= MOST_SEGMENTED_BYTES
-           && other->direction == first->direction
+           && all_bytes + other->size_bytes <= most_bytes && other->direction == first->direction
            && (other->client == first->client || !to_client);
 }
 
@@ -148,7 +151,7 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
             while (number >= 0 && segments < own->most_segments
                    && last_bytes == first->size_bytes) {
                 const departure *other = &own->leaving[number];
-                if (!may_join(relay, first, other, all_bytes)
+                if (!may_join(relay, first, other, all_bytes, segments)
                     || vectors + vectors_of(other) > VECTORS)
                     break;
                 last_bytes = other->size_bytes;
