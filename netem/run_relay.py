@@ -56,7 +56,7 @@ class NetworkChannel(CountingSocket):
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass on a datagram that a peer sent before its socket was open; count others."""
         direction = self._directions.get(source[:2])
-        loop = loop_number(data)
+        loop = loop_number(data) if self._loops > 1 else 0
         if direction is None:
             self._foreign += 1
         elif loop is None or loop >= self._loops:

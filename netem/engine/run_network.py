@@ -41,7 +41,7 @@ class RunNetwork:
     Args:
         resolved: the resolved scenario.
         start: where in the run it begins.
-        loops: number of the run's loops.
+        loops: number of the run's loops; of one, every datagram is its.
     """
 
     def __init__(self, resolved: Scenario, start: Start, loops: int = 1) -> None:
@@ -51,7 +51,7 @@ class RunNetwork:
             self._memory.add_clients()
         self._relay, clients = self._memory.core, self._memory.clients
         self._relay.inputs = self._relay.first_number = start.first_number
-        self._relay.loops, self._relay.by_loop = self._loops, 1
+        self._relay.loops, self._relay.by_loop = self._loops, self._loops > 1
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["place"][flows] = flows
         network = resolved.network

@@ -51,9 +51,10 @@ def all_are_accounted_for(run: Attacked) -> Iterator[str]:
 
 def nothing_is_lost(run: Attacked) -> Iterator[str]:
     """All datagrams of the loop arrive, and the record is complete."""
+    (loop,) = run.summary["loops"]
     for key in ("unintended_losses", "missing_samples"):
-        if run.summary[key]:
-            yield f"{key}: {run.summary[key]}, {run.summary['unintended_losses_by_leg']}"
+        if loop[key]:
+            yield f"{key}: {loop[key]}, {loop['unintended_losses_by_leg']}"
     for role in LOOP_ROLES:
         if run.channel(role)["lost_in_kernel"] not in (0, None):
             yield f"{role}: {run.channel(role)['lost_in_kernel']} lost in the kernel"
@@ -61,13 +62,11 @@ def nothing_is_lost(run: Attacked) -> Iterator[str]:
 
 def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
     """Replay gives the recorded outputs, and (I1) holds to rounding."""
-    if not (
-        run.summary["loops"][0]["replay"]["bit_exact"]
-        and run.summary["loops"][0]["replay"]["complete"]
-    ):
-        yield f"replay: {run.summary['replay']}"
-    if not run.summary["loops"][0]["identity_residual_max"] < 1e-11:
-        yield f"identity residual {run.summary['identity_residual_max']}"
+    (loop,) = run.summary["loops"]
+    if not (loop["replay"]["bit_exact"] and loop["replay"]["complete"]):
+        yield f"replay: {loop['replay']}"
+    if not loop["identity_residual_max"] < 1e-11:
+        yield f"identity residual {loop['identity_residual_max']}"
 
 
 def no_claim_is_violated(run: Attacked) -> Iterator[str]:

@@ -197,7 +197,7 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(
     assert summary["loops"][0]["replay"]["complete"]
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
     again = start(0, "collect", str(run_dir), str(folder), "--json")
-    assert json.loads(ended(again)[0])["replay"] == summary["loops"][0]["replay"]
+    assert json.loads(ended(again)[0])["loops"][0]["replay"] == summary["loops"][0]["replay"]
 
 
 def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> No
     assert noack.json("check", "lane_following")["name"] == "lane_following"
     run = noack.json("demo", *EPHEMERAL, "--set", "horizon_s=0.5", "--report")
     assert run["exit"]["status"] == 0
-    assert run["replay"]["bit_exact"]
+    assert run["loops"][0]["replay"]["bit_exact"]
     assert (noack.folder / "runs" / "latest" / "report.html").stat().st_size > 10_000
     assert noack("netem", "--explain", "loss", "5%").returncode == 0
 

@@ -163,7 +163,7 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
     if "notices" in name:
         payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
     else:
-        numbers = np.frombuffer(bytearray(data[16:]), "<i8").copy()
+        numbers = np.frombuffer(data[16 : 16 + (len(data) - 16) // 8 * 8], "<i8").copy()
         for _ in range(choices.below(4)):
             numbers[choices.below(len(numbers))] = int(np.int64(choices.integer() % 2**63))
         payload = numbers.tobytes()[: choices.one([len(data) - 16, 0, 8, 33])]
