@@ -38,9 +38,9 @@ from noack.trigger.mixed import MixedTrigger
 from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.send_on_area import SendOnAreaTrigger
 from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
+from noack.trigger.trigger_rule import Forecast
 from plant_server.disturbance_signal import Disturbance
 from plant_server.measurement import MeasurementModel
 from plant_server.plant import Plant
@@ -123,9 +123,6 @@ class UserTrigger:
 
     def restart(self, t_ns: int, x: Vector) -> None:
         self.calls.append("restart")
-
-    def change(self, policy: Policy) -> None:
-        """Its settings do not change."""
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
         self.calls.append("test")
