@@ -207,7 +207,7 @@ class Decoder:
             "noack_reception *",
             {
                 "flow": flow, "entries": dimension, "newest": -1,
-                "not_before_ns": not_before_ns,
+                "not_before_ns": not_before_ns, "not_after_ns": TIMES_NS - 1,
             },
         )  # fmt: skip
         self._message = ffi.new("noack_message *")
