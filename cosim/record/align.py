@@ -162,7 +162,7 @@ def join(
     t_ns = measurements["t_ns"]
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
     x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
-    flow = ModelFlow(loop.H, (), loop.setpoint) if flow is None else flow
+    flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
     x_c, received = _at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:

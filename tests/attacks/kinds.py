@@ -10,15 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.protocol.datagram_seal import KEY_BYTES, TAG_BYTES
-from noack.protocol.wire_format import (
-    HEADER_BYTES,
-    Decoder,
-    Encoder,
-    Flow,
-    Message,
-    Rejection,
-)
+from noack.protocol.wire_format import HEADER_BYTES, Encoder, Flow, Message, Rejection
 from noack.runtime.address import LOOPBACK
+from tests.wire_decoder import Decoder
 
 FUTURE = 2**40
 """A sequence number that no run reaches: greater than every accepted number."""
