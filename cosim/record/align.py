@@ -298,9 +298,3 @@ class IdentityResidual:
                 totals[i] = missed.total()
         residual = np.abs(aligned.x_c - aligned.x_s - totals).max(axis=1)
         return np.where(in_common(self._scenario, aligned), residual, np.nan)
-
-
-def identity_residual(record: RunRecord) -> Reals:
-    """Return the residual of (I1) at each measurement of a run, (k,)."""
-    residual = IdentityResidual(record.scenario)
-    return np.concatenate([residual.take(part) for part in aligned_parts(record)])

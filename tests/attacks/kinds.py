@@ -47,7 +47,7 @@ def _authentic(
     message = Message(
         target.flow if flow is None else flow,
         FUTURE + draw.getrandbits(20) if sequence is None else sequence,
-        draw.getrandbits(40),
+        draw.getrandbits(32),  # within the run
         np.array([draw.gauss(0, 1e6) for _ in range(target.dimension)]),
     )
     encoder = Encoder(
