@@ -7,10 +7,6 @@
 
 enum { MOST_LOOPS = 65535 };
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 const char *noack_channel_check(const noack_channel *channel) {
     if (!is_between(1, channel->loops, MOST_LOOPS) || !is_between(1, channel->directions, 2))
         return "a network has 1 to 65535 loops, and one or two directions";

@@ -16,6 +16,9 @@
 
 static inline int64_t max_of(int64_t a, int64_t b) { return a > b ? a : b; }
 static inline int64_t min_of(int64_t a, int64_t b) { return a < b ? a : b; }
+static inline int is_between(int64_t least, int64_t number, int64_t most) {
+    return least <= number && number <= most;
+}
 
 /* Division and remainder that round towards minus infinity, as Python's do; b > 0. */
 static inline int64_t floor_div(int64_t a, int64_t b) { return a / b - (a % b < 0); }

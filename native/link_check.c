@@ -10,10 +10,6 @@ enum { MOST_OPPORTUNITIES_PER_MS = 1 << 20, NS_PER_MS = 1000000 };
 static const int64_t FAR_NS = INT64_C(1) << 61;
 static const int64_t LONGEST_DELAY_NS = INT64_C(1000000000000000); /* 11.6 days, of a stage */
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 static int in_range(int64_t begin, int64_t end, int64_t count) {
     return 0 <= begin && begin <= end && end <= count;
 }

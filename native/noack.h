@@ -374,6 +374,7 @@ typedef struct { /* what a machine receives of a flow */
     int64_t entries;
     int64_t newest;        /* sequence number of the newest message accepted; -1: none */
     int64_t not_before_ns; /* earlier messages are stale */
+    int64_t not_after_ns;  /* later messages are out of range: no run has them */
     int64_t accepted;
     int64_t rejected[10]; /* by noack.protocol.wire_format.Rejection */
 } noack_reception;
@@ -580,6 +581,7 @@ int64_t noack_process_due_ns(const noack_process *process);
    NOACK_DONE, or a noack_question: after the answer the call is repeated. */
 int64_t noack_process_handle(
     noack_process *process, const noack_message *message, int64_t now_ns);
+/* Do the first tick; noack_process_due_ns tells whether there is one. */
 int64_t noack_process_tick(noack_process *process, int64_t now_ns);
 
 /* The machine of a loop. */

@@ -17,8 +17,6 @@ enum {
     VECTOR = 32
 };
 
-#define TIMES_NS (INT64_C(1) << 62)
-
 static const uint64_t initial[8] = {
     UINT64_C(0x6A09E667F3BCC908), UINT64_C(0xBB67AE8584CAA73B), UINT64_C(0x3C6EF372FE94F82B),
     UINT64_C(0xA54FF53A5F1D36F1), UINT64_C(0x510E527FADE682D1), UINT64_C(0x9B05688C2B3E6C1F),
@@ -167,7 +165,7 @@ int64_t wire_examine_message(
     if (!from_peer)
         return NOACK_BAD_SOURCE;
     /* Sequence numbers from 2^63 on are negative here. */
-    if (message->sequence < 0 || message->t_ns < 0 || message->t_ns >= TIMES_NS)
+    if (message->sequence < 0 || message->t_ns < 0 || message->t_ns > reception->not_after_ns)
         return NOACK_BAD_RANGE;
     if (message->sequence <= reception->newest || message->t_ns < reception->not_before_ns)
         return NOACK_STALE;

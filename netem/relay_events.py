@@ -11,4 +11,3 @@ Events = NDArray[np.void]
 EVENT = dtype_of("noack_event")
 """One event, with the fields of ``noack_event`` in native/noack.h; the payload is ``data[offset :
 offset + size_bytes]``."""
-ADDRESS_BYTES = EVENT["source"].shape[0]

@@ -40,6 +40,7 @@ SENSOR = Role(
     (None, SENSOR_MEASUREMENT, SENSOR_ACKNOWLEDGEMENT), SENSOR_SETTING,
 )  # fmt: skip
 _SENT_PLACES = 64
+_ANY_TIME_NS = 2**60  # the latest horizon of a machine
 
 
 @dataclass
@@ -62,6 +63,7 @@ class Sensor:
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
         observer: estimates x from the measurements; None: they are x.
+        horizon_ns: no measurement is later; a message that is, is rejected.
     """
 
     H: Matrix
@@ -74,6 +76,7 @@ class Sensor:
     schedule: ChangeSchedule | None = None
     timeout_ns: int | None = None
     observer: Observer | None = None
+    horizon_ns: int = _ANY_TIME_NS
 
     role = SENSOR
 
@@ -104,6 +107,7 @@ class Sensor:
         set_machine(
             sensor.machine, n=n, m=self.inputs, flow=Flow.MEASUREMENT,
             entries=n if own is None else own.p + own.reported, first_number=self.first_number,
+            horizon_ns=self.horizon_ns,
         )  # fmt: skip
         memory.set_model(sensor.model, memory.transitions(self.H, steps_ns), (), self._points)
         start = np.zeros(n) if self.x0 is None else self.x0
@@ -254,6 +258,7 @@ def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Sensor:
         schedule=None if acknowledges else ChangeSchedule(resolved, _prepared, results),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
         observer=observer_of(resolved, restarted=start.is_restart),
+        horizon_ns=resolved.timing.horizon_ns,
     )
 
 

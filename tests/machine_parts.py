@@ -20,7 +20,7 @@ def machine(part: Plant | Sensor | Controller) -> LoopMachines:
 
 def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int, **settings: Any) -> LoopMachines:
     """A linear plant from x0 on."""
-    system = LinearSystem(A, B, x0, step_ns=period_ns)
+    system = LinearSystem(A, B, x0)
     return machine(Plant(system, B.shape[1], period_ns=period_ns, **settings))
 
 

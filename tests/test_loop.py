@@ -25,8 +25,9 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import RECEIVES, SENDS, receiver_of
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
+from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
 from sensor_node.sensor import sensor_of
+from tests.wire_decoder import Decoder
 
 RUN, KEY = 7, bytes(32)
 PERIOD_NS = 10_000_000

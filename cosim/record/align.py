@@ -162,7 +162,7 @@ def join(
     t_ns = measurements["t_ns"]
     reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
     x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
-    flow = ModelFlow(loop.H, (), loop.setpoint) if flow is None else flow
+    flow = ModelFlow(loop.H, loop.setpoint) if flow is None else flow
     x_c, received = _at(flow, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
@@ -298,9 +298,3 @@ class IdentityResidual:
                 totals[i] = missed.total()
         residual = np.abs(aligned.x_c - aligned.x_s - totals).max(axis=1)
         return np.where(in_common(self._scenario, aligned), residual, np.nan)
-
-
-def identity_residual(record: RunRecord) -> Reals:
-    """Return the residual of (I1) at each measurement of a run, (k,)."""
-    residual = IdentityResidual(record.scenario)
-    return np.concatenate([residual.take(part) for part in aligned_parts(record)])

@@ -75,7 +75,7 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
 def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
     """The flow of the controller's model in a run, with its set-points."""
     loop, schedule = loop_of(scenario), ChangeSchedule(scenario)
-    flow, known = ModelFlow(loop.H, (), loop.setpoint), set()
+    flow, known = ModelFlow(loop.H, loop.setpoint), set()
     for change, since_ns in _changes_in(received):
         if change.number not in known:  # a restarted controller receives it again
             known.add(change.number)

@@ -8,12 +8,7 @@
 
 enum { TABLES = 4, SEQUENCE = 8, TIME = 16, NOW = 24, SENT_HEADER = 3, SENT_DATAGRAM = 5 };
 enum { PACKET_FLOW = 32, PACKET_SIZE = 80, PACKET_HEAD = 88, MOST_BYTES = 65535 };
-static const int64_t FAR_NS = INT64_C(1) << 62;
 static const int64_t EARLIEST_NS = -3600 * NS_PER_S; /* by a clock that is off */
-
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
 
 static const noack_reception *reception_of(const noack_input_replay *replay, int64_t kind) {
     const noack_machine *machine = noack_process_machine(replay->process, replay->loop);
@@ -153,7 +148,10 @@ static int64_t replay_network(
 
 static int64_t tick(noack_input_replay *replay, int64_t now_ns) {
     noack_process *process = replay->process;
-    check_deadline(replay, tick_ns(noack_process_machine(process, replay->loop)), now_ns);
+    int64_t due_ns = tick_ns(noack_process_machine(process, replay->loop));
+    check_deadline(replay, due_ns, now_ns);
+    if (due_ns == NO_TICK)
+        return NOACK_CANNOT_TAKE;
     if (process->role == NOACK_PLANT)
         return noack_plant_tick(
             &process->plants[replay->loop], now_ns, &process->output, process->notes);
@@ -178,7 +176,8 @@ static int64_t handle(
         .sequence = word_at(recorded, SEQUENCE),
         .t_ns = word_at(recorded, TIME),
     };
-    if (message.sequence < 0 || !is_between(0, message.t_ns, FAR_NS - 1))
+    int64_t latest_ns = reception_of(replay, table->kind)->not_after_ns;
+    if (message.sequence < 0 || !is_between(0, message.t_ns, latest_ns))
         return NOACK_CANNOT_TAKE;
     for (int i = 0; i < 3; i++) {
         const noack_columns *columns = &table->vector[i];

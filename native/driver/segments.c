@@ -12,10 +12,6 @@
 static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
 enum { LAST_STEP = 1 << 30 };
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 static int covers(const noack_signal *signal, int64_t last) {
     return signal->width == 0 || (signal->first == 0 && signal->rows > last);
 }

@@ -20,10 +20,6 @@ static const int64_t RECEIVER[] = {
     [NOACK_ACKNOWLEDGEMENT] = NOACK_SENSOR,
 };
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 static const char *check_group(const noack_simulation *simulation, int64_t number) {
     const noack_loop_group *group = &simulation->of_group[number];
     for (int64_t role = NOACK_PLANT; role <= NOACK_CONTROLLER; role++) {

@@ -5,10 +5,6 @@
 static const int64_t NEVER_NS = INT64_C(1) << 62; /* longer times never end */
 enum { MOST_ROWS = 256, MOST_FATES = 1 << 30 };
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 static int is_positive(double number) { return number >= 0.0 && number < INFINITY; }
 
 static const char *check_exact_rule(const noack_exact *exact) {

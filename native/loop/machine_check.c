@@ -10,10 +10,6 @@ static const int64_t MOST_LENGTH = INT64_C(1) << 32;
  */
 static const int64_t MOST_NS = INT64_C(1) << 60, MOST_NUMBER = INT64_MAX / 2;
 
-static int is_between(int64_t least, int64_t number, int64_t most) {
-    return least <= number && number <= most;
-}
-
 /* A time up to which a machine has come: that of a message at most. */
 static int is_reached(int64_t t_ns) { return is_between(0, t_ns, MESSAGE_TIMES_NS); }
 
@@ -32,6 +28,9 @@ static const char *check_machine(const noack_machine *machine) {
     if (!is_between(0, machine->received.entries, NOACK_MAX_ENTRIES)
         || machine->acknowledgements.entries != 0)
         return "a machine receives vectors of more than 64 entries";
+    if (!is_between(0, machine->received.not_after_ns, MESSAGE_TIMES_NS - 1)
+        || !is_between(0, machine->acknowledgements.not_after_ns, MESSAGE_TIMES_NS - 1))
+        return "a machine receives messages of a time out of range";
     return NULL;
 }
 
@@ -244,6 +243,8 @@ const char *noack_process_check(const noack_process *process) {
         || (process->role == NOACK_SENSOR && process->sensors == NULL)
         || (process->role == NOACK_CONTROLLER && process->controllers == NULL))
         return "a process has no machines";
+    if (!is_between(0, process->heap_count, process->loops))
+        return "a process has more loops with a tick than it has loops";
     for (int64_t loop = 0; loop < process->loops; loop++) {
         const char *wrong = check_loop(process, loop);
         if (wrong != NULL)

@@ -9,8 +9,8 @@ notice.
 
 import json
 from bisect import bisect
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
@@ -27,10 +27,8 @@ from noack.config.scenario_changes import content_with_settings, with_settings
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Machine, Notice, Record
+from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
-
-T = TypeVar("T")
 
 LATE = "violation"  # level of the notice of a process that applies a change late
 
@@ -115,25 +113,6 @@ def change_notice(change: ParameterChange, more: str = "") -> Notice:
     """Return the notice of a change for the run's log."""
     text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{more}"
     return Notice(change.t_ns, CHANGED, text)
-
-
-class ReconfigurableMachine(Machine[T], Protocol[T]):
-    """A machine whose settings may change during a run."""
-
-    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Process the announcement of a change; return one row and its notices.
-
-        Raise CallerError, and change nothing, if the scenario would be invalid.
-        """
-        ...
-
-
-class FixedMachine:
-    """Base of machines with constant settings: those of the acknowledgement baseline."""
-
-    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Refuse the announcement of a change by a CallerError."""
-        raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
 
 
 def announcement_outputs(

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from noack.controllers.controller_settings import ControllerSettings, ControlModel
-from noack.core.linear_systems import Matrix, Vector
-from noack.core.ordered_arithmetic import product
+from noack.core.linear_systems import Matrix, Vector, product
 
 
 class LinearFeedbackSettings(ControllerSettings):

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
-HEADER = LIBRARY.with_name("_core_header.py")
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:

@@ -4,14 +4,14 @@ Time steps are integer nanoseconds; matrices are per second. The same step alway
 matrix, bit for bit, whether it was cached or not, and on every processor.
 """
 
-from collections.abc import Iterable
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.core_library import core, ffi
 from noack.core.matrix_exponential import exponential
-from noack.core.ordered_arithmetic import norm_of, product
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -46,16 +46,13 @@ def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
 class Propagator:
     """Advances states of the autonomous system ``dz/dt = G z`` exactly; G is (n, n), per second.
 
-    Transition matrices are cached by step; a loop on a time grid has few distinct steps. The
-    matrices of ``steps_ns`` are computed at once, so that the first deadlines are not delayed.
+    Transition matrices are cached by step; a loop on a time grid has few distinct steps.
     """
 
-    def __init__(self, generator: Matrix, steps_ns: Iterable[int] = ()) -> None:
+    def __init__(self, generator: Matrix) -> None:
         self.generator = np.array(generator, dtype=np.float64)
         self._static = not self.generator.any()
         self.transition = lru_cache(_CACHED_STEPS)(partial(transition, self.generator))
-        for step_ns in steps_ns:
-            self.transition(step_ns)
 
     def __call__(self, state: Vector, dt_ns: int) -> Vector:
         """Return e^{G dt} ``state``, shape (n,)."""
@@ -70,25 +67,19 @@ class Propagator:
         return np.asarray(states @ self.transition(dt_ns).T)
 
 
-class HeldInputPropagator:
-    """Advances ``dx/dt = A x + B u`` exactly under a held input (:func:`discretise`)."""
-
-    def __init__(self, A: Matrix, B: Matrix) -> None:
-        self.A = np.array(A, dtype=np.float64)
-        self.B = np.array(B, dtype=np.float64)
-        self.step = lru_cache(_CACHED_STEPS)(partial(discretise, self.A, self.B))
-
-    def __call__(self, x: Vector, u: Vector, dt_ns: int) -> Vector:
-        """Return x after ``dt_ns`` under the constant input ``u`` (shapes (n,), (m,))."""
-        if dt_ns == 0:
-            return x
-        Ad, Bd = self.step(dt_ns)
-        return product(Ad, x) + product(Bd, u)
-
-
 def norm(vector: Vector) -> float:
     """Return the Euclidean norm ‖v‖₂ of a vector of shape (n,) without overflow of squares."""
-    return norm_of(vector.tolist(), 0, len(vector))
+    return float(core.noack_norm(len(vector), _reals(vector)))
+
+
+def product(matrix: Matrix, vector: Vector) -> Vector:
+    """Return the matrix, (p, n), times the vector, (n,): the core's sums, from the left.
+
+    numpy's last bits of a product depend on the processor and on the memory layout.
+    """
+    result = np.empty(len(matrix))
+    core.noack_product(*matrix.shape, _reals(matrix), _reals(vector), _reals(result))
+    return result
 
 
 def row_norms(rows: Matrix) -> Vector:
@@ -109,3 +100,7 @@ def row_norms(rows: Matrix) -> Vector:
 def spectral_abscissa(matrix: Matrix) -> float:
     """Return the largest real part of the eigenvalues, per second."""
     return float(np.linalg.eigvals(matrix).real.max())
+
+
+def _reals(values: Matrix | Vector) -> Any:
+    return ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))

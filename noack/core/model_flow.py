@@ -4,7 +4,6 @@ The set-point x_r changes at the same times in sensor and controller, so both mo
 """
 
 from bisect import bisect_right
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -14,13 +13,11 @@ from noack.core.linear_systems import Matrix, Propagator, Vector
 class ModelFlow:
     """Propagates the state of the model with the closed-loop matrix H, (n, n), per second.
 
-    ``steps_ns`` are steps to precompute, ``setpoint`` is the initial x_r, (n,); None is 0.
+    ``setpoint`` is the initial x_r, (n,); None is 0.
     """
 
-    def __init__(
-        self, H: Matrix, steps_ns: Iterable[int] = (), setpoint: Vector | None = None
-    ) -> None:
-        self.propagate = Propagator(H, steps_ns)
+    def __init__(self, H: Matrix, setpoint: Vector | None = None) -> None:
+        self.propagate = Propagator(H)
         self._since_ns: list[int] = []
         self._setpoints = [setpoint]
         self.moved = setpoint is not None
@@ -32,10 +29,6 @@ class ModelFlow:
             self._since_ns.append(since_ns)
             self._setpoints.append(setpoint)
             self.moved = True
-
-    def setpoint(self, t_ns: int) -> Vector | None:
-        """Return x_r at a time; None is 0."""
-        return self._setpoints[bisect_right(self._since_ns, t_ns)]
 
     def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
         """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""

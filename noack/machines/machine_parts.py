@@ -85,7 +85,7 @@ def set_machine(
     first_number: int = 0,
     period_ns: int = 0,
     first_ns: int = 0,
-    horizon_ns: int = 0,
+    horizon_ns: int,
     step: int = 0,
 ) -> None:
     """Fill a ``noack_machine`` at its start."""
@@ -95,7 +95,8 @@ def set_machine(
     machine.step, machine.reached_ns, machine.change_ns = step, -1, NEVER_NS
     machine.received.flow, machine.received.entries = flow, entries
     machine.acknowledgements.flow = Flow.ACKNOWLEDGEMENT
-    machine.received.newest = machine.acknowledgements.newest = -1
+    for reception in (machine.received, machine.acknowledgements):
+        reception.newest, reception.not_after_ns = -1, horizon_ns
 
 
 def take_changes(schedule: ChangeSchedule | None, machine: Any) -> Sequence[Any]:

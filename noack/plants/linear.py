@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from noack.core.linear_systems import HeldInputPropagator, Matrix, Vector
+from noack.core.linear_systems import Matrix, Vector, discretise, product
 from noack.plants.plant_settings import PlantSettings, PlantStart
 
 _EMPTY = np.zeros(0)
@@ -18,22 +18,18 @@ class LinearSettings(PlantSettings):
     kind: Literal["linear"] = "linear"
 
     def system(self, start: PlantStart) -> "LinearSystem":
-        return LinearSystem(start.A, start.B, start.x0, step_ns=start.step_ns)
+        return LinearSystem(start.A, start.B, start.x0)
 
 
 class LinearSystem:
-    """``dx/dt = A x + B u``; z is empty.
+    """``dx/dt = A x + B u``; z is empty. A plant's steps of it are the core's."""
 
-    The matrices of the expected step are computed before the first deadline.
-    """
-
-    def __init__(self, A: Matrix, B: Matrix, x0: Vector, *, step_ns: int) -> None:
+    def __init__(self, A: Matrix, B: Matrix, x0: Vector) -> None:
         self.A, self.B = A, B
-        self._advance = HeldInputPropagator(A, B)
-        self._advance.step(step_ns)
         self.x = np.array(x0, dtype=np.float64)
         self.z = _EMPTY
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """x(t + dt) = Ad x(t) + Bd u."""
-        self.x = self._advance(self.x, u, dt_ns)
+        Ad, Bd = discretise(self.A, self.B, dt_ns)
+        self.x = product(Ad, self.x) + product(Bd, u)

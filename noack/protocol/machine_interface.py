@@ -1,10 +1,6 @@
-"""A pure machine: inputs and time in, outputs out; no socket, no clock, no randomness.
+"""What machines emit beside messages, and where in a run they begin."""
 
-The live shells (``noack.runtime``), the simulator and replay drive machines through this interface.
-"""
-
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 from noack.protocol.wire_format import Message
 
@@ -60,21 +56,3 @@ class Notice(NamedTuple):
 
 
 Output = Message | Record | Notice
-
-T = TypeVar("T")
-
-
-class Machine(Protocol[T]):
-    """One process of the loop, without its input and output; T is what it receives and sends."""
-
-    def handle(self, message: T, now_ns: int) -> Sequence[T | Record | Notice]:
-        """Take a message that arrived at simulated time ``now_ns``."""
-        ...
-
-    def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
-        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
-        ...
-
-    def next_deadline_ns(self) -> int | None:
-        """When :meth:`on_timer` is due next; None if no timer is set."""
-        ...

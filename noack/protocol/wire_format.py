@@ -36,9 +36,8 @@ VERSION = 1
 VERSIONS = VERSION, EncryptedSeal.version
 MAX_DIMENSION = 64
 MAX_LOOPS = 65_535
-SEQUENCES, TIMES_NS = 2**63, 2**62
-"""Upper limits of sequence numbers and times: they fit the record's columns, and sums of times do
-too. At 100,000 messages a second, 2⁶³ take three million years."""
+TIMES_NS = 2**62
+"""Upper limit of times: sums of two fit the record's columns."""
 _HEADER = struct.Struct("<2sBBHHQQq")
 HEADER_ROW = np.dtype(
     [
@@ -65,9 +64,6 @@ class Flow(IntEnum):
     ACKNOWLEDGEMENT = 4
     """controller → network → sensor, with ``protocol = "ack"`` only: an update's sequence number
     and event time, and no vector, shape (0,)."""
-
-
-NO_VECTOR: Vector = np.zeros(0)  # the vector of an acknowledgement
 
 
 class Message(NamedTuple):
@@ -118,11 +114,6 @@ def read_header(datagram: bytes) -> Header | None:
     if len(datagram) < HEADER_BYTES or datagram[:2] != MAGIC:
         return None
     return Header(*_HEADER.unpack_from(datagram)[1:])
-
-
-def flow_of(datagram: bytes) -> int | None:
-    """The flow field of a datagram, unverified; None if the datagram is too short."""
-    return datagram[FLOW_OFFSET] if len(datagram) >= HEADER_BYTES else None
 
 
 def loop_number(datagram: bytes) -> int | None:
@@ -181,78 +172,6 @@ class Encoder:
         if self._wire.seal is None:
             return datagram
         return self._wire.seal.close(datagram[:HEADER_BYTES], datagram[HEADER_BYTES:-TAG_BYTES])
-
-
-class Decoder:
-    """Turns the datagrams of one flow of a loop into messages; others are counted and rejected.
-
-    Only a datagram that is newer than every one accepted before is accepted. A datagram from before
-    ``not_before_ns`` is stale: the process before a restart may have accepted it.
-    """
-
-    def __init__(
-        self,
-        flow: Flow,
-        dimension: int,
-        run_id: int,
-        key: bytes,
-        *,
-        not_before_ns: int = 0,
-        loop: int = 0,
-        encrypted: bool = False,
-    ) -> None:
-        self._wire = Wire(run_id, key, encrypted=encrypted)
-        self._flow, self._loop = flow, loop
-        self._reception = ffi.new(
-            "noack_reception *",
-            {
-                "flow": flow, "entries": dimension, "newest": -1,
-                "not_before_ns": not_before_ns,
-            },
-        )  # fmt: skip
-        self._message = ffi.new("noack_message *")
-
-    def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
-        """Return the message, or None when the datagram was rejected (see ``rejected``).
-
-        From any source but the peer's address even an authentic datagram is a replay.
-        """
-        found = self._examine(datagram, from_peer, opened=False)
-        if found == core.NOACK_ENCRYPTED:
-            found = core.NOACK_BAD_TAG
-            assert self._wire.seal is not None
-            content = self._wire.seal.open(datagram, HEADER_BYTES)
-            if content is not None:
-                readable = datagram[:HEADER_BYTES] + content + datagram[-TAG_BYTES:]
-                found = self._examine(readable, from_peer, opened=True)
-        message = self._message
-        core.noack_wire_count(self._reception, found, message)
-        if found != core.NOACK_ACCEPTED:
-            return None
-        vector = np.array(ffi.unpack(message.vector, message.entries), np.float64)
-        return Message(self._flow, message.sequence, message.t_ns, vector, self._loop)
-
-    def _examine(self, datagram: bytes, from_peer: bool, *, opened: bool) -> int:
-        return int(
-            core.noack_wire_examine(
-                self._wire.core, self._reception, self._loop, datagram, len(datagram),
-                from_peer, opened, self._message,
-            )
-        )  # fmt: skip
-
-    @property
-    def accepted(self) -> int:
-        """Number of accepted datagrams."""
-        return int(self._reception.accepted)
-
-    @property
-    def rejected(self) -> dict[Rejection, int]:
-        """Number of rejected datagrams by reason."""
-        return rejected_of(self._reception)
-
-    def report(self) -> dict[str, object]:
-        """Counters, for the run's summary."""
-        return reception_report(self._reception)
 
 
 def rejected_of(reception: Any) -> dict[Rejection, int]:

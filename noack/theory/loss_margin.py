@@ -30,7 +30,7 @@ from noack.theory.joint_spectral_radius import (
 from noack.theory.mean_square_growth import RandomGrowth, mean_square_growth, sure_growth
 from noack.theory.switched_system import Edge
 from noack.theory.time_triggered_loop import LoopTimes, TimeTriggeredLoop
-from noack.trigger.trigger_condition import NEVER_NS
+from noack.trigger.trigger_rule import NEVER_NS
 
 _MOST_SLOTS = 100
 _MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12

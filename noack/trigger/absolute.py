@@ -9,8 +9,7 @@ from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
-from noack.trigger.trigger_condition import error_form
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import TriggerRule, error_form
 
 
 class AbsoluteSettings(WeightedSettings):

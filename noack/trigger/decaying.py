@@ -13,8 +13,7 @@ from typing import Literal, Self
 from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
-from noack.trigger.trigger_condition import error_form
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import TriggerRule, error_form
 
 _LEAST_BETA = 1e-300
 

@@ -17,8 +17,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
-from noack.trigger.trigger_condition import DynamicVariable, QuadraticForm, quadratic_form
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import DynamicVariable, QuadraticForm, TriggerRule, quadratic_form
 
 
 class DynamicSettings(LyapunovFunctionSettings):

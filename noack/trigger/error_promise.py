@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import QuadraticForm
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import QuadraticForm, TriggerRule
 
 _ROUNDING = 1.0 + 1e-9
 _RELATIVE, _RESIDUAL = 1e-7, 1e-13

@@ -17,8 +17,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
-from noack.trigger.trigger_condition import QuadraticForm, empty_map, state_map
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, empty_map, state_map
 
 
 class LyapunovSettings(LyapunovFunctionSettings):

@@ -14,8 +14,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Share, Size, WeightedSettings
-from noack.trigger.trigger_condition import QuadraticForm, error_map, state_map
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, error_map, state_map
 
 
 class MixedSettings(WeightedSettings):

@@ -5,8 +5,7 @@ from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_condition import QuadraticForm, empty_map
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, empty_map
 
 
 class PeriodicSettings(WeightedSettings):

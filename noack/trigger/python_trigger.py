@@ -14,7 +14,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.settings.user_class import ClassSettings, new_instance, read_only, user_code
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
-from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
+from noack.trigger.trigger_policy import CodedPolicy, TriggerDecision
 
 _BEYOND_EXACT = (
     'trigger.policy: needs a policy that is a rule; this scenario has "python", a class that '
@@ -74,9 +74,6 @@ class PythonTrigger:
 
     def restart(self, t_ns: int, x: Vector) -> None:
         self.start(t_ns, x)
-
-    def change(self, policy: Policy) -> None:
-        """Continue: the settings of a class do not change during a run."""
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
         """Decide whether a measurement is an event.

@@ -16,8 +16,7 @@ from noack.core.linear_systems import Matrix
 from noack.settings.matrices import Rows, require_shape
 from noack.settings.section import NonNegative
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_condition import NEVER_NS, QuadraticForm, quadratic_form
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import NEVER_NS, QuadraticForm, TriggerRule, quadratic_form
 
 
 class QuadraticSettings(WeightedSettings):

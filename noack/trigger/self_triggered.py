@@ -19,9 +19,7 @@ from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.decaying import decaying_text
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.self_triggered_interval import Forecast
-from noack.trigger.trigger_condition import QuadraticForm, empty_map
-from noack.trigger.trigger_rule import TriggerRule
+from noack.trigger.trigger_rule import Forecast, QuadraticForm, TriggerRule, empty_map
 
 
 class SelfTriggeredSettings(WeightedSettings):

@@ -1,6 +1,16 @@
-"""A policy's trigger rule, as data: from each event it makes the condition of the next one.
+"""A policy's trigger rule, as data: the form that every policy has.
 
-The live sensor and exact simulation both read this one description.
+With z = (x, e_s), the sensor transmits at the first time t after an event at which
+
+    ‖P z‖² > max(c e^{−ρ(t−t₀)}, f)² + ‖N z‖² + η(t),    η̇ = −λη + ‖P_η z‖² − ‖N_η z‖²,
+
+but not while the comparison does not count, on a grid only at its points, and when the next event
+is due in any case. A rule that integrates compares ∫‖P z‖dτ, from the last event to t, instead of
+‖P z‖.
+
+The live sensor evaluates the rule at its measurements (native/loop/trigger.c): between two of them
+it takes ‖P_η z‖² − ‖N_η z‖² as it was at the first, and integrates ‖P z‖ by the trapezoidal rule.
+Exact simulation finds the first t (native/exact/).
 """
 
 import math
@@ -8,21 +18,51 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.ordered_arithmetic import product
-from noack.trigger.self_triggered_interval import Forecast, interval_ns
-from noack.trigger.trigger_condition import (
-    NEVER_NS,
-    DynamicVariable,
-    QuadraticForm,
-    TriggerCondition,
-)
+from noack.core.linear_systems import Matrix
+
+NEVER_NS = math.inf
+
+
+class QuadraticForm(NamedTuple):
+    """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
+
+    up: Matrix
+    """P, shape (p, 2n)."""
+    down: Matrix
+    """N, shape (q, 2n); q = 0 for none."""
+
+
+class DynamicVariable(NamedTuple):
+    """Girard's dynamic variable: η̇ = −λη + ψ(z)."""
+
+    decay_per_s: float
+    """λ."""
+    gain: QuadraticForm
+    """ψ."""
+
+
+class Forecast(NamedTuple):
+    """The assumed growth of the sensor's error, and its threshold (:mod:`.self_triggered`)."""
+
+    beta: float
+    """β > 0."""
+    alpha_per_s: float
+    """α > 0."""
+    floor: float
+    """ε ≥ 0."""
+    growth_per_s: float
+    """L ≥ 0."""
+    mismatch_per_s: float
+    """a ≥ 0."""
+    disturbance_per_s: float
+    """b ≥ 0."""
 
 
 class TriggerRule(NamedTuple):
-    """How each event sets the condition of the next one; names as in ``TriggerCondition``."""
+    """How each event sets the comparison that decides about the next one."""
 
     form: QuadraticForm
+    """P and N."""
     level: float = 0.0
     """c ≥ 0; it decays from t₀ = 0 on."""
     rate_per_s: float = 0.0
@@ -32,8 +72,10 @@ class TriggerRule(NamedTuple):
     from_event: bool = False
     """Instead, t₀ is the event's time, and c is ‖P z‖ just after it."""
     grid_ns: float = 0.0
+    """Period of the times at which the comparison counts, from t = 0 on; 0: it always counts."""
     dynamic_variable: DynamicVariable | None = None
     integrates: bool = False
+    """Whether ∫‖P z‖dτ since the last event is compared; then N is empty, and there is no η."""
     idle_ns: float = -math.inf
     """The comparison does not count before this time after an event."""
     longest_ns: float = NEVER_NS
@@ -49,20 +91,29 @@ class TriggerRule(NamedTuple):
         """α of a threshold that decays from the run's start on; 0 for other thresholds."""
         return 0.0 if self.from_event else self.rate_per_s
 
-    def after(self, t_ns: float, x: Vector) -> TriggerCondition:
-        """The condition after an event at a state x, (n,), or from the start on."""
-        level, since_ns, due_ns = self.level, 0.0, self.longest_ns
-        if self.from_event:
-            # The same bits as the compared norm, so that the event itself does not exceed it.
-            z = np.concatenate([x, np.zeros_like(x)])
-            level, since_ns = norm(product(self.form.up, z)), t_ns
-        if self.forecast is not None:
-            size = norm(x if self.weight is None else product(self.weight, x))
-            due_ns = interval_ns(
-                self.forecast, size, t_ns * 1e-9, self.shortest_ns, self.longest_ns
-            )
-        return TriggerCondition(
-            self.form, level, self.rate_per_s, since_ns, self.floor,
-            t_ns + self.idle_ns, t_ns + due_ns, self.grid_ns, self.dynamic_variable,
-            self.integrates,
-        )  # fmt: skip
+
+def error_map(n: int, weight: Matrix | None = None) -> Matrix:
+    """[0 W], which takes z to W e_s, shape (n, 2n)."""
+    return np.hstack([np.zeros((n, n)), np.eye(n) if weight is None else weight])
+
+
+def error_form(n: int, weight: Matrix | None = None) -> QuadraticForm:
+    """‖W e_s‖²."""
+    return QuadraticForm(error_map(n, weight), empty_map(n))
+
+
+def state_map(n: int, weight: Matrix | None = None) -> Matrix:
+    """[W 0], which takes z to W x, shape (n, 2n)."""
+    return np.hstack([np.eye(n) if weight is None else weight, np.zeros((n, n))])
+
+
+def empty_map(n: int) -> Matrix:
+    """No rows: the N of a form without one."""
+    return np.zeros((0, 2 * n))
+
+
+def quadratic_form(Q: Matrix) -> QuadraticForm:
+    """The form zᵀQz of a symmetric matrix, (2n, 2n), as the difference of two squares."""
+    values, vectors = np.linalg.eigh(Q)
+    rows = np.sqrt(np.abs(values))[:, None] * vectors.T
+    return QuadraticForm(rows[values > 0], rows[values < 0])

@@ -11,11 +11,12 @@ import pytest
 from benchmarks._report import MeasurementError
 from benchmarks._two_hosts import two_hosts
 from noack.protocol.topology import LOOP_ROLES
-from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
+from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target
 from tests.attacks.sender import PEER, STRANGER
+from tests.wire_decoder import Decoder
 
 PER_PORT = 3_000
 RATE_HZ = 4000.0

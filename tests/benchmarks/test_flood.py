@@ -18,8 +18,9 @@ from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.wire_format import Decoder, Flow, Rejection
+from noack.protocol.wire_format import Flow, Rejection
 from tests.cosim.record.changed_records import changed, copied
+from tests.wire_decoder import Decoder
 
 PERIOD_NS = 2_000_000
 

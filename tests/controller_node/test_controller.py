@@ -12,7 +12,7 @@ from controller_node.controller import Controller, controller_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.core.ordered_arithmetic import product
+from noack.core.linear_systems import product
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,

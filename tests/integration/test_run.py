@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
-from cosim.record.align import align_tables, identity_residual
+from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
@@ -22,6 +22,7 @@ from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import Fate, tables
 from noack.protocol.wire_format import read_header
 from tests.cosim.output.viewer.test_viewer import read, series
+from tests.cosim.record.changed_records import identity_residual
 from tests.integration.conftest import Finished, run_scenario, settings
 from tests.oracles.link import Datagram, update_link_of
 

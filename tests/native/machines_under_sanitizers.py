@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from noack.core.core_library import LIBRARY, core, load_core
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from tests.noack.machines.any_machines import (
     MS,
     Sizes,
@@ -22,6 +22,7 @@ from tests.noack.machines.any_machines import (
     sizes,
     text_of,
 )
+from tests.wire_decoder import NO_VECTOR
 
 TIMES_NS, NUMBERS = 2**62, 2**63
 """Times and numbers of messages are less."""

@@ -65,7 +65,9 @@ def test_any_datagrams_are_read_clean() -> None:
 
 def test_simulations_and_replays_run_clean() -> None:
     run_tests("tests/netem/test_channel.py", "tests/cosim/simulation/test_event_order.py")
-    run_tests("tests/cosim/analysis/test_replay.py", "-k", "numbers or exact or bit_for_bit")
+    run_tests(
+        "tests/cosim/analysis/test_replay.py", "-k", "numbers or exact or bit_for_bit or runs_end"
+    )
     run_tests("tests/cosim/analysis/adversary/test_policies.py", "-k", "machines or early")
 
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped, link_name
 from netem.link_state import LinkState
-from noack.config.parameter_changes import ChangeSchedule, FixedMachine, ParameterChange
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
+from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
     NETEM_RELEASE,
@@ -24,6 +24,7 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
+from tests.machine_interface import Machine
 
 
 class _InFlight(NamedTuple):
@@ -208,7 +209,7 @@ def link_of(
     )  # fmt: skip
 
 
-class Duplex(FixedMachine):
+class Duplex:
     """The machine of a network with a direction from the controller.
 
     If the forward direction is a link with a schedule of changes, its settings may change.
@@ -229,8 +230,7 @@ class Duplex(FixedMachine):
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Accept a change of the forward direction; see :class:`Link`."""
         forward = self._links[0]
-        if not isinstance(forward, Link):
-            return super().announce(change, now_ns)
+        assert isinstance(forward, Link)
         return self._numbered(forward.announce(change, now_ns))
 
     def next_deadline_ns(self) -> int | None:

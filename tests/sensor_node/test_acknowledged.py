@@ -10,11 +10,12 @@ from noack.core.linear_systems import transition
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import tables
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.decaying import DecayingTrigger
 from sensor_node.sensor import Sensor
 from tests.machine_parts import machine, state_of
+from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
 GRID_NS = 10 * MS

@@ -23,7 +23,7 @@ from noack.observers.observability import observer_gain, unobservable_mode
 from noack.observers.observer_settings import ObserverSettings
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
-from noack.protocol.wire_format import Flow, Message
+from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.trigger.absolute import AbsoluteTrigger
 from sensor_node.observer import Observer
 from sensor_node.sensor import Sensor, sensor_of
@@ -254,3 +254,21 @@ def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str
     assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
     assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
     assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)
+
+
+def test_a_measurement_after_the_runs_end_is_rejected(observed: dict[str, Any]) -> None:
+    """An authentic one of any time cannot keep the observer busy with the steps up to it."""
+    scenario = resolved(observed)
+    own, horizon_ns = sensor_of(scenario), scenario.timing.horizon_ns
+    wire, encoder = Wire(1, bytes(32)), Encoder(1, bytes(32))
+    reception, message = own.machines[0].machine.received, ffi.new("noack_message *")
+    values = np.zeros(reception.entries)
+    for t_ns, expected in (
+        (horizon_ns, core.NOACK_ACCEPTED), (horizon_ns + 1, core.NOACK_BAD_RANGE),
+        (10**15, core.NOACK_BAD_RANGE),
+    ):  # fmt: skip
+        datagram = encoder.encode(Message(Flow.MEASUREMENT, 1, t_ns, values))
+        found = core.noack_wire_examine(
+            wire.core, ffi.addressof(reception), 0, datagram, len(datagram), True, False, message
+        )
+        assert found == expected

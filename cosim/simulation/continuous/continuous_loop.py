@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.exact_simulation import OK, ExactSimulation
+from cosim.simulation.exact_simulation import ExactSimulation
 from noack.config.resolution import LoopMatrices, loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -104,21 +104,6 @@ class ContinuousLoop:
         W = self.trigger.weight
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
-
-    def next_event(self, state: LoopState, until_s: float) -> LoopState | None:
-        """Return the next event up to ``until_s`` of a loop just after an event, before its reset.
-
-        Raises:
-            CallerError: the loop diverges, or its events cannot be decided.
-        """
-        simulation = self.simulation(until_s, known_start=True)
-        t_s, start = np.array([state.t_s]), np.array(state[1:])
-        found = simulation.segments(self.loop.A, self.loop.B, t_s, start[None])
-        if found.statuses[0] != OK:
-            raise CallerError(f"trigger: no event after {state.t_s:g} s: the loop diverges")
-        if not found.events[0]:
-            return None
-        return LoopState(float(found.t_s[0]), *found.states[0])
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
         """Return the state at ``t_s`` ≥ ``state.t_s``, without events in between."""

@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,12 +83,7 @@ def results_of(
         ],
         "evidence": evidence,
     }
-    return _read(_rounded(document))
-
-
-def load_results(path: Path) -> Results:
-    """Read ``paper.json``."""
-    return _read(json.loads(path.read_text(encoding="utf-8")))
+    return read_results(_rounded(document))
 
 
 def dumps(results: Results) -> str:
@@ -103,7 +97,8 @@ def dumps(results: Results) -> str:
     return f'{{"tables": [\n{",".join(tables)}\n],\n"evidence": {evidence}}}\n'
 
 
-def _read(document: Mapping[str, Any]) -> Results:
+def read_results(document: Mapping[str, Any]) -> Results:
+    """Return the results in the content of ``paper.json``."""
     tables = {
         (table["table"], table["variation"]): np.array(
             [[math.inf if value is None else value for value in row] for row in table["rows"]],

@@ -231,6 +231,33 @@ def test_values_that_a_machine_refuses_are_a_difference() -> None:
     assert "sensor: replayed up to input 20" in found.gaps
 
 
+@pytest.mark.parametrize("table", [PLANT_STEP, CONTROLLER_STEP])
+def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
+    """Of a period of 10¹⁸ ns, the times of ten more steps would not fit 64 bits."""
+    rows = RECORD[table]
+    more = np.repeat(rows[-1:], 10)
+    owned = (RECORD[one]["input"] for one in RECORD.tables if OWNER[one] == OWNER[table])
+    last = max(inputs.max(initial=0) for inputs in owned)
+    more["input"], more["now_ns"] = np.arange(1, 11) + last, 2**62
+    found = replay(changed(RECORD, {table: np.concatenate([rows, more])}))
+    account = next(one for one in found.processes if one.process == OWNER[table])
+    assert account.difference is not None
+    assert account.difference.row == len(rows)
+    assert f"{OWNER[table]}: replayed up to input {last + 1}" in found.gaps
+
+
+def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
+    """The observer would make 10⁹ steps up to it."""
+    record = DAMAGED[1]
+    rows = record[SENSOR_MEASUREMENT].copy()
+    rows["t_ns"][20] = 10**18
+    found = replay(changed(record, {SENSOR_MEASUREMENT: rows}))
+    sensor = next(account for account in found.processes if account.process == "sensor")
+    assert sensor.difference is not None
+    assert "cannot take this input" in sensor.difference.what
+    assert sensor.compared == 20
+
+
 def test_an_empty_record_is_not_reported_as_exact() -> None:
     found = replay(
         changed(RECORD, {table: RECORD[table][:0] for table in RECORD.tables}, reports={})

@@ -13,9 +13,9 @@ from netem.channel import Network
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.protocol.machine_interface import Machine
 from noack.protocol.record_tables import PLANT_STEP
 from tests.cosim.simulation.shuttle import shuttled
+from tests.machine_interface import Machine
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NO_OUTAGE = "none"

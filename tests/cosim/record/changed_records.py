@@ -1,10 +1,11 @@
-"""Copies of a record that differ in some places."""
+"""Copies of a record that differ in some places, and what its parts say together."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from cosim.record.align import IdentityResidual, Reals, aligned_parts
 from cosim.record.run_record import Rows, RunRecord
 
 NO_CHANGE: Mapping[str, Rows] = {}
@@ -31,3 +32,9 @@ def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> R
     kind = rows.dtype[column]
     rows[column][row] = np.frombuffer(raw, kind.base).reshape(kind.shape)
     return changed(record, {table: rows})
+
+
+def identity_residual(record: RunRecord) -> Reals:
+    """The residual of (I1) at each measurement of a run, (k,)."""
+    residual = IdentityResidual(record.scenario)
+    return np.concatenate([residual.take(part) for part in aligned_parts(record)])

@@ -14,7 +14,7 @@ from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
-from cosim.record.align import align_tables, identity_residual
+from cosim.record.align import align_tables
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import sensor_of
-from tests.cosim.record.changed_records import changed
+from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
 
 MS = 1_000_000

@@ -20,9 +20,10 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.machine_interface import BEGINNING, Machine, Record, Start
+from noack.protocol.machine_interface import BEGINNING, Record, Start
 from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.wire_format import Flow
+from tests.machine_interface import Machine
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of
 from tests.oracles.link import Datagram, network_of
@@ -60,7 +61,7 @@ class Both:
     ) -> None:
         self.loops = loops
         self.plain: Machine[Datagram] = network_of(resolved, start, loops=self.loops)
-        self.compiled: Any = RunNetwork(resolved, start, loops)
+        self.compiled: Any = RunNetwork(resolved, start, self.loops)
         sender, sensor, plant, self._controller, *receivers = sockets
         peers = {name_of(sensor): receivers[0], name_of(self._controller): receivers[1]}
         self._other = plant if Flow.ACTUATION in resolved.network.flows else sensor

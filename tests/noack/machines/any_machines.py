@@ -12,8 +12,7 @@ from controller_node.controller import Controller
 from noack.controllers.controller_settings import ControlFailedError
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.core_library import core, ffi
-from noack.core.linear_systems import Matrix, Vector, norm
-from noack.core.ordered_arithmetic import product
+from noack.core.linear_systems import Matrix, Vector, norm, product
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -27,7 +26,7 @@ from noack.observers.luenberger import LuenbergerSettings
 from noack.plants.linear import LinearSystem
 from noack.plants.systems.plant_system import SystemFailedError
 from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
 from noack.trigger.decaying import DecayingTrigger
@@ -38,15 +37,16 @@ from noack.trigger.mixed import MixedTrigger
 from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.send_on_area import SendOnAreaTrigger
 from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
+from noack.trigger.trigger_rule import Forecast
 from plant_server.disturbance_signal import Disturbance
 from plant_server.measurement import MeasurementModel
 from plant_server.plant import Plant
 from plant_server.watchdog import NEVER_NS, Watchdog
 from sensor_node.observer import Observer
 from sensor_node.sensor import Sensor
+from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
 Rng = np.random.Generator
@@ -124,9 +124,6 @@ class UserTrigger:
     def restart(self, t_ns: int, x: Vector) -> None:
         self.calls.append("restart")
 
-    def change(self, policy: Policy) -> None:
-        """Its settings do not change."""
-
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> TriggerDecision:
         self.calls.append("test")
         left = norm(e_s)
@@ -175,7 +172,7 @@ def plant(seed: int, of: Sizes, scale: float = 1.0, period_ns: int = 10 * MS) ->
         fails_ns = int(rng.choice([300 * MS, NEVER_NS]))
         system: Any = UserSystem(A, B[:, :m], x0, np.zeros(of.internal), fails_ns)
     else:
-        system = LinearSystem(A, B, x0, step_ns=period_ns)
+        system = LinearSystem(A, B, x0)
     waves = [_waves(rng, m)] * d, [_waves(rng, n)] * w
     outputs = of.outputs or n
     C = None if outputs == n and chance(rng) else matrix(rng, 1.0, outputs, n)

@@ -29,7 +29,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     SENSOR_SETTING,
 )
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.trigger_policy import CodedPolicy
 from plant_server.disturbance_signal import BLOCK
@@ -52,6 +52,7 @@ from tests.noack.machines.any_machines import (
     sensor,
     sizes,
 )
+from tests.wire_decoder import NO_VECTOR
 
 Part = Plant | Sensor | Controller
 COUNT = 120

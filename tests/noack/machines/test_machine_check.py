@@ -28,6 +28,7 @@ PROCESS = "a process has no machines"
 PERIOD = "a machine has a phase, a horizon or a period out of range"
 NUMBERS = "a machine has numbers out of range"
 RECEIVES = "a machine receives vectors of more than 64 entries"
+MESSAGE_TIMES = "a machine receives messages of a time out of range"
 MODEL = "a model has no matrices of its size"
 PLACES = "a model's number of kept matrices is not a power of 2, from 4 on"
 POINTS = "a model has no set points"
@@ -64,6 +65,10 @@ WRONG: dict[str, list[tuple[str, Any, str]]] = {
         ("machine.step", 2**60 // (10 * MS) + 1, NUMBERS),
         ("machine.received.entries", -1, RECEIVES), ("machine.received.entries", 65, RECEIVES),
         ("machine.acknowledgements.entries", 1, RECEIVES),
+        *[(f"machine.{name}.not_after_ns", value, MESSAGE_TIMES)
+          for name in ("received", "acknowledgements") for value in (-1, 2**62)],
+        *[("heap_count", value, "a process has more loops with a tick than it has loops")
+          for value in (-1, 2)],
         ("machine.period_ns", 0, "a plant has no period"),
         ("input_period_ns", 0, "a plant has no period"),
         *[(name, value, "a plant has no measurement")

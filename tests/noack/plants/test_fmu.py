@@ -21,7 +21,7 @@ from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.named_file import located
-from tests.noack.plants.motion import H_NS, motion
+from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 
 pytest.importorskip("fmpy")
@@ -88,7 +88,7 @@ def test_x_and_u_are_deviations_from_the_operating_point(version: int, tmp_path:
     still = FmuSystem(loaded, np.zeros(2))
     np.testing.assert_allclose(motion(still, [0.0] * 100), np.zeros((101, 2)), atol=1e-12)
     moved = FmuSystem(loaded, X0)
-    linear = LinearSystem(np.array([[0, 1], [-3.0, -1]]), np.array([[0.0], [1]]), X0, step_ns=H_NS)
+    linear = LinearSystem(np.array([[0, 1], [-3.0, -1]]), np.array([[0.0], [1]]), X0)
     np.testing.assert_allclose(motion(moved, INPUTS), motion(linear, INPUTS), atol=1e-11)
 
 

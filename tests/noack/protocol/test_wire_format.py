@@ -16,7 +16,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from noack.protocol.wire_format import (
-    Decoder,
     Encoder,
     Flow,
     Header,
@@ -25,6 +24,7 @@ from noack.protocol.wire_format import (
     loop_number,
     read_header,
 )
+from tests.wire_decoder import Decoder
 
 PAGE = (Path(__file__).parents[3] / "docs" / "wire.md").read_text(encoding="utf-8")
 FLOWS = {"measurement": 1, "update": 2, "actuation": 3, "acknowledgement": 4}

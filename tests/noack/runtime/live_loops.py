@@ -59,8 +59,8 @@ class Rows:
 
 
 def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
-    """Return the resolved scenario with other sections."""
-    return resolve(validate(content | changes, "here"))
+    """Return the resolved scenario of 5 s with other sections."""
+    return resolve(validate(content | {"horizon_s": 5.0} | changes, "here"))
 
 
 class Live:

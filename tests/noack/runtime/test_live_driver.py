@@ -28,9 +28,10 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.wire_format import NO_VECTOR, Flow, Message
+from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
 from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
+from tests.wire_decoder import NO_VECTOR
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 NOW = "now_ns"

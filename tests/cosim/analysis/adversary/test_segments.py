@@ -15,6 +15,7 @@ from cosim.simulation.continuous.continuous_loop import LoopState
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LossAutomaton
 from tests.cosim.analysis.adversary.scenarios import flow_of, scenarios, simulate
+from tests.cosim.simulation.continuous.next_event import next_event
 
 STATES = 10
 POINTS = 4001
@@ -32,7 +33,7 @@ def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
     found = flow(t_s, z)
     for i in range(STATES):
         start = LoopState(t_s[i], *np.split(z[i], 3))
-        expected = system.next_event(start, resolved.horizon_s)
+        expected = next_event(system, start, resolved.horizon_s)
         assert found.is_event[i] == (expected is not None)
         if expected is not None:
             assert found.end_s[i] == pytest.approx(expected.t_s, rel=1e-9)

@@ -19,10 +19,10 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.scenario import Scenario
-from noack.protocol.machine_interface import Machine
 from noack.theory.run_conditions import allowed_conditions
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.simulation.shuttle import shuttled
+from tests.machine_interface import Machine
 
 MS = 1_000_000
 PPB = 10**9

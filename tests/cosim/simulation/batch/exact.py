@@ -32,6 +32,7 @@ from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import QuadraticForm
 from tests.oracles.link import UPDATE_LINK, Link
 
 LOSSES = (
@@ -126,40 +127,47 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
     rule, G = setting.trigger.trigger_rule(n), run.system.generator
     eta = setting.trigger.initial_dynamic_variable
     checked = 0
+    dynamic = rule.dynamic_variable
     for state, begin_s, end_s in pieces(run):
-        after = rule.after(begin_s * 1e9, state.x)
+        level, since_s = rule.level, 0.0
+        if rule.from_event:
+            level, since_s = float(np.linalg.norm(rule.form.up[:, :n] @ state.x)), begin_s
 
-        def flow(t_s: float, y: Vector, after: Any = after) -> Vector:
-            rate = float(after.auxiliary_rates(y[None, : 2 * n])[0])
-            if after.dynamic_variable is not None:
-                rate -= after.dynamic_variable.decay_per_s * y[-1]
+        def flow(t_s: float, y: Vector) -> Vector:
+            rate = float(np.linalg.norm(rule.form.up @ y[: 2 * n])) if rule.integrates else 0.0
+            if dynamic is not None:
+                rate = value_of(dynamic.gain, y[: 2 * n]) - dynamic.decay_per_s * y[-1]
             return np.append(G @ y[:-1], rate)
 
-        def excess(t_s: float, y: Vector, after: Any = after) -> float:
-            level, square = (
-                after.threshold(t_s * 1e9),
-                float(after.form.values(y[None, : 2 * n])[0]),
-            )
-            if after.integrates:
-                return float(y[-1]) - level
-            used = float(y[-1]) if after.dynamic_variable is not None else 0.0
-            return square - used - level * level
+        def excess(t_s: float, y: Vector, level: float = level, since_s: float = since_s) -> float:
+            right = max(level * math.exp(-rule.rate_per_s * (t_s - since_s)), rule.floor)
+            if rule.integrates:
+                return float(y[-1]) - right
+            used = 0.0 if dynamic is None else float(y[-1])
+            return value_of(rule.form, y[: 2 * n]) - used - right * right
 
-        start = np.concatenate([*state[1:], [0.0 if after.integrates else eta]])
+        start = np.concatenate([*state[1:], [0.0 if rule.integrates else eta]])
         solved = solve_ivp(
             flow, (begin_s, end_s), start, "DOP853", rtol=1e-11, atol=1e-14, dense_output=True
         )
-        from_s = max(begin_s, after.earliest_ns * 1e-9)
-        if len(after.form.up) and not after.grid_ns and from_s < end_s - 1e-6:
+        from_s = begin_s + max(rule.idle_ns * 1e-9, 0.0)
+        if len(rule.form.up) and not rule.grid_ns and from_s < end_s - 1e-6:
             inside = np.linspace(from_s, end_s, 203)[1:-1]
             largest = max(excess(t_s, solved.sol(t_s)) for t_s in inside[inside < end_s - 1e-7])
             assert largest <= 1e-8
             checked += 1
         eta = float(solved.y[-1, -1])
-        is_event, due = end_s in run.event_s, abs(end_s - after.latest_ns * 1e-9) < 1e-9
-        if is_event and not due and not after.grid_ns and end_s > from_s + 1e-9:
+        compares = len(rule.form.up) > 0 and not rule.grid_ns
+        due = abs(end_s - begin_s - rule.longest_ns * 1e-9) < 1e-9
+        if compares and end_s in run.event_s and not due and end_s > from_s + 1e-9:
             assert abs(excess(end_s, solved.y[:, -1])) <= 1e-7
     return checked
+
+
+def value_of(form: QuadraticForm, z: Vector) -> float:
+    """‖P z‖² − ‖N z‖²."""
+    up, down = form.up @ z, form.down @ z
+    return float(up @ up - down @ down)
 
 
 def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:

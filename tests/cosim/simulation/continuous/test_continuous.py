@@ -23,6 +23,7 @@ from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
+from tests.cosim.simulation.continuous.next_event import next_event
 
 
 def loop_with(
@@ -274,7 +275,7 @@ def scalar_system(trigger: DecayingTrigger) -> ContinuousLoop:
 
 
 def next_event_s(system: ContinuousLoop, state: LoopState, until_s: float) -> float | None:
-    found = system.next_event(state, until_s)
+    found = next_event(system, state, until_s)
     return None if found is None else found.t_s
 
 

@@ -1,5 +1,6 @@
 """The counterexamples, each against a closed form or an independent computation."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from scipy.linalg import expm
 from cosim.studies.paper.draw_measures import resolved_draw
 from cosim.studies.paper.paper_campaign import BASE, load_campaign
 from cosim.studies.paper.paper_evidence import Numbers, evidence
-from cosim.studies.paper.paper_results import load_results, results_of
+from cosim.studies.paper.paper_results import read_results, results_of
 from noack.config.named_models import lane_following
 from noack.config.resolution import loop_of
 
@@ -22,11 +23,14 @@ SCENARIO = load_campaign()[1][BASE]
 
 @pytest.fixture(scope="module")
 def computed() -> Numbers:
-    return evidence(SCENARIO, load_results(COMMITTED).representative)
+    return evidence(SCENARIO, read_results(json.loads(COMMITTED.read_bytes())).representative)
 
 
 def test_the_committed_evidence_is_what_the_code_computes(computed: Numbers) -> None:
-    assert_close(results_of([], computed).evidence, load_results(COMMITTED).evidence)
+    assert_close(
+        results_of([], computed).evidence,
+        read_results(json.loads(COMMITTED.read_bytes())).evidence,
+    )
 
 
 def assert_close(first: Any, second: Any) -> None:

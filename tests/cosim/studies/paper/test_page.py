@@ -22,9 +22,9 @@ from cosim.studies.paper.paper_results import (
     REPRESENTED,
     Results,
     dumps,
-    load_results,
     number,
     percent,
+    read_results,
     spread,
 )
 from noack.config.scenario import Scenario
@@ -38,7 +38,7 @@ DRAWS = 4
 
 @pytest.fixture(scope="module")
 def results() -> Results:
-    return load_results(COMMITTED)
+    return read_results(json.loads(COMMITTED.read_bytes()))
 
 
 def test_the_page_is_the_template_with_the_committed_numbers(results: Results) -> None:
@@ -79,7 +79,7 @@ def test_the_command_computes_the_committed_draws_and_writes_the_page(
     text = console.export_text()
     assert f"Section V over {DRAWS} draws" in text
     assert all(claim["gist"] in text and claim["verdict"] in text for claim in report["claims"])
-    written = load_results(tmp_path / "figures" / "paper.json")
+    written = read_results(json.loads((tmp_path / "figures" / "paper.json").read_bytes()))
     assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
     for key, rows in results.tables.items():
         found = written.tables[key]
