@@ -45,7 +45,7 @@ int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns) {
 }
 
 int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
-    double fastest = 1.0 + (double)clock->slew_ppb / PPB, speed = clock->speed * fastest;
+    double fastest = 1.0 + (double)clock->slew_ppb / (double)PPB, speed = clock->speed * fastest;
     if (speed == 1.0 || simulated_ns <= 0)
         return simulated_ns;
     return whole_ns((double)simulated_ns / speed);

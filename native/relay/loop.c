@@ -301,8 +301,8 @@ static int64_t decide_batch(noack_relay *relay) {
 static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
     return relay->heap_length > 0
            && (double)(relay->heap[0].release_ns - relay->read_ns)
-                  < HOUSEKEEPING_NS * relay->clock.speed
-           && (double)(relay->read_ns - until_ns) < MOST_PUT_OFF_NS * relay->clock.speed;
+                  < (double)HOUSEKEEPING_NS * relay->clock.speed
+           && (double)(relay->read_ns - until_ns) < (double)MOST_PUT_OFF_NS * relay->clock.speed;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
@@ -403,7 +403,8 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
                     own->ready_count = own->ready_next = 0;
                     return NOACK_HOUSEKEEPING;
                 }
-                wait_until_ns = relay->read_ns + (int64_t)(HOUSEKEEPING_NS * relay->clock.speed);
+                wait_until_ns =
+                    relay->read_ns + (int64_t)((double)HOUSEKEEPING_NS * relay->clock.speed);
             }
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
