@@ -150,7 +150,7 @@ def test_datagrams_before_the_peer_sockets_are_read_first(content: dict[str, Any
         enlarge_buffer(live.endpoint, 256 * 1024 * 1024)
         live.send(*(measurement(number, [1.0, 0.0]) for number in range(early)))
 
-    with closing(Live("sensor", [scenario(content)], early=before)) as live:
+    with closing(Live("sensor", [scenario(content, horizon_s=10.0)], early=before)) as live:
         live.send(measurement(early, [1.0, 0.0]))
         live.channel.tend(0, live.rows)
         assert live.driver.accepted == early
