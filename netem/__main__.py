@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from noack.runtime.signals import stoppable_imports
 
 with stoppable_imports():
-    from netem.engine.run_network import RunNetwork
-    from netem.run_relay import NetworkChannel
+    from netem.run_network import NetworkChannel, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.topology import ENDS
     from noack.runtime.command_line import Parser, failed
@@ -33,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         options, more = joining.parse_known_args(given)
         if not more:
             return join_run("netem", run_network, options)
-        from netem.cli.relay_run import alone
+        from netem.stand_alone import alone
 
         return alone(given)
     except NoackError as error:

@@ -1,6 +1,6 @@
 """The network of a run as a machine without sockets: native/channel.c decides, this configures it.
 
-Simulation and replay drive it. The relay of a live run (:mod:`netem.engine.run_network`) decides
+Simulation and replay drive it. The relay of a live run (:mod:`netem.run_network`) decides
 alike. The flows 0 to N − 1 of a run with N loops come from the sensors, the next N from the
 controllers, if acknowledgements or actuations cross the network. The two directions are
 independent: each has its own settings, random streams and guarantee. Payloads are not interpreted.

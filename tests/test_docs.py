@@ -15,7 +15,7 @@ from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
-from netem.words.words_to_settings import KEYWORDS
+from netem.tc_words import KEYWORDS
 from noack.config.feature_kinds import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

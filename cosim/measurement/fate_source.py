@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from netem.fates.fate_replay import opened_fates
+from netem.fates import opened_fates
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import Fate
 from noack.traces.packet_trace import (

@@ -25,7 +25,7 @@ from cosim.analysis.summary_model import (
 )
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.core.number_format import NONE, duration, number, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]

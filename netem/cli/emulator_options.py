@@ -6,9 +6,9 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-from netem.engine.relay_interface import LinkSpec
-from netem.words.links_file import load_links
-from netem.words.words_to_settings import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
+from netem.relay_links import LinkSpec
+from netem.tc_words import load_links
+from netem.tc_words import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.impairments.quantities import OWN_TIME_S

@@ -1,33 +1,165 @@
-"""Live control of a relay over zenoh, in a thread of its own.
+"""Commands of other threads, which the relay's thread runs between two batches of datagrams.
 
-A running emulator listens on a Unix socket that only its user can reach. Below ``netem/NAME`` it
-answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
-docs/netem-control.md describes. A query with a mistake is answered with one line, and changes
-nothing.
+The packet path never waits: statistics, live control and the live screen have their own threads,
+and each command takes microseconds.
 """
 
 import json
+import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future
 from contextlib import ExitStack
-from typing import Any, Literal, Self
+from dataclasses import dataclass, replace
+from functools import cached_property
+from queue import SimpleQueue
+from threading import Lock
+from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.command_queue import CommandQueue
 from netem.control.emulator_session import EMULATORS, published
-from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_thread import StatisticsThread
-from netem.engine.relay_interface import DIRECTIONS, Direction
-from netem.words.words_to_settings import settings_of, text_of
+from netem.control.emulator_statistics import Statistics, StatisticsThread
+from netem.relay import Relay
+from netem.relay_links import DIRECTIONS, Direction, LinkReport
+from netem.tc_words import settings_of, text_of
 from noack.config.validation_messages import brief
-from noack.core.errors import CallerError, MachineError, NoackError
-from noack.impairments.kept_loss import with_kept_loss
+from noack.core.errors import CallerError, MachineError, NoackError, PeerError
+from noack.impairments.kept_loss import expected_loss, with_kept_loss
+from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.zenoh_session import cause_of, open_session
+
+T = TypeVar("T")
+
+_PATIENCE_S = 5.0
+
+
+@dataclass(frozen=True)
+class AppliedSettings:
+    """The settings of a direction, and its counters when they were applied."""
+
+    settings: LinkSettings
+    since: Counters
+
+    @cached_property
+    def words(self) -> str:
+        """The settings in the words of ``tc netem``."""
+        return text_of(self.settings)
+
+    @cached_property
+    def predicted_loss(self) -> float | None:
+        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
+        return expected_loss(self.settings).rate
+
+
+class Snapshot(NamedTuple):
+    """The state of a relay at one time."""
+
+    links: Sequence[LinkReport]
+    in_force: Mapping[tuple[str, Direction], AppliedSettings]
+    elapsed_ns: int
+    """Time since the relay started."""
+    unix_ns: int
+
+
+class CommandQueue:
+    """Runs commands of other threads in the relay's thread."""
+
+    def __init__(self, relay: Relay) -> None:
+        self._relay = relay
+        self._began_ns = time.monotonic_ns()
+        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
+        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
+            (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
+            for spec in relay.specs
+            for direction in DIRECTIONS
+        }
+        self._closed = False
+        self._lock = Lock()
+
+    @property
+    def links(self) -> Sequence[str]:
+        """Names of the relay's links."""
+        return [spec.name for spec in self._relay.specs]
+
+    def run_pending(self) -> None:
+        """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
+        for _ in range(self._waiting.qsize()):
+            future, command = self._waiting.get_nowait()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(command())
+            except Exception as error:
+                future.set_exception(error)
+
+    def close(self) -> None:
+        """Refuse further commands; called in the relay's thread when the relay ends."""
+        with self._lock:
+            self._closed = True
+        while not self._waiting.empty():
+            self._waiting.get_nowait()[0].cancel()
+
+    def submit(self, command: Callable[[], T]) -> T:
+        """Run a command in the relay's thread, from another thread, and return its result.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        future: Future[T] = Future()
+        with self._lock:
+            if self._closed:
+                raise PeerError("the emulator has ended")
+            self._waiting.put((future, command))
+        try:
+            return future.result(_PATIENCE_S)
+        except CancelledError:
+            raise PeerError("the emulator has ended") from None
+        except TimeoutError:
+            if future.done():  # the command itself raised it
+                raise
+            future.cancel()
+            raise PeerError(f"the emulator has not answered for {_PATIENCE_S:g} s") from None
+
+    def snapshot(self) -> Snapshot:
+        """Return the state of the relay, from another thread.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        return self.submit(self.look)
+
+    def look(self) -> Snapshot:
+        """Return the state of the relay, in its thread or after its end."""
+        return Snapshot(
+            self._relay.report(),
+            dict(self._in_force),
+            time.monotonic_ns() - self._began_ns,
+            time.time_ns(),
+        )
+
+    def change(self, link: str, directions: Sequence[Direction], settings: LinkSettings) -> None:
+        """Change directions of a link, from another thread.
+
+        Raises:
+            CallerError: the relay refuses the settings.
+            PeerError: the relay has ended, or does not answer.
+        """
+
+        def command() -> None:
+            for direction in directions:
+                self._relay.change(link, direction, settings)
+            (report,) = (one for one in self._relay.report() if one.name == link)
+            for direction in directions:
+                counters = replace(getattr(report, direction).counters)
+                self._in_force[link, direction] = AppliedSettings(settings, counters)
+
+        self.submit(command)
+
 
 _PUBLISH_S = 1.0
 _QUERIES = 64

@@ -1,26 +1,89 @@
-"""Commands for a running emulator: ``noack netem show``, ``set`` and ``watch``."""
+"""Client of live control: sends queries to a running emulator, and receives its statistics."""
 
 import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, cast
 
+import zenoh
 from rich.console import Console
+from zenoh.handlers import RingChannel
 
-from netem.control.control_client import Client
-from netem.control.emulator_session import find, running
-from netem.control.live_screen import Screen
-from netem.control.statistics_view import History, render
-from netem.engine.relay_interface import DIRECTIONS
-from netem.words.words_to_settings import guarantee_words, require_no_dashes, settings_of
-from noack.core.errors import CallerError, ExitStatus, NoackError
+from netem.control.emulator_session import EMULATORS, find, running
+from netem.control.emulator_statistics import Statistics
+from netem.control.statistics_view import History, Screen, render
+from netem.relay_links import DIRECTIONS
+from netem.tc_words import guarantee_words, require_no_dashes, settings_of
+from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.signals import Signals
+from noack.runtime.zenoh_session import answer_to, cause_of, open_session
+
+_ANSWER_S = 30.0
+_SILENCE_S = 3.0
+_POLL_S = 0.02
+
+
+class Client:
+    """A connection to the running emulator of this name.
+
+    Raises:
+        PeerError: the emulator does not accept the connection.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        try:
+            self._session = open_session(EMULATORS, name, listen=False)
+        except zenoh.ZError as error:
+            raise PeerError(f"emulator {name!r} cannot be reached: {cause_of(error)}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def ask(self, what: str, **content: Any) -> Any:
+        """Send the query ``report``, ``settings`` or ``change``, and return the answer.
+
+        Raises:
+            CallerError: the query has a mistake.
+            PeerError: there is no answer.
+        """
+        key = f"netem/{self._name}/{what}"
+        answer = answer_to(self._session, key, json.dumps(content), _ANSWER_S)
+        if answer is not None:
+            return json.loads(answer)
+        raise PeerError(f"emulator {self._name!r} does not answer")
+
+    def follow(self, stop: Callable[[], bool]) -> Iterator[Statistics]:
+        """Yield the statistics that the emulator publishes, until ``stop()``.
+
+        Raises:
+            PeerError: the emulator has ended.
+        """
+        key = f"netem/{self._name}/statistics"
+        with self._session.declare_subscriber(key, RingChannel(2)) as subscriber:
+            received_s = time.monotonic()
+            while not stop():
+                sample = subscriber.try_recv()
+                if sample is not None:
+                    received_s = time.monotonic()
+                    yield cast(Statistics, json.loads(sample.payload.to_string()))
+                elif time.monotonic() < received_s + _SILENCE_S:
+                    time.sleep(_POLL_S)
+                elif self._name not in running():
+                    raise PeerError(f"emulator {self._name!r} has ended")
+                else:
+                    received_s = time.monotonic()
+
 
 _NAME_HELP = "the emulator's --control NAME; optional if only one runs"
 

@@ -1,14 +1,21 @@
-"""An emulator's statistics as a full-screen view in the terminal, and as lines of text.
+"""Numbers with units, and small charts of block characters, as the terminal shows them."""
 
-Each link has a panel with its two directions side by side. If the terminal has no room for all
-panels, a table has one row per direction.
-"""
-
+import contextlib
+import io
+import json
+import os
+import select
+import sys
+import termios
 import textwrap
+import tty
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from typing import Self
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
@@ -20,17 +27,70 @@ from netem.control.emulator_statistics import (
     RecentRates,
     Statistics,
 )
-from netem.control.number_texts import (
-    NONE,
-    bar,
-    bits_text,
-    elapsed_text,
-    percent_text,
-    rate_text,
-    sparkline,
-    time_text,
-)
-from netem.engine.relay_interface import DIRECTIONS, Direction
+from netem.relay_links import DIRECTIONS, Direction
+
+_BLOCKS = "▁▂▃▄▅▆▇█"
+NONE = "–"
+
+
+def rate_text(per_s: float) -> str:
+    """Datagrams per second."""
+    return f"{per_s:,.0f}/s" if per_s >= 10 or per_s == 0 else f"{per_s:.2g}/s"
+
+
+def bits_text(bits_per_s: float) -> str:
+    """Bits per second, with three digits."""
+    return _with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
+
+
+def time_text(t_ns: float | None) -> str:
+    """A duration, with three digits."""
+    return NONE if t_ns is None else _with_unit(t_ns, ("s", "ms", "µs", "ns"))
+
+
+def percent_text(share: float | None) -> str:
+    """A share in percent, to 0.01 % below 10 %."""
+    if share is None:
+        return NONE
+    percent = 100 * share
+    if percent == 0 or percent >= 99.995:
+        return f"{percent:.0f} %"
+    if percent < 0.0995:
+        return f"{percent:.2g} %"
+    return f"{percent:.1f} %" if percent >= 9.995 else f"{percent:.2f} %"
+
+
+def elapsed_text(elapsed_s: float) -> str:
+    """Hours, minutes and seconds."""
+    minutes, seconds = divmod(int(elapsed_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def sparkline(values: Sequence[float | None], top: float) -> str:
+    """Return one block per value: full height at ``top``, a blank for None."""
+    last = len(_BLOCKS) - 1
+    return "".join(
+        " " if value is None else _BLOCKS[min(max(round(value / (top or 1.0) * last), 0), last)]
+        for value in values
+    )
+
+
+def bar(share: float, width: int) -> tuple[str, str]:
+    """Return the filled part and the rest of a bar of ``width`` characters."""
+    filled = round(min(max(share, 0.0), 1.0) * width)
+    return "━" * filled, "─" * (width - filled)
+
+
+def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
+    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
+    for unit, size in zip(units, (1e9, 1e6, 1e3), strict=False):
+        if value >= 0.9995 * size:
+            part = value / size
+            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
+            return f"{part:.{digits}f} {unit}"
+    return f"{value:.0f} {units[-1]}"
+
 
 _SPAN_S = 60.0
 _ARROWS = {"forward": "forward →", "reverse": "← reverse"}
@@ -320,3 +380,93 @@ def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     ]  # fmt: skip
     parts += [f"UNINTENDED {n:,} {cause}" for cause, n in of["unintended"].items() if n]
     return "  ".join(parts)
+
+
+_MESSAGES_SHOWN = 3
+
+
+class Screen:
+    """Shows statistics within the context; the last picture remains afterwards.
+
+    Messages on standard error are shown below the picture, and written at the end. With ``as_json``
+    it prints each document as a line of JSON instead.
+    """
+
+    def __init__(self, title: str, *, as_json: bool = False) -> None:
+        self._title = title
+        self._as_json = as_json
+        self._console = Console()
+        self._history = History()
+        self._live: Live | None = None
+        self._size = self._console.size
+        self._messages = io.StringIO()
+        self._keys = False
+        self._stack = ExitStack()
+        self.quit_requested = False
+        """Whether the user has pressed q."""
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal and not self._console.is_dumb_terminal and not self._as_json:
+            live = Live(
+                console=self._console, screen=True, auto_refresh=False,
+                redirect_stdout=False, redirect_stderr=False,
+            )  # fmt: skip
+            with ExitStack() as stack:
+                stack.callback(self._leave)
+                stack.enter_context(contextlib.redirect_stderr(self._messages))
+                self._keys = stack.enter_context(_single_keys())
+                self._live = stack.enter_context(live)
+                self._stack = stack.pop_all()
+            self._draw()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def show(self, statistics: Statistics) -> None:
+        """Show new statistics."""
+        if self._as_json:
+            print(json.dumps(statistics), flush=True)
+        elif self._live is None:
+            print("\n".join(plain_lines(statistics)), flush=True)
+        else:
+            self._history.add(statistics)
+            self._draw()
+
+    def poll(self) -> None:
+        """Read the keyboard, and draw again if the terminal's size has changed."""
+        while self._keys and select.select([sys.stdin], (), (), 0)[0]:
+            keys = os.read(sys.stdin.fileno(), 64)
+            self._keys = bool(keys)
+            self.quit_requested |= b"q" in keys.lower()
+        if self._live is not None and self._console.size != self._size:
+            self._size = self._console.size
+            self._draw()
+
+    def _draw(self) -> None:
+        assert self._live is not None
+        messages = self._messages.getvalue().splitlines()[-_MESSAGES_SHOWN:]
+        height = self._console.height - len(messages) - 1
+        picture = render(self._history, self._title, self._console.width, height)
+        below = [Text(f" {message}", "yellow", no_wrap=True) for message in messages]
+        help_line = Text(" q ends" if self._keys else " Ctrl-C ends", "dim")
+        self._live.update(Group(picture, *below, help_line), refresh=True)
+
+    def _leave(self) -> None:
+        if self._history.latest is not None:
+            self._console.print(render(self._history, self._title, self._console.width, None))
+        print(self._messages.getvalue(), end="", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _single_keys() -> Iterator[bool]:
+    """Read keys at once and without echo; yield whether there is a keyboard."""
+    if not sys.stdin.isatty():
+        yield False
+        return
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield True
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

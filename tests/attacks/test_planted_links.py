@@ -21,9 +21,9 @@ from cosim.measurement.live.probe_rows import ProbeRows
 from cosim.output.viewer.recording_file import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, finished_run
 from cosim.record.run_ending import EndingFile
-from netem.capture.capture_writer import CaptureWriter
-from netem.engine.relay_interface import LinkSpec
-from netem.fates.fate_recorder import FateRecorder
+from netem.capture import CaptureWriter
+from netem.fates import FateRecorder
+from netem.relay_links import LinkSpec
 from noack.config.matrix_files import write_matrices
 from noack.core.errors import NoackError
 from noack.impairments.link_settings import LinkSettings

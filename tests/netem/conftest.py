@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from netem.link_state import LinkState
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 

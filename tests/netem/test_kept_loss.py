@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments import kept_loss
 from noack.impairments.kept_loss import (

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record

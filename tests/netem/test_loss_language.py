@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import Fate

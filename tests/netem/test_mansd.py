@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.link_state import LinkState
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.constraints import guarantee_of
 from noack.impairments.link_records import RecordedDecision

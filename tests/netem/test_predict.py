@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import predict

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from netem.engine.run_network import RunNetwork
-from netem.run_relay import NetworkChannel
+from netem.run_network import NetworkChannel, RunNetwork
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario_file import load
 from noack.core.clock import RunClock

@@ -29,7 +29,7 @@ def schema(
 
         cli.print_json(campaign_schema())
     elif netem:
-        from netem.words.links_file import json_schema as links_schema
+        from netem.tc_words import json_schema as links_schema
 
         cli.print_json(links_schema())
     else:

@@ -15,7 +15,7 @@ from cosim.cli import app
 from cosim.cli.program import examples_of
 from netem.cli import emulator_options as emulator
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
-from netem.words.words_to_settings import parse
+from netem.tc_words import parse
 from noack.core.errors import NoackError
 
 PROGRAM: Any = get_command(app)

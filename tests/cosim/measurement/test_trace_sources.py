@@ -12,7 +12,7 @@ from cosim.measurement.run_source import updates_trace
 from cosim.measurement.trace_sources import SourceOptions, read_source
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.simulation.virtual_time import simulate
-from netem.fates.fate_trace import description
+from netem.fates import description
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError

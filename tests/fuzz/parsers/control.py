@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from netem.control.control_server import ControlServer, SettingsChange
-from netem.engine.relay_interface import DIRECTIONS
+from netem.relay_links import DIRECTIONS
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, edited, vocabulary

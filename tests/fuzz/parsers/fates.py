@@ -6,10 +6,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from netem.engine.relay_interface import LinkSpec
-from netem.fates.fate_replay import read_fates
-from netem.fates.fate_trace import METADATA, SCHEMA, description
-from netem.words.words_to_settings import settings_of
+from netem.fates import METADATA, SCHEMA, description, read_fates
+from netem.relay_links import LinkSpec
+from netem.tc_words import settings_of
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited

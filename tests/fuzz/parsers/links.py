@@ -8,8 +8,7 @@ from unittest.mock import patch
 
 import tomli_w
 
-from netem.words.links_file import json_schema, load_links
-from netem.words.words_to_settings import settings_of, text_of
+from netem.tc_words import json_schema, load_links, settings_of, text_of
 from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import NAMED, edited, quoted, vocabulary, write_named

@@ -1,8 +1,7 @@
 """Words of ``tc netem``: plain text or, after a zero byte, a sequence of valid words."""
 
-from netem.words.tc_command import tc_command
-from netem.words.words_to_settings import EXAMPLES as ANY_WORD
-from netem.words.words_to_settings import parse, text_of
+from netem.tc_words import EXAMPLES as ANY_WORD
+from netem.tc_words import parse, tc_command, text_of
 from noack.core.errors import CallerError
 from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.kinds import IMPAIRMENTS

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from netem.capture.pcapng import PcapngSection
-from netem.engine.relay_interface import LinkSpec
-from netem.relay_events import EVENT, Bytes, Events
+from netem.capture import PcapngSection
+from netem.relay_links import EVENT, Bytes, Events, LinkSpec
 from noack.impairments.link_settings import LinkSettings
 
 T_NS = 1_767_225_600_123_456_789

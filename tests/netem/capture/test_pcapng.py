@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.capture.pcapng import PcapngSection
-from netem.engine.relay_interface import DIRECTIONS
-from netem.relay_events import EVENT
+from netem.capture import PcapngSection
+from netem.relay_links import DIRECTIONS, EVENT
 from noack.protocol.record_tables import Fate
 from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
 from tests.netem.capture.reader import Datagram, datagram, read

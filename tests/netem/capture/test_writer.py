@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.capture.capture_writer import CaptureWriter
-from netem.capture.pcapng import PcapngSection
-from netem.relay_events import Bytes, Events
+from netem.capture import CaptureWriter, PcapngSection
+from netem.relay_links import Bytes, Events
 from noack.core.errors import CallerError
 from tests.netem.capture.batches import SPECS, batch, file_of
 from tests.netem.capture.reader import Options, read

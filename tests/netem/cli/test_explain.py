@@ -10,8 +10,7 @@ import pytest
 
 from netem.__main__ import main
 from netem.cli.emulator_options import parser, specs_of
-from netem.words.links_file import load_links
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import load_links, settings_of
 from noack.impairments.link_settings import LinkSettings
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()

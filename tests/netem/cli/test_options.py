@@ -10,8 +10,8 @@ import pytest
 
 from netem.__main__ import main
 from netem.cli.emulator_options import parsed, parser, specs_of
-from netem.engine.relay_interface import LinkSpec
-from netem.words.words_to_settings import EXAMPLES, KEYWORDS, parse, settings_of
+from netem.relay_links import LinkSpec
+from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
 from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LOSS_WORDS
 

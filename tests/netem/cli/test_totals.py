@@ -5,8 +5,8 @@ from typing import Any
 
 from rich.console import Console
 
-from netem.cli.relay_totals import print_totals
 from netem.control.emulator_statistics import Statistics
+from netem.stand_alone import print_totals
 
 NO_FATES = dict.fromkeys(
     ("delivered", "dropped", "forced", "corrupted", "overflowed", "blacked_out"), 0

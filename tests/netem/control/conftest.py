@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.command_queue import CommandQueue
-from netem.control.control_server import ControlServer
+from netem.control.control_server import CommandQueue, ControlServer
 from tests.netem.control.relays import FakeRelay, running
 
 

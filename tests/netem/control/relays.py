@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.command_queue import CommandQueue
+from netem.control.control_server import CommandQueue
 from netem.engine import histogram
-from netem.engine.relay import Relay
-from netem.engine.relay_interface import (
+from netem.relay import Relay
+from netem.relay_links import (
     DIRECTIONS,
     Address,
     Direction,
@@ -20,7 +20,7 @@ from netem.engine.relay_interface import (
     LinkReport,
     LinkSpec,
 )
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings

@@ -2,8 +2,8 @@ import threading
 
 import pytest
 
-from netem.control.command_queue import CommandQueue
-from netem.words.words_to_settings import settings_of
+from netem.control.control_server import CommandQueue
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
 from tests.netem.control.relays import FakeRelay
@@ -66,7 +66,7 @@ def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> Non
 def test_a_command_to_a_stuck_relay_times_out(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("netem.control.command_queue._PATIENCE_S", 0.01)
+    monkeypatch.setattr("netem.control.control_server._PATIENCE_S", 0.01)
     commands = CommandQueue(relay)
     with pytest.raises(PeerError, match="has not answered for"):
         commands.snapshot()

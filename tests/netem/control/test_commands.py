@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from netem.control import control_client, emulator_commands
-from netem.control.command_queue import CommandQueue
-from netem.control.control_server import ControlServer
-from netem.control.live_screen import Screen
-from netem.words.words_to_settings import settings_of
+from netem.control.control_server import CommandQueue, ControlServer
+from netem.control.statistics_view import Screen
+from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
 from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay, running

@@ -9,10 +9,9 @@ import pytest
 
 from netem.control import emulator_statistics
 from netem.control.control_server import ControlServer
-from netem.engine.relay_interface import LinkSpec
-from netem.fates.fate_recorder import FateRecorder
-from netem.fates.fate_trace import SCHEMA
-from netem.words.words_to_settings import settings_of
+from netem.fates import SCHEMA, FateRecorder
+from netem.relay_links import LinkSpec
+from netem.tc_words import settings_of
 from noack.impairments.link_settings import LinkSettings
 from tests.netem.control.relays import FakeRelay, running
 

@@ -8,8 +8,8 @@ import pytest
 from netem.cli import relay_run
 from netem.control import emulator_commands
 from netem.control.emulator_session import running
-from netem.fates.fate_recorder import FateRecorder
-from netem.words.words_to_settings import settings_of
+from netem.fates import FateRecorder
+from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
 from tests.netem.control.processes import emulator, udp_socket
 from tests.netem.fates.links import spec_of

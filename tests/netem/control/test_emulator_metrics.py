@@ -11,10 +11,9 @@ from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from netem.control import relay_attachments
-from netem.control.command_queue import CommandQueue
-from netem.control.emulator_metrics import EmulatorMetrics, metrics
-from netem.control.emulator_statistics import statistics
-from netem.control.relay_attachments import Options, attached
+from netem.control.control_server import CommandQueue
+from netem.control.emulator_session import Options, attached
+from netem.control.emulator_statistics import EmulatorMetrics, metrics, statistics
 from noack.runtime import metrics_server as servers
 from noack.runtime.address import text_of
 from tests.netem.control.relays import FakeRelay

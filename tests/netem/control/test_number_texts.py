@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.control.number_texts import (
+from netem.control.statistics_view import (
     bar,
     bits_text,
     elapsed_text,

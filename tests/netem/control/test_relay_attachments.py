@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.emulator_session import running
-from netem.control.relay_attachments import Options, add_options, attached, options_of
+from netem.control.emulator_session import Options, add_options, attached, options_of, running
 from noack.core.errors import CallerError
 from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay

@@ -8,12 +8,11 @@ import pytest
 from zenoh.handlers import FifoChannel
 
 from netem.control import control_server
-from netem.control.command_queue import CommandQueue
-from netem.control.control_client import Client
-from netem.control.control_server import ControlServer
+from netem.control.control_server import CommandQueue, ControlServer
+from netem.control.emulator_commands import Client
 from netem.control.emulator_session import EMULATORS, find, running
-from netem.engine.relay_interface import DIRECTIONS
-from netem.words.words_to_settings import settings_of
+from netem.relay_links import DIRECTIONS
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
@@ -157,7 +156,7 @@ def test_a_client_that_blocks_the_server_does_not_block_the_relay(
         blocked.set()
         assert free.wait(60)
 
-    monkeypatch.setattr("netem.control.statistics_thread.statistics", slow)
+    monkeypatch.setattr("netem.control.emulator_statistics.statistics", slow)
     assert blocked.wait(60)
     try:
         for _ in range(10):

@@ -3,14 +3,14 @@ from typing import Any
 
 import pytest
 
-from netem.control.command_queue import AppliedSettings, Snapshot
+from netem.control.control_server import AppliedSettings, Snapshot
 from netem.control.emulator_statistics import (
     DirectionStatistics,
     Statistics,
     statistics,
 )
-from netem.engine.relay_interface import FlowReport
-from netem.words.words_to_settings import settings_of
+from netem.relay_links import FlowReport
+from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_records import Counters
 from tests.netem.control.relays import FakeRelay, times

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import pytest
 from rich.console import Console
 
-from netem.control.command_queue import CommandQueue
+from netem.control.control_server import CommandQueue
 from netem.control.emulator_statistics import Statistics, statistics
 from netem.control.statistics_view import History, plain_lines, render
-from netem.engine.relay_interface import LinkSpec
-from netem.words.words_to_settings import settings_of
+from netem.relay_links import LinkSpec
+from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_records import Counters
 from tests.netem.control.relays import SETTINGS, FakeRelay, times

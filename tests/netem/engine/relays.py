@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.relay import Relay
-from netem.engine.relay_interface import Address, LinkReport, LinkSpec, Tap
+from netem.relay import Relay
+from netem.relay_links import Address, LinkReport, LinkSpec, Tap
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.peer_sockets import enlarge_buffer
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.histogram import BUCKETS, coarse, lower_ns, quantile_ns
+from netem.relay_links import BUCKETS, coarse, lower_ns, quantile_ns
 from noack.core.core_library import core
 
 TIMES = st.lists(st.integers(0, 2**43), min_size=1, max_size=200)

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from netem.engine.link_listeners import open_links
-from netem.engine.relay_interface import LinkSpec
+from netem.relay_links import LinkSpec, open_links
 from noack.core.errors import CallerError
 from tests.netem.engine.relays import HOSTS, endpoints, link, name_of
 

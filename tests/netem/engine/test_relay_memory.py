@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.relay import Relay
-from netem.engine.relay_memory import RelayMemory, name_array
-from netem.engine.relay_sockets import socket_name, unpacked_address
-from netem.words.words_to_settings import settings_of
+from netem.relay import Relay
+from netem.relay_links import socket_name, unpacked_address
+from netem.relay_memory import RelayMemory, name_array
+from netem.tc_words import settings_of
 from noack.core.core_library import core, pointer_to
 from noack.runtime.address import packed_name
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running
@@ -69,7 +69,7 @@ def test_the_timer_slack_of_the_thread_is_restored() -> None:
 def test_memory_is_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the datagrams are delayed or copied; clients appear and expire."""
     rounds, size, most_clients = 8, 300, 5
-    monkeypatch.setattr("netem.engine.relay._RARE_PERIOD_NS", 0)
+    monkeypatch.setattr("netem.relay._RARE_PERIOD_NS", 0)
     harsh = settings_of("loss 30% duplicate 30% delay 1ms 1ms mansd 3")
     with (
         endpoints(HOSTS[4]) as (server,),

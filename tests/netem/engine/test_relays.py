@@ -17,9 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 from netem.engine import relay_memory
-from netem.engine.relay_interface import DirectionReport
-from netem.engine.relay_sockets import raise_file_limit
-from netem.words.words_to_settings import settings_of
+from netem.relay_links import DirectionReport, raise_file_limit
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_records import RecordedDecision
 from noack.protocol.record_tables import Fate

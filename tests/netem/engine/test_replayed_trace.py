@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.link_settings import read_files
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace

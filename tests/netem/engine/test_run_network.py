@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.run_network import RunNetwork
-from netem.words.words_to_settings import settings_of
+from netem.run_network import RunNetwork
+from netem.tc_words import settings_of
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

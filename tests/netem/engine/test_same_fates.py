@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.relay_interface import LinkSpec
+from netem.relay_links import LinkSpec
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running

@@ -9,9 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.relay_interface import LinkSpec
-from netem.fates.fate_recorder import FateRecorder
-from netem.relay_events import EVENT
+from netem.fates import FateRecorder
+from netem.relay_links import EVENT, LinkSpec
 from noack.core.core_library import ffi
 from noack.impairments.link_settings import LinkSettings
 from tests.oracles.link import Datagram, Link

@@ -9,8 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from netem.fates.fate_replay import read_fates
-from netem.fates.fate_trace import METADATA
+from netem.fates import METADATA, read_fates
 from noack.core.errors import CallerError
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
 

@@ -10,11 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from netem.fates.fate_recorder import FateRecorder
-from netem.fates.fate_replay import read_fates
-from netem.fates.fate_trace import METADATA
-from netem.relay_events import EVENT
-from netem.words.words_to_settings import settings_of
+from netem.fates import METADATA, FateRecorder, read_fates
+from netem.relay_links import EVENT
+from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.fates.fate_replay import read_fates
-from netem.words.words_to_settings import settings_of
+from netem.fates import read_fates
+from netem.tc_words import settings_of
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.link_settings import read_files
 from tests.oracles.link import Link
 

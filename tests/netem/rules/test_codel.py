@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.words.words_to_settings import settings_of, text_of
+from netem.tc_words import settings_of, text_of
 from noack.impairments.disciplines.codel import Codel
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from netem.link_state import LinkState
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings

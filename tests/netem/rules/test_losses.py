@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from tests.oracles.link import Link
 
 COUNT = 400_000

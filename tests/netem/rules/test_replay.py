@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.link_settings import LinkSettings, read_files
 from noack.traces.trace_formats import read_trace

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from netem.words.tc_command import tc_command
-from netem.words.words_to_settings import settings_of
+from netem.tc_words import settings_of, tc_command
 from noack.core.errors import CallerError
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds import AnyImpairment

@@ -12,9 +12,8 @@ import pytest
 import tomli_w
 from hypothesis import given
 
-from netem.engine.relay_interface import LinkSpec
-from netem.words.links_file import LinksFile, json_schema, load_links
-from netem.words.words_to_settings import settings_of, text_of
+from netem.relay_links import LinkSpec
+from netem.tc_words import LinksFile, json_schema, load_links, settings_of, text_of
 from noack.config import toml_file
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.cli.explain_links import settings_meaning
-from netem.words.words_to_settings import settings_of
+from netem.explain_links import settings_meaning
+from netem.tc_words import settings_of
 
 DRAWS = 20_000
 

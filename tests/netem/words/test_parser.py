@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from netem.words.words_to_settings import parse, settings_of, text_of
+from netem.tc_words import parse, settings_of, text_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.quantities import (

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from netem.words.links_file import LinksFile
+from netem.tc_words import LinksFile
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import put, value_of
 from noack.config.toml_file import json_schema

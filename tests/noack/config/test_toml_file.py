@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cosim.studies.campaign.campaign_file import load as load_campaign
-from netem.words.links_file import load_links
+from netem.tc_words import load_links
 from noack.config import toml_file
 from noack.config.scenario_file import load, put, validate
 from noack.core.errors import CallerError

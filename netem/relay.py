@@ -7,10 +7,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from netem.engine.client_table import ClientTable
-from netem.engine.link_listeners import open_links
-from netem.engine.link_warnings import LinkWarnings, UnintendedLosses
-from netem.engine.relay_interface import (
+from netem.client_table import ClientTable, LinkWarnings, UnintendedLosses
+from netem.relay_links import (
     DIRECTIONS,
     Address,
     Direction,
@@ -19,9 +17,12 @@ from netem.engine.relay_interface import (
     LinkReport,
     LinkSpec,
     Tap,
+    let_wait,
+    open_links,
+    raise_file_limit,
+    stamp_arrivals,
 )
-from netem.engine.relay_memory import RelayDirection, RelayMemory
-from netem.engine.relay_sockets import let_wait, raise_file_limit, stamp_arrivals
+from netem.relay_memory import RelayDirection, RelayMemory
 from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings

@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from netem.engine.relay_interface import LinkSpec
-from netem.words.tc_command import TcCommand, tc_command
-from netem.words.words_to_settings import text_of
+from netem.relay_links import LinkSpec
+from netem.tc_words import TcCommand, tc_command, text_of
 from noack.core.errors import shortened
 from noack.impairments.kept_loss import expected_loss, with_kept_loss
 from noack.impairments.link_settings import LinkSettings

@@ -1,23 +1,119 @@
-"""Clients of a relay: a row in its memory and a return path for each."""
+"""A link's reports on standard error: refused clients, unreachable servers, unintended losses."""
 
-from collections.abc import Iterator, Sequence
+import errno
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from netem.engine.link_listeners import OpenLink
-from netem.engine.link_warnings import LinkWarnings
-from netem.engine.relay_interface import Address
-from netem.engine.relay_memory import RelayDirection, RelayMemory, name_array
-from netem.engine.relay_sockets import (
+from netem.relay_links import (
+    Address,
+    Direction,
     Endpoint,
+    LinkSpec,
+    OpenLink,
     has_data,
     packed_name,
     return_path,
     stamp_arrivals,
     unpacked_address,
 )
+from netem.relay_memory import RelayDirection, RelayMemory, name_array
+from netem.standard_error import say
 from noack.core.core_library import core
+from noack.runtime.address import text_of
 from noack.runtime.udp_sockets import drops_of
+
+KERNEL = "lost_in_kernel"
+_CAUSES = {
+    KERNEL: "were lost in the kernel, as its receive buffer was full",
+    os.strerror(errno.ENOBUFS): "were lost, as a queue on the way out was full",
+    os.strerror(errno.ENOMEM): "were lost, as there was no memory to delay them",
+}
+
+
+class LinkWarnings:
+    """Refused clients and the unreachable server of a link; each reason is reported once."""
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._spec = spec
+        self._full = False
+        self._reported: set[str] = set()
+
+    def accepts_client(self, clients: int) -> bool:
+        """Whether a client is accepted in addition to ``clients`` present ones."""
+        if clients >= self._spec.most_clients:
+            self._full = True
+            self._report(f"no more than {self._spec.most_clients} clients at once are served")
+        return not self._full
+
+    def no_descriptor_left(self, error: int, clients: int) -> bool:
+        """Whether an errno means that no file descriptor is left; if so, refuse further clients."""
+        if error not in (errno.EMFILE, errno.ENFILE):
+            return False
+        self._full = True
+        self._report(
+            f"no file descriptors are left for more than {clients} clients; raise the limit "
+            "(ulimit -n)"
+        )
+        return True
+
+    def client_removed(self) -> None:
+        """Accept clients again."""
+        self._full = False
+
+    def port_unreachable(self, answers: int) -> None:
+        """Set the total number of ICMP port-unreachable messages from the server's host."""
+        if answers:
+            self._report(
+                f"nothing listens on {text_of(self._spec.to)} (ICMP port unreachable); "
+                "what is sent there is lost"
+            )
+
+    def _report(self, reason: str) -> None:
+        if reason not in self._reported:
+            self._reported.add(reason)
+            say(f"link {self._spec.name}: {reason}")
+
+
+class UnintendedLosses:
+    """Losses that no setting caused, in one direction of a link.
+
+    They void the guarantee and are always reported.
+    """
+
+    def __init__(self, link: str, direction: Direction) -> None:
+        self._where = f"link {link}, {direction}"
+        self._counts: Counter[str] = Counter({KERNEL: 0})
+        self._reported: Counter[str] = Counter()
+
+    def lost_in_kernel(self, datagrams: int) -> None:
+        """Set the total number of datagrams that the kernel has dropped."""
+        self._set(KERNEL, datagrams)
+
+    def not_sent(self, error: int, datagrams: int) -> None:
+        """Set the total number of datagrams that could not be sent or stored, for one errno."""
+        self._set(os.strerror(error), datagrams)
+
+    def counts(self) -> Mapping[str, int]:
+        """Return the number of losses by cause."""
+        return dict(self._counts)
+
+    def report(self) -> None:
+        """Report the totals that have changed since the last call on standard error."""
+        for cause, datagrams in self._counts.items():
+            if datagrams > self._reported[cause]:
+                self._reported[cause] = datagrams
+                text = _CAUSES.get(cause, f"could not be sent ({cause})")
+                say(f"{self._where}: {datagrams} datagrams {text}, against the guarantee")
+
+    def _set(self, cause: str, datagrams: int) -> None:
+        if datagrams > 0:
+            self._counts[cause] = datagrams
+            if not self._reported[cause]:
+                self.report()
+
 
 _QUERIED_AT_ONCE = 64
 _STALL_NS = 1_000_000_000

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
-from netem.relay_events import EVENT
+from netem.relay_links import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings

@@ -1,1 +1,0 @@
-"""The emulator's command line."""

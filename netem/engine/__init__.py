@@ -1,1 +1,0 @@
-"""The relay around the core: its sockets, clients, memory, and what taps receive."""

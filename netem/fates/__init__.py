@@ -1,1 +1,0 @@
-"""Fate traces: the fate of each datagram, recorded as Parquet and repeated in a replay."""

@@ -1,1 +1,0 @@
-"""Links described by words: the syntax of ``tc netem``, links files, and explanations."""
