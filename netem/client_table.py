@@ -1,4 +1,9 @@
-"""A link's reports on standard error: refused clients, unreachable servers, unintended losses."""
+"""A relay's clients: a row in its memory and a return path for each; and a link's warnings.
+
+:class:`ClientTable` accepts, finds and forgets clients. :class:`LinkWarnings` and
+:class:`UnintendedLosses` report on standard error what goes wrong: refused clients, unreachable
+servers, unintended losses.
+"""
 
 import errno
 import os
@@ -16,11 +21,11 @@ from netem.relay_links import (
     has_data,
     packed_name,
     return_path,
+    say,
     stamp_arrivals,
     unpacked_address,
 )
 from netem.relay_memory import RelayDirection, RelayMemory, name_array
-from netem.standard_error import say
 from noack.core.core_library import core
 from noack.runtime.address import text_of
 from noack.runtime.udp_sockets import drops_of

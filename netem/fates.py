@@ -35,8 +35,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from netem.relay_links import DIRECTIONS, EVENT, Direction, LinkSpec
-from netem.standard_error import say
+from netem.relay_links import DIRECTIONS, EVENT, Direction, LinkSpec, say
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent

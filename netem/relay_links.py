@@ -1,4 +1,9 @@
-"""The events of a relay: one per datagram that arrives or departs."""
+"""A relay's links: what describes one, its sockets, and what the relay reports of it.
+
+In the order of reading: lines for the user; events, which taps receive; :class:`LinkSpec`, and the
+reports; histograms of times, which the core counts (native/relay/events.c); sockets over IPv4 and
+IPv6; and :func:`open_links`, which binds the listening sockets.
+"""
 
 import ctypes
 import errno
@@ -22,8 +27,15 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import SocketName as SocketName
 from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of
+from noack.runtime.command_line import print_to_stderr
 from noack.runtime.peer_sockets import enlarge_buffer
 from noack.runtime.udp_sockets import drops_of
+
+
+def say(line: str) -> None:
+    """Write a line; if standard error is closed, the emulator continues."""
+    print_to_stderr(f"noack netem: {line}")
+
 
 Bytes = NDArray[np.uint8]
 Events = NDArray[np.void]

@@ -1,164 +1,118 @@
-"""Commands of other threads, which the relay's thread runs between two batches of datagrams.
+"""Live control of a running emulator: its file, by which commands find it, and its queries.
 
-The packet path never waits: statistics, live control and the live screen have their own threads,
-and each command takes microseconds.
+While an emulator runs, its file is in the user's runtime directory (:mod:`noack.runtime.lock_file`)
+beside the Unix socket on which it listens, which only its user can reach. Below ``netem/NAME`` it
+answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
+docs/netem-control.md describes, in a thread of its own. A query with a mistake is answered with one
+line, and changes nothing.
 """
 
 import json
-import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import cached_property
-from queue import SimpleQueue
-from threading import Lock
-from typing import Any, Literal, NamedTuple, Self, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal, Self
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.emulator_session import EMULATORS, published
-from netem.control.emulator_statistics import Statistics, StatisticsThread
-from netem.relay import Relay
-from netem.relay_links import DIRECTIONS, Direction, LinkReport
+from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
+from netem.relay_links import DIRECTIONS, Direction
 from netem.tc_words import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
-from noack.impairments.kept_loss import expected_loss, with_kept_loss
-from noack.impairments.link_records import Counters
+from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime import lock_file
+from noack.runtime.private_folder import require_name
 from noack.runtime.zenoh_session import cause_of, open_session
 
-T = TypeVar("T")
-
-_PATIENCE_S = 5.0
-
-
-@dataclass(frozen=True)
-class AppliedSettings:
-    """The settings of a direction, and its counters when they were applied."""
-
-    settings: LinkSettings
-    since: Counters
-
-    @cached_property
-    def words(self) -> str:
-        """The settings in the words of ``tc netem``."""
-        return text_of(self.settings)
-
-    @cached_property
-    def predicted_loss(self) -> float | None:
-        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
-        return expected_loss(self.settings).rate
+EMULATORS = "netem"
+"""The folder of the files."""
+_STARTING = "netem_starting"
 
 
-class Snapshot(NamedTuple):
-    """The state of a relay at one time."""
-
-    links: Sequence[LinkReport]
-    in_force: Mapping[tuple[str, Direction], AppliedSettings]
-    elapsed_ns: int
-    """Time since the relay started."""
-    unix_ns: int
+def _in_use(name: str) -> CallerError:
+    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
 
 
-class CommandQueue:
-    """Runs commands of other threads in the relay's thread."""
-
-    def __init__(self, relay: Relay) -> None:
-        self._relay = relay
-        self._began_ns = time.monotonic_ns()
-        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
-        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
-            (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
-            for spec in relay.specs
-            for direction in DIRECTIONS
-        }
-        self._closed = False
-        self._lock = Lock()
-
-    @property
-    def links(self) -> Sequence[str]:
-        """Names of the relay's links."""
-        return [spec.name for spec in self._relay.specs]
-
-    def run_pending(self) -> None:
-        """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
-        for _ in range(self._waiting.qsize()):
-            future, command = self._waiting.get_nowait()
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                future.set_result(command())
-            except Exception as error:
-                future.set_exception(error)
-
-    def close(self) -> None:
-        """Refuse further commands; called in the relay's thread when the relay ends."""
-        with self._lock:
-            self._closed = True
-        while not self._waiting.empty():
-            self._waiting.get_nowait()[0].cancel()
-
-    def submit(self, command: Callable[[], T]) -> T:
-        """Run a command in the relay's thread, from another thread, and return its result.
-
-        Raises:
-            PeerError: the relay has ended, or does not answer.
-        """
-        future: Future[T] = Future()
-        with self._lock:
-            if self._closed:
-                raise PeerError("the emulator has ended")
-            self._waiting.put((future, command))
+@contextmanager
+def _locked(kind: str, name: str) -> Iterator[Path]:
+    require_name(name, "emulator")
+    with ExitStack() as stack:
         try:
-            return future.result(_PATIENCE_S)
-        except CancelledError:
-            raise PeerError("the emulator has ended") from None
-        except TimeoutError:
-            if future.done():  # the command itself raised it
-                raise
-            future.cancel()
-            raise PeerError(f"the emulator has not answered for {_PATIENCE_S:g} s") from None
+            path = stack.enter_context(lock_file.lock_file(kind, name, {}))
+        except FileExistsError:
+            raise _in_use(name) from None
+        yield path
 
-    def snapshot(self) -> Snapshot:
-        """Return the state of the relay, from another thread.
 
-        Raises:
-            PeerError: the relay has ended, or does not answer.
-        """
-        return self.submit(self.look)
+def published(name: str) -> AbstractContextManager[Path]:
+    """Keep an emulator's file within the context.
 
-    def look(self) -> Snapshot:
-        """Return the state of the relay, in its thread or after its end."""
-        return Snapshot(
-            self._relay.report(),
-            dict(self._in_force),
-            time.monotonic_ns() - self._began_ns,
-            time.time_ns(),
+    Raises:
+        CallerError: the name is not allowed or in use, or the folder is not the user's own.
+    """
+    return _locked(EMULATORS, name)
+
+
+@contextmanager
+def starting(name: str | None) -> Iterator[None]:
+    """Publish within the context that an emulator of this name, if any, starts.
+
+    Raises:
+        CallerError: the name is not allowed or in use, or the folder is not the user's own.
+    """
+    if name is None:
+        yield
+        return
+    with _locked(_STARTING, name):
+        if name in running():
+            raise _in_use(name)
+        yield
+
+
+def running() -> list[str]:
+    """Return the names of this user's emulators that accept commands.
+
+    Raises:
+        CallerError: other users have access to the folder.
+    """
+    return list(_files())
+
+
+def find(name: str | None) -> str:
+    """Return the name of a running emulator; if ``name`` is None, of the only one.
+
+    Raises:
+        CallerError: there is no such emulator, or several run and none is named.
+        PeerError: it is still starting.
+    """
+    files = _files()
+    begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
+    if name not in files and (name in begun or (name is None and begun and not files)):
+        raise PeerError(
+            f"emulator {name or begun[0]!r} is starting; "
+            "it prints `ready` on standard output when it accepts commands"
         )
+    if not files:
+        which = "" if name is None else f" {name!r}"
+        raise CallerError(
+            f"no emulator{which} accepts commands; start one with `noack netem --control NAME …`"
+        )
+    if name is None and len(files) > 1:
+        raise CallerError(f"which emulator? Running: {', '.join(files)}")
+    name = name or next(iter(files))
+    if name not in files:
+        raise CallerError(f"no emulator {name!r}; running: {', '.join(files)}")
+    return name
 
-    def change(self, link: str, directions: Sequence[Direction], settings: LinkSettings) -> None:
-        """Change directions of a link, from another thread.
 
-        Raises:
-            CallerError: the relay refuses the settings.
-            PeerError: the relay has ended, or does not answer.
-        """
-
-        def command() -> None:
-            for direction in directions:
-                self._relay.change(link, direction, settings)
-            (report,) = (one for one in self._relay.report() if one.name == link)
-            for direction in directions:
-                counters = replace(getattr(report, direction).counters)
-                self._in_force[link, direction] = AppliedSettings(settings, counters)
-
-        self.submit(command)
+def _files() -> dict[str, lock_file.LockFile]:
+    return {file.path.stem: file for file in lock_file.live_lock_files(EMULATORS)}
 
 
 _PUBLISH_S = 1.0

@@ -1,4 +1,7 @@
-"""Client of live control: sends queries to a running emulator, and receives its statistics."""
+"""The commands ``noack netem show``, ``set`` and ``watch``, and their client of live control.
+
+The client sends queries to a running emulator, and receives its statistics.
+"""
 
 import argparse
 import json
@@ -14,7 +17,7 @@ import zenoh
 from rich.console import Console
 from zenoh.handlers import RingChannel
 
-from netem.control.emulator_session import EMULATORS, find, running
+from netem.control.control_server import EMULATORS, find, running
 from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_view import History, Screen, render
 from netem.relay_links import DIRECTIONS

@@ -1,26 +1,29 @@
-"""A relay's statistics as a JSON document: its keys, and its construction from reports.
+"""A relay's statistics as a JSON document, and the queue by which other threads reach the relay.
 
-Later versions may add keys, but remove none. Counts are totals since the relay started; ``recent``
-covers the time since the previous document.
+:class:`CommandQueue` runs commands in the relay's thread between two batches of datagrams: the
+packet path never waits, and each command takes microseconds. :func:`statistics` makes the document
+of two snapshots. Later versions may add keys, but remove none. Counts are totals since the relay
+started; ``recent`` covers the time since the previous document. :class:`StatisticsThread` passes
+documents to a consumer at intervals.
 """
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import CancelledError, Future
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, Self, TypedDict
+from functools import cached_property
+from queue import SimpleQueue
+from threading import Lock
+from typing import Any, NamedTuple, Self, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from prometheus_client import Metric
-from prometheus_client.metrics_core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-)
 
-from netem.control.control_server import AppliedSettings, CommandQueue, Snapshot
+from netem.relay import Relay
 from netem.relay_links import (
     DIRECTIONS,
     Direction,
@@ -29,11 +32,142 @@ from netem.relay_links import (
     coarse,
     quantile_ns,
 )
+from netem.tc_words import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
+from noack.impairments.kept_loss import expected_loss
 from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
-from noack.runtime.address import text_of
+from noack.runtime.address import text_of as address_text
+
+T = TypeVar("T")
+
+_PATIENCE_S = 5.0
+
+
+@dataclass(frozen=True)
+class AppliedSettings:
+    """The settings of a direction, and its counters when they were applied."""
+
+    settings: LinkSettings
+    since: Counters
+
+    @cached_property
+    def words(self) -> str:
+        """The settings in the words of ``tc netem``."""
+        return text_of(self.settings)
+
+    @cached_property
+    def predicted_loss(self) -> float | None:
+        """See :mod:`noack.impairments.loss_prediction`; this may take seconds."""
+        return expected_loss(self.settings).rate
+
+
+class Snapshot(NamedTuple):
+    """The state of a relay at one time."""
+
+    links: Sequence[LinkReport]
+    in_force: Mapping[tuple[str, Direction], AppliedSettings]
+    elapsed_ns: int
+    """Time since the relay started."""
+    unix_ns: int
+
+
+class CommandQueue:
+    """Runs commands of other threads in the relay's thread."""
+
+    def __init__(self, relay: Relay) -> None:
+        self._relay = relay
+        self._began_ns = time.monotonic_ns()
+        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
+        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
+            (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
+            for spec in relay.specs
+            for direction in DIRECTIONS
+        }
+        self._closed = False
+        self._lock = Lock()
+
+    @property
+    def links(self) -> Sequence[str]:
+        """Names of the relay's links."""
+        return [spec.name for spec in self._relay.specs]
+
+    def run_pending(self) -> None:
+        """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
+        for _ in range(self._waiting.qsize()):
+            future, command = self._waiting.get_nowait()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(command())
+            except Exception as error:
+                future.set_exception(error)
+
+    def close(self) -> None:
+        """Refuse further commands; called in the relay's thread when the relay ends."""
+        with self._lock:
+            self._closed = True
+        while not self._waiting.empty():
+            self._waiting.get_nowait()[0].cancel()
+
+    def submit(self, command: Callable[[], T]) -> T:
+        """Run a command in the relay's thread, from another thread, and return its result.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        future: Future[T] = Future()
+        with self._lock:
+            if self._closed:
+                raise PeerError("the emulator has ended")
+            self._waiting.put((future, command))
+        try:
+            return future.result(_PATIENCE_S)
+        except CancelledError:
+            raise PeerError("the emulator has ended") from None
+        except TimeoutError:
+            if future.done():  # the command itself raised it
+                raise
+            future.cancel()
+            raise PeerError(f"the emulator has not answered for {_PATIENCE_S:g} s") from None
+
+    def snapshot(self) -> Snapshot:
+        """Return the state of the relay, from another thread.
+
+        Raises:
+            PeerError: the relay has ended, or does not answer.
+        """
+        return self.submit(self.look)
+
+    def look(self) -> Snapshot:
+        """Return the state of the relay, in its thread or after its end."""
+        return Snapshot(
+            self._relay.report(),
+            dict(self._in_force),
+            time.monotonic_ns() - self._began_ns,
+            time.time_ns(),
+        )
+
+    def change(self, link: str, directions: Sequence[Direction], settings: LinkSettings) -> None:
+        """Change directions of a link, from another thread.
+
+        Raises:
+            CallerError: the relay refuses the settings.
+            PeerError: the relay has ended, or does not answer.
+        """
+
+        def command() -> None:
+            for direction in directions:
+                self._relay.change(link, direction, settings)
+            (report,) = (one for one in self._relay.report() if one.name == link)
+            for direction in directions:
+                counters = replace(getattr(report, direction).counters)
+                self._in_force[link, direction] = AppliedSettings(settings, counters)
+
+        self.submit(command)
+
 
 _MAX_WORDS = 200
 """Longer settings are cut to this number of characters."""
@@ -171,8 +305,8 @@ def _link(
 
     return {
         "name": after.name,
-        "listen": text_of(after.listen),
-        "to": text_of(after.to),
+        "listen": address_text(after.listen),
+        "to": address_text(after.to),
         "clients": after.clients,
         "clients_ever": after.clients_ever,
         "refused": after.refused,
@@ -214,7 +348,9 @@ def _direction(
         "in_flight": report.in_flight,
         "most_in_flight": counters.most_in_flight,
         "flows": [
-            FlowStatistics(flow=flow, client=text_of(client), packets=n, longest_loss_burst=burst)
+            FlowStatistics(
+                flow=flow, client=address_text(client), packets=n, longest_loss_burst=burst
+            )
             for flow, client, n, burst in report.flows
         ],
         "delay_ns": quantiles(report.delays),
@@ -339,119 +475,3 @@ class StatisticsThread:
         before = self._snapshots[-1] if self._snapshots else None
         self._snapshots.append(snapshot)
         self._show(statistics(snapshot, before))
-
-
-_PREFIX = "noack_netem"
-_FRESH_S = 0.1
-"""Newer statistics answer a further request, so that frequent readers do not load the relay."""
-
-_COUNTERS: Mapping[str, tuple[Callable[[DirectionStatistics], int], str]] = {
-    "received_datagrams": (lambda one: one["received"], "datagrams received"),
-    "received_bytes": (lambda one: one["received_bytes"], "bytes received, payload only"),
-    "forwarded_datagrams": (lambda one: one["forwarded"], "datagrams forwarded, copies included"),
-    "forwarded_bytes": (lambda one: one["forwarded_bytes"], "bytes forwarded, payload only"),
-    "duplicated_datagrams": (lambda one: one["duplicated"], "copies made"),
-    "stale_datagrams": (lambda one: one["delivered_out_of_order"],
-                        "datagrams delivered out of order"),
-    "held_back_datagrams": (lambda one: one["held_back"],
-                            "datagrams held back for the guarantee"),
-}  # fmt: skip
-_GAUGES: Mapping[str, tuple[Callable[[DirectionStatistics], float | None], str]] = {
-    "in_flight_datagrams": (lambda one: one["in_flight"], "datagrams inside the emulator"),
-    "longest_loss_burst": (lambda one: one["longest_loss_burst"],
-                           "most consecutive losses of a flow under the present settings"),
-    "loss_burst_limit": (lambda one: one["mansd"],
-                         "most consecutive losses that the guarantee allows (M - 1)"),
-    "loss_ratio": (lambda one: one["loss"]["realised"],
-                   "share of the datagrams not effectively delivered, present settings"),
-    "predicted_loss_ratio": (lambda one: one["loss"]["predicted"],
-                             "expected share of datagrams lost by a random draw"),
-}  # fmt: skip
-_TIMES = {
-    "delay_seconds": ("delay_ns", "time in the emulator, quantiles since its start"),
-    "lateness_seconds": ("lateness_ns", "lateness of the emulator, quantiles since its start"),
-}
-_QUANTILES = {"p50": "0.5", "p99": "0.99", "p999": "0.999", "max": "1"}
-_OF_LINK = {
-    "refused_datagrams": ("refused", "datagrams of clients beyond the limit"),
-    "discarded_datagrams": ("discarded", "datagrams that no client waits for"),
-    "port_unreachable": ("port_unreachable", "answers that no process listens"),
-}
-
-
-class EmulatorMetrics:
-    """Computes the metrics of a relay when they are read."""
-
-    def __init__(self, commands: CommandQueue) -> None:
-        self._commands = commands
-        self._latest: Statistics | None = None
-        self._at_s = 0.0
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the metrics; none while the relay does not answer."""
-        if self._latest is None or time.monotonic() - self._at_s > _FRESH_S:
-            try:
-                self._latest = statistics(self._commands.snapshot())
-            except PeerError:
-                return
-            self._at_s = time.monotonic()
-        yield from metrics(self._latest)
-
-
-def metrics(found: Statistics) -> Iterator[Metric]:
-    """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
-    yield GaugeMetricFamily(
-        f"{_PREFIX}_elapsed_seconds", "time since the emulator started", found["elapsed_s"]
-    )
-    clients = GaugeMetricFamily(f"{_PREFIX}_clients", "clients of a link", labels=["link"])
-    for link in found["links"]:
-        clients.add_metric([link["name"]], link["clients"])
-    yield clients
-    for name, (key, text) in _OF_LINK.items():
-        counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=["link"])
-        for link in found["links"]:
-            counter.add_metric([link["name"]], link[key])  # type: ignore[literal-required]
-        yield counter
-    directions = [
-        ([link["name"], name], link[name]) for link in found["links"] for name in DIRECTIONS
-    ]
-    yield from _of_directions(directions)
-
-
-def _of_directions(directions: list[tuple[list[str], DirectionStatistics]]) -> Iterator[Metric]:
-    labels = ["link", "direction"]
-    for name, (count, text) in _COUNTERS.items():
-        counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels)
-        for values, one in directions:
-            counter.add_metric(values, count(one))
-        yield counter
-    for name, (value, text) in _GAUGES.items():
-        gauge = GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels)
-        for values, one in directions:
-            if (known := value(one)) is not None:
-                gauge.add_metric(values, known)
-        yield gauge
-    yield from _by_key(directions, "fates", "datagrams", "fate", "datagrams by their fate")
-    yield from _by_key(
-        directions, "unintended", "unintended_losses", "cause", "losses that no setting caused"
-    )
-    for name, (key, text) in _TIMES.items():
-        gauge = GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=[*labels, "quantile"])
-        for values, one in directions:
-            times: Any = one[key]  # type: ignore[literal-required]
-            for quantile, label in _QUANTILES.items():
-                if times[quantile] is not None:
-                    gauge.add_metric([*values, label], times[quantile] / NS_PER_S)
-        yield gauge
-
-
-def _by_key(
-    directions: list[tuple[list[str], DirectionStatistics]], key: str, name: str, label: str,
-    text: str,
-) -> Iterator[Metric]:  # fmt: skip
-    counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=["link", "direction", label])
-    for values, one in directions:
-        counts: Mapping[str, int] = one[key]  # type: ignore[literal-required]
-        for which, count in counts.items():
-            counter.add_metric([*values, which], count)
-    yield counter

@@ -1,4 +1,8 @@
-"""Numbers with units, and small charts of block characters, as the terminal shows them."""
+"""A relay's statistics in the terminal: numbers with units, small charts, and the live screen.
+
+:func:`render` draws a statistics document; :class:`Screen` shows it again and again, and reads the
+keys.
+"""
 
 import contextlib
 import io

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from cosim.doctor.machine_measures import _runtime_folder
-from netem.control import emulator_session
+from netem.control import control_server as emulator_session
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, PeerError

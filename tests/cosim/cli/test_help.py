@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli.program import examples_of
-from netem.cli import emulator_options as emulator
+from netem import emulator_options as emulator
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
 from netem.tc_words import parse
 from noack.core.errors import NoackError
@@ -136,11 +136,11 @@ def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
 
 
 def test_the_emulators_examples_have_valid_arguments() -> None:
-    text = emulator.parser().format_help().replace(" \\\n", " ")
+    text = emulator.command_line_parser().format_help().replace(" \\\n", " ")
     shown = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
     assert len(shown) >= 5
     for example in shown:
-        options = emulator.parsed(emulator.parser(), shlex.split(example))
+        options = emulator.parsed(emulator.command_line_parser(), shlex.split(example))
         parse(options.words or ())
         if options.links is None:
             emulator.specs_of(options)

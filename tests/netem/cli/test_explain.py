@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from netem.__main__ import main
-from netem.cli.emulator_options import parser, specs_of
+from netem.emulator_options import command_line_parser as parser
+from netem.emulator_options import specs_of
 from netem.tc_words import load_links, settings_of
 from noack.impairments.link_settings import LinkSettings
 

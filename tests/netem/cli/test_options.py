@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from netem.__main__ import main
-from netem.cli.emulator_options import parsed, parser, specs_of
+from netem.emulator_options import command_line_parser as parser
+from netem.emulator_options import parsed, specs_of
 from netem.relay_links import LinkSpec
 from netem.tc_words import EXAMPLES, KEYWORDS, parse, settings_of
 from noack.core.errors import CallerError

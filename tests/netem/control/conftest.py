@@ -3,7 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.control_server import CommandQueue, ControlServer
+from netem.control.control_server import ControlServer
+from netem.control.emulator_statistics import CommandQueue
 from tests.netem.control.relays import FakeRelay, running
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.control_server import CommandQueue
-from netem.engine import histogram
+from netem import relay_links
+from netem.control.emulator_statistics import CommandQueue
 from netem.relay import Relay
 from netem.relay_links import (
     DIRECTIONS,
@@ -36,7 +36,7 @@ def spec_of(name: str) -> LinkSpec:
 
 def times(*t_ns: int) -> NDArray[np.int64]:
     buckets = [core.noack_bucket_of(one_ns) for one_ns in t_ns]
-    return np.bincount(np.array(buckets, np.int64), minlength=histogram.BUCKETS)
+    return np.bincount(np.array(buckets, np.int64), minlength=relay_links.BUCKETS)
 
 
 class FakeRelay(Relay):

@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from netem.control.control_server import CommandQueue
+from netem.control.emulator_statistics import CommandQueue
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
@@ -66,7 +66,7 @@ def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> Non
 def test_a_command_to_a_stuck_relay_times_out(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("netem.control.control_server._PATIENCE_S", 0.01)
+    monkeypatch.setattr("netem.control.emulator_statistics._PATIENCE_S", 0.01)
     commands = CommandQueue(relay)
     with pytest.raises(PeerError, match="has not answered for"):
         commands.snapshot()

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from netem.control import control_client, emulator_commands
-from netem.control.control_server import CommandQueue, ControlServer
+from netem.control import emulator_commands
+from netem.control.control_server import ControlServer
+from netem.control.emulator_statistics import CommandQueue
 from netem.control.statistics_view import Screen
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
@@ -138,7 +139,7 @@ def test_watch_fails_when_the_emulator_ends(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(control_client, "_SILENCE_S", 0.1)
+    monkeypatch.setattr(emulator_commands, "_SILENCE_S", 0.1)
     relay.counters["up", "forward"].received = 7
     emulator = ControlServer("lab", commands).__enter__()
     monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from netem.cli import relay_run
+from netem import stand_alone
 from netem.control import emulator_commands
-from netem.control.emulator_session import running
+from netem.control.control_server import running
 from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
@@ -63,6 +63,6 @@ def test_a_replay_uses_the_cap_of_its_trace_by_default(
     path = tmp_path / "fates.parquet"
     with FateRecorder(path, [spec_of(settings_of("loss 60% mansd 2"), "relay")]):
         pass
-    (spec,) = relay_run._replaying([spec_of(settings_of(words), "relay")], path)
+    (spec,) = stand_alone._replaying([spec_of(settings_of(words), "relay")], path)
     assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
     assert spec.decisions == {"forward": [], "reverse": []}

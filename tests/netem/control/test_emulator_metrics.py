@@ -10,10 +10,10 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
-from netem.control import relay_attachments
-from netem.control.control_server import CommandQueue
-from netem.control.emulator_session import Options, attached
-from netem.control.emulator_statistics import EmulatorMetrics, metrics, statistics
+from netem import stand_alone
+from netem.control.emulator_metrics import EmulatorMetrics, metrics
+from netem.control.emulator_statistics import CommandQueue, statistics
+from netem.stand_alone import Options, attached
 from noack.runtime import metrics_server as servers
 from noack.runtime.address import text_of
 from tests.netem.control.relays import FakeRelay
@@ -71,7 +71,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     threads = threading.active_count()
     monkeypatch.setattr(servers, "_REQUEST_S", 3600.0)
     asked: list[tuple[str, int]] = []
-    monkeypatch.setattr(relay_attachments, "text_of", lambda at: asked.append(at) or text_of(at))
+    monkeypatch.setattr(stand_alone, "text_of", lambda at: asked.append(at) or text_of(at))
     with (
         ExitStack() as stack,
         attached(relay, Options(metrics=":0")) as side,

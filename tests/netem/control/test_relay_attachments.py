@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.emulator_session import Options, add_options, attached, options_of, running
+from netem.control.control_server import running
+from netem.stand_alone import Options, _add_watching_options, attached, options_of
 from noack.core.errors import CallerError
 from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay
@@ -17,7 +18,7 @@ from tests.netem.control.relays import FakeRelay
 
 def options(*arguments: str) -> Options:
     parser = argparse.ArgumentParser()
-    add_options(parser)
+    _add_watching_options(parser)
     return options_of(parser.parse_args(arguments))
 
 

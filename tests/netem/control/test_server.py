@@ -8,9 +8,9 @@ import pytest
 from zenoh.handlers import FifoChannel
 
 from netem.control import control_server
-from netem.control.control_server import CommandQueue, ControlServer
+from netem.control.control_server import EMULATORS, ControlServer, find, running
 from netem.control.emulator_commands import Client
-from netem.control.emulator_session import EMULATORS, find, running
+from netem.control.emulator_statistics import CommandQueue
 from netem.relay_links import DIRECTIONS
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError

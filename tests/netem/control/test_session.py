@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.emulator_session import find, published, running
+from netem.control.control_server import find, published, running
 from noack.core.errors import CallerError
 
 LAB = "lab"
@@ -50,7 +50,7 @@ def test_unfit_names_are_refused(name: str) -> None:
 
 HOLDER = """
 import sys
-from netem.control.emulator_session import published
+from netem.control.control_server import published
 with published("dead"):
     print("published", flush=True)
     sys.stdin.read()

@@ -3,9 +3,10 @@ from typing import Any
 
 import pytest
 
-from netem.control.control_server import AppliedSettings, Snapshot
 from netem.control.emulator_statistics import (
+    AppliedSettings,
     DirectionStatistics,
+    Snapshot,
     Statistics,
     statistics,
 )

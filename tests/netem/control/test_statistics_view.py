@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import pytest
 from rich.console import Console
 
-from netem.control.control_server import CommandQueue
-from netem.control.emulator_statistics import Statistics, statistics
+from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
 from netem.control.statistics_view import History, plain_lines, render
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine import relay_memory
+from netem import relay_memory
 from netem.relay_links import DirectionReport, raise_file_limit
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError

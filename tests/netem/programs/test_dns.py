@@ -20,7 +20,7 @@ import pytest
 from dnslib import RR, DNSRecord
 from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 
-from netem.cli.emulator_options import LINK_NAME
+from netem.emulator_options import LINK_NAME
 from netem.tc_words import settings_of
 from tests.netem.programs.conftest import FORWARDED, Emulate
 from tests.oracles.link import Link

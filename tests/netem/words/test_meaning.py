@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.explain_links import settings_meaning
+from netem.emulator_options import settings_meaning
 from netem.tc_words import settings_of
 
 DRAWS = 20_000
