@@ -10,9 +10,9 @@ from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_process import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.joint_spectral_radius import ACCURACY
-from noack.theory.loss_margin import LossMargin, Stability, capped
-from noack.theory.mean_square_growth import RandomGrowth
+from noack.theory.margins.joint_spectral_radius import ACCURACY
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped
+from noack.theory.random_losses.mean_square_growth import RandomGrowth
 
 MOST_M = 16
 

@@ -45,7 +45,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.theory.assumptions import assumptions
+from noack.theory.certificates.assumptions import assumptions
 
 
 @dataclass(frozen=True)

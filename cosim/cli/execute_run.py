@@ -114,7 +114,7 @@ def warn_of_violations(scenario: "Scenario") -> None:
     from noack.config.link_load import link_loads, load_warnings, require_capacity
     from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
-    from noack.theory.assumptions import AssumptionStatus, assumptions
+    from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 
     require_capacity(scenario)
     shares = len(loop_names(scenario)) > 1

@@ -33,7 +33,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.identities import ModelDifference
+from noack.theory.paper.error_bounds import ModelDifference
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]

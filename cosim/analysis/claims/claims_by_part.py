@@ -6,7 +6,7 @@ the controller received: there x_s = x, and x_c is reset to x. There are no clai
 
 Such a part starts with an input of the part before: until the plant applies the first input of the
 new part, u was computed from older updates. ‖u − Kx‖ is recorded, and the certificate holds if it
-covers input errors of this size (:class:`noack.theory.scenario_certificates.CertificateScope`).
+covers input errors of this size (:class:`noack.theory.certificates.scenario_certificates.CertificateScope`).
 
 The processes of a stopped run end some milliseconds apart. Claims and conditions are checked up to
 the last time that all of them reached, because the loop is incomplete after it.
@@ -42,8 +42,8 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
-from noack.theory.persistent_causes import forcing_of
-from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
+from noack.theory.bounds.disturbances import forcing_of
+from noack.theory.certificates.conditions import about_setpoint, void_at_setpoint
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")

@@ -21,7 +21,7 @@ from noack.config.state_estimation import assumed_model
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.theory.run_conditions import network_delay_ns
+from noack.theory.certificates.conditions import network_delay_ns
 from plant_server.disturbance_signal import disturbance_of
 from plant_server.measurement import measurement_model_of
 from plant_server.plant import plant_of

@@ -10,9 +10,9 @@ import numpy as np
 
 from noack.core.linear_systems import Vector
 from noack.theory import lost_events, sharpened_bounds
-from noack.theory.delivery_flow import DeliveryFlow, Reach
-from noack.theory.plant_gains import PlantGains
-from noack.theory.sharpened_bounds import InvariantEllipsoids
+from noack.theory.bounds.gains import PlantGains
+from noack.theory.certificates.delivery_flow import DeliveryFlow, Reach
+from noack.theory.certificates.solution import InvariantEllipsoids
 
 
 def only_the_start() -> AbstractContextManager[Any]:

@@ -7,12 +7,11 @@ from unittest.mock import patch
 
 from noack.config.scenario import Scenario
 from noack.theory import certificate, scenario_certificates
-from noack.theory.certificate_terms import Constants, NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_growth import TriggerBound
-from noack.theory.error_inequalities import ErrorInequalities, ErrorWay
-from noack.theory.scenario_certificates import certify, trigger_bounds
-from noack.theory.trigger_bounds import TriggerBounds
+from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound
+from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.inequalities import ErrorInequalities, ErrorWay
+from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from noack.trigger.error_promise import ErrorPromise
 
 Conditions = NetworkConditions

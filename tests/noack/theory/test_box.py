@@ -12,13 +12,11 @@ from hypothesis import assume, find, given, settings
 from hypothesis import strategies as st
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.box import BoxGains
-from noack.theory.certificate import solve
-from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
-from noack.theory.error_gains import Output
-from noack.theory.error_growth import TriggerBound
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.plant_gains import Coefficients, PlantGains
+from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import Coefficients, Output, PlantGains
+from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound, VoidError
+from noack.theory.certificates.solution import solve
 from tests.noack.theory.loops import (
     RUNS,
     SEARCH,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
-from noack.theory.certificate_terms import VoidError
+from noack.theory.bounds.terms import VoidError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.loops import (
     SEARCH,

@@ -15,9 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.contraction import decay_of, spectral_norms
-from noack.theory.enclosure import factors, norm_bounds, response, response_until
-from noack.theory.kernel_bounds import KernelBounds, NotDecayingError
+from noack.theory.bounds.contraction import decay_of, spectral_norms
+from noack.theory.bounds.enclosure import (
+    KernelBounds,
+    NotDecayingError,
+    factors,
+    norm_bounds,
+    response,
+    response_until,
+)
 
 Rng = np.random.Generator
 

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.theory.identities import ModelDifference
+from noack.theory.paper.error_bounds import ModelDifference
 
 H = np.array([[-0.3, 1.0, 0.2], [-2.0, -0.1, 0.0], [0.5, 0.0, 0.4]])
 GROWTH = max(float(np.linalg.norm(expm(H * t), 2)) for t in np.linspace(0, 13 * 0.4, 100))

@@ -22,8 +22,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
-from noack.theory.delivery_graph import EventTimes, bursts_of
-from noack.theory.loss_margin import LossMargin, capped
+from noack.theory.margins.loss_margin import EventTimes, LossMargin, bursts_of, capped
 
 ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'

@@ -6,10 +6,9 @@ import pytest
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from noack.impairments.loss_process import LossProcess
-from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.error_gains import ErrorGains
-from noack.theory.plant_gains import PlantGains
-from noack.theory.random_losses import moment_at_events, moments
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, VoidError
+from noack.theory.random_losses.moments import moment_at_events, moments
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import loop_of
 from tests.noack.theory.loops import System, random_system

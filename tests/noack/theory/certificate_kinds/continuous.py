@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.terms import NetworkConditions, VoidError
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
