@@ -23,8 +23,13 @@ from noack.theory.certificates.conditions import (
     nominal_conditions,
     void_at_setpoint,
 )
-from noack.theory.certificates.design import NetworkLimits, choose_weight, network_limits
-from noack.theory.certificates.scenario_certificates import box, own_plant
+from noack.theory.certificates.scenario_certificates import (
+    NetworkLimits,
+    box,
+    network_limits,
+    own_plant,
+)
+from noack.theory.certificates.weight import choose_weight
 from noack.theory.margins.loss_margin import LossMargin, Stability
 from noack.theory.paper.theorems import Theorem2, theorem_2
 from noack.theory.random_losses.moments import UnlimitedLosses, unlimited_losses

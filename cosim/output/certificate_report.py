@@ -15,8 +15,7 @@ from noack.core.number_format import duration
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX
-from noack.theory.certificates.design import MOST_S
-from noack.theory.certificates.scenario_certificates import outside_box
+from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 
 
 def print_certificates(console: Console, found: Certificates) -> None:

@@ -12,7 +12,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.certificates.design import choose_weight
+from noack.theory.certificates.weight import choose_weight
 
 NORMS = ("identity", "given", "chosen")
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)

@@ -15,7 +15,6 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.core.lyapunov_equation import solve_lyapunov
 
 Stack = NDArray[np.float64]
-
 EPSILON = 8 * float(np.finfo(float).eps)
 """Times n and the product of the factors' magnitudes, this exceeds the rounding of a product."""
 

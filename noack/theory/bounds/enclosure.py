@@ -31,29 +31,19 @@ from noack.theory.bounds.contraction import (
 )
 
 _ROUNDING = 1.0 + 1e-9
-
 _TAYLOR_TERMS = 4
-
 _LARGEST_EXPONENT = 100.0
-
 _BLOCK = 64
-
 _FIRST_STEP, _STEP = 0.05, 0.2
 """Step lengths as shares of the fastest mode's time constant."""
-
 _SAG = 0.005
 """A step may become longer if the chord deviates from e^{Gτ}D by at most this share of its norm."""
-
 _CELLS_PER_BLOCK = 256
-
 _MOST_CELLS = 60_000
-
 _MOST_ENTRIES = 4_000_000
 """Largest number of entries of all matrices of a response. With many states there are fewer cells,
 and the looser bound beyond the grid applies earlier."""
-
 _TAIL_SHARE = 1e-5
-
 Name = TypeVar("Name", bound=str)
 
 
@@ -215,10 +205,6 @@ class ResponseBounds:
         middle = 0.5 * (norms[:-1] + norms[1:])
         bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[0, 0]
         return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
-
-
-_FIRST_STEP, _STEP = 0.05, 0.2
-"""Step lengths as shares of the fastest mode's time constant."""
 
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:

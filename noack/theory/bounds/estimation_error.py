@@ -30,10 +30,8 @@ from noack.theory.bounds.gains import Forcing
 from noack.theory.bounds.terms import EstimationBound
 
 Stack = NDArray[np.float64]
-
 MISMATCH = "Â − A"
 """Name of the output by which the plant's steps differ from the model's."""
-
 _MOST_GAINS = 1500
 _SETTLED = 1e-9
 _MOST_STEPS = 100_000

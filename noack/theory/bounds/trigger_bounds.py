@@ -24,23 +24,17 @@ from noack.trigger.trigger_rule import TriggerRule
 
 _AVERAGED = 2.0 ** np.arange(-6, 5)
 """Times over which an integral is averaged, in time constants of the model."""
-
 _NONE = (
     "where the rule does not transmit, e_s may still have any size; "
     'combine it with policy = "deadline"'
 )
-
 _ACCUMULATE = (
     "events may accumulate, since no threshold keeps them apart; "
     'test the rule at sampling times, or combine it with policy = "dwell"'
 )
-
 COARSE_CELLS = 64
-
 _FINE_CELLS = 256
-
 _SHORTEST_S, LONGEST_S = 1e-9, 1e6
-
 _PICARD_ROUNDS = 8
 
 
@@ -231,9 +225,6 @@ class TriggerBounds:
 
 def _rounded_up(time_s: float, step_s: float) -> float:
     return step_s * math.ceil(time_s / step_s - 1e-9) if step_s else time_s
-
-
-_SHORTEST_S, LONGEST_S = 1e-9, 1e6
 
 
 class ErrorGrowth:

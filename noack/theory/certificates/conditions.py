@@ -17,10 +17,8 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.terms import NetworkConditions
 
 OWN_PLANT = "the scenario's plant"
-
 BOX = "every plant of the uncertainty box"
 """The plants that a certificate covers, by name."""
-
 _AT_REST = 1e-9
 """The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
 

@@ -37,53 +37,32 @@ from noack.theory.bounds.enclosure import KernelBounds
 from noack.theory.bounds.gains import Output, PlantGains
 
 _CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
-
 _MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
-
 _LOGITS = np.append(np.arange(-12.0, 13.0, 2.0), 40.0)
-
 _ALONE = 40.0
 """λ = 1, to rounding: only ‖Λξ‖ ≤ 1 is used."""
-
 _NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
-
 _AT_ONCE = 16
-
 SHARES = np.array([
     (first, (1 - first) * (1 - last), (1 - first) * last)
     for first in (0.01, 0.03, 0.1, 0.3) for last in (0.1, 0.3, 0.5, 0.7, 0.9)
 ])  # fmt: skip
 """Of the three conditions that hold after the last node."""
-
 _TAYLOR_TERMS = 4
-
 ROUNDING = 1 + 1e-5
 """Exceeds the error of e^{Fτ}: measured below 1e-12 of its norm, which is up to 1e6; no proof."""
-
 _NEAR, _RATIO, _MOST_NODES = (0.0, 0.5, 0.75, 1.0), 1.1, 80
 """First nodes of r in units of δ; then the ratio from node to node."""
-
 _LATEST = 6.0
 """Largest r in units of δ at which events are looked for."""
-
 _SOUGHT = 0.8
 """‖e^{(H+αI)r}‖_W at the last r, if possible."""
-
 _WORTH = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
-
 _NOTHING = 1e-3
 """Bound of ‖e_c‖ at a delivery, where it is 0, in β."""
-
 _ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
-
 _LATE_TERMS, _CONDITION = 8, 1e-10
-
-_CELLS_PER_STEP, _FIRST_STEP, _MOST_STEP = 32, 0.005, 0.02
-
-_MOST_GROWTH, _SETTLED, _MOST_CELLS = 1e6, 0.03, 3000
-
-_NEIGHBOURS, _WIDTHS = np.array([-1.0, 0.0, 1.0]), np.array([1.5, 0.75, 0.37, 0.18, 0.09])
 
 
 class DeliveryFlow:
@@ -299,14 +278,6 @@ def _semi_axes(singular: Vector, logits: Vector) -> Stack:
 def _columns(stacks: list[Stack]) -> Matrix:
     """Return stacks of the same shape (k, 2n, n) side by side."""
     return np.asarray(np.concatenate(stacks).transpose(1, 0, 2).reshape(stacks[0].shape[1], -1))
-
-
-_NEAR, _RATIO, _MOST_NODES = (0.0, 0.5, 0.75, 1.0), 1.1, 80
-"""First nodes of r in units of δ; then the ratio from node to node."""
-
-_ROUNDS, _POWER, _LEAST_WEIGHT, _NEARLY = 40, 0.3, 1e-9, 0.97
-
-_LATE_TERMS, _CONDITION = 8, 1e-10
 
 
 def errors_after_losses(

@@ -27,16 +27,12 @@ from noack.theory.certificates.solution import solve_sum
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
-
 Added = tuple[Constants, Constants | None]
 """Constants whose bounds are added."""
-
 _RATES = (0.05, 0.2, 0.4, 0.7)
 """Rates that are tried, as shares of the loop's decay rate."""
-
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
-
 Found = TypeVar("Found", bound=Sequence[Constants])
 
 

@@ -39,13 +39,9 @@ from noack.theory.bounds.trigger_bounds import (
 )
 
 _SIGNALS = 6
-
 _CELLS = 2048
-
 _MOST_BINS = 1 << 16
-
 _ROUNDING = 1 + 1e-9
-
 _EPSILON = float(np.finfo(float).eps)
 
 

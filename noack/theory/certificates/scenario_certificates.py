@@ -26,25 +26,16 @@ from noack.theory.certificates.solution import solve
 
 MOST_S = 10.0
 """No larger times are tried."""
-
 _LEAST_S, _USUAL_S = 1e-6, 1e-3
-
 _RESOLUTION = 1e-3
-
 _WIDER, _NEXT = 4.0, 1.2
-
 _STEPS = 6
 """After so many steps the middle is tried, if interpolation has not found the limit."""
-
 Points = Sequence[tuple[float, float]]
 """Logarithms of loop gains, and of their times."""
-
 _SLOWER = 0.9
-
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
-
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
-
 Phases = tuple[Constants, Constants | None, Constants | None]
 """The constants, those from the floor on, and those under persistent causes."""
 
@@ -351,11 +342,6 @@ def _is_finite(constants: Constants) -> bool:
     """Return whether every constant is finite; only the inter-event time may be infinite."""
     numbers = [v for v in constants._replace(inter_event_s=None) if v is not None]
     return all(map(math.isfinite, numbers)) and not math.isnan(constants.inter_event_s or 0.0)
-
-
-_LEAST_S, _USUAL_S = 1e-6, 1e-3
-
-_WIDER, _NEXT = 4.0, 1.2
 
 
 class NetworkLimits(NamedTuple):

@@ -43,32 +43,21 @@ from noack.theory.certificates.delivery_flow import (
 from noack.theory.certificates.inequalities import ErrorInequalities, ErrorWay
 
 _SETTLED = 1e-3
-
 _SHARPER = 0.99
 """Bounds from the flow are computed again if Δ has become smaller by this factor."""
-
 _ATTEMPTS = 200
-
 _MARGINS = (1.0, 1.01, 1.02, 1.05, 1.08, 1.12, 1.2, 1.35)
 """Factors of the ellipsoid's computed size that are tried."""
-
 _STARTS = [(-1.5, -2.0, -7.0), (0.0, -7.0, -7.0), (-1.5, 0.0, -1.0), (-1.5, -7.0, -1.0)]
 """Parameters of the ellipsoid that are tried first."""
-
 _DIRECTIONS = np.vstack([np.eye(3), -np.eye(3)])
-
 _WIDTHS = (1.5, 1.5, 1.5, 0.8, 0.8, 0.4, 0.4, 0.2)
 """Changes of one parameter in each round of the search."""
-
 _COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
 """Multipliers μ: all of them, and around the best one."""
-
 _NODES, _CRITICAL = 16, 4
-
 _SHORT, _MOST_STEPS = 0.005, 16
-
 _ILL_CONDITIONED = 1e8
-
 _LEAST_SHARE = 1e-6
 
 
@@ -229,14 +218,6 @@ def _smallest(
     if not found:
         raise void
     return min(found, key=lambda one: sum(constants.state for constants in one[0]))
-
-
-_COARSE, _FINE = np.exp(np.arange(-9.0, 13.0, 3.0)), np.exp(np.linspace(-2.0, 2.0, 9))
-"""Multipliers μ: all of them, and around the best one."""
-
-_NODES, _CRITICAL = 16, 4
-
-_SHORT, _MOST_STEPS = 0.005, 16
 
 
 class SharpenedBounds(NamedTuple):

@@ -16,15 +16,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 
 _UNIT = 2.0**-53
-
 _ENLARGED = 1 + 2.0**-40
-
 _UNDERFLOW = 1e-290
-
 _DIGITS = 384
-
 _ONE = 1 << _DIGITS
-
 _TERMS = 60
 """Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
 

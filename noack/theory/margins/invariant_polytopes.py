@@ -16,26 +16,16 @@ from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
 from noack.theory.margins.switched_system import Cycle, SwitchedSystem
 
 _EXCHANGES = 400
-
 _IMPROVEMENT = 1e-11
-
 _PIVOT = 1e-9
-
 _PRODUCTS = 250_000
 """Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
-
 _NONE = -1
-
 _ENLARGED = 1 + 2.0**-40
-
 UNIT = 0.1
-
 _INSIDE = 1 - 1e-9
-
 _MUCH_LARGER = 1.3
-
 _ROUNDS = 60
-
 _FARTHEST = 1e3
 """Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
 

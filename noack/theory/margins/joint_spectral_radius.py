@@ -28,45 +28,26 @@ from noack.theory.margins.switched_system import (
 )
 
 ACCURACY = 2e-4
-
 _COARSER, _COARSEST = 4.0, 1e15
-
 _MOST_CYCLE_EDGES = 60
 """Largest length of the cycles that are tried, also in a graph of more nodes."""
-
 MOST_VERTICES = 800
-
 MOST_LEAVING = 60
 """Largest number of edges that leave a node for which polytopes are tried."""
-
 _FASTEST, _STEADY = 8, 17
-
 _REMEMBERED = 3
 """Classes of edges that a node remembers in the second search for quadratic norms."""
-
 _LEAST_GROWTH = 1e-3
 """Growth of the polytopes if no cycle grows, relative to the largest norm of a matrix."""
-
 MOST_ENTRIES = 300
 """Largest number of entries of all T_v; for more, the search takes too long: they are all equal."""
-
 _SHARPNESS = (10.0, 100.0, 1000.0, 10000.0)
-
 _STEPS = 200
-
 _FIRST_EDGES, _FURTHER_EDGES = 48, 24
-
 _ATTEMPTS = 8
-
 _SETTLED = 1e-4
-
 _SMALLEST = 1e-300
-
 _ENLARGED = 1 + 2.0**-40
-
-_COARSER, _COARSEST = 4.0, 1e15
-
-_FASTEST, _STEADY = 8, 17
 
 
 class _CycleSearch(NamedTuple):
@@ -185,9 +166,6 @@ def _growth(cycle: Cycle) -> float:
 
 def _largest(system: SwitchedSystem) -> float:
     return max(float(np.abs(edge.matrix.middle).max()) for edge in system.edges)
-
-
-_FIRST_EDGES, _FURTHER_EDGES = 48, 24
 
 
 class QuadraticNorms(NamedTuple):

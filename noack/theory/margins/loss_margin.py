@@ -41,18 +41,12 @@ from noack.theory.random_losses.mean_square_growth import (
 from noack.trigger.trigger_rule import NEVER_NS
 
 MOST_EDGES = 5000
-
 _MOST_SLOTS = 100
-
 _MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
 """Loss probability up to which almost all runs are examined; rarer bursts are bounded together."""
-
 _TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
-
 _FIRST_ACCURACY = 1e-2
-
 _QUICK_ACCURACY = 3e-2
-
 _LAST_ACCURACY = 1e-8
 
 
@@ -149,10 +143,6 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
         burst._replace(target=lowest[classes[burst.target]])
         for node in lowest.values() for burst in leaving[node]
     ]  # fmt: skip
-
-
-_MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
-"""Loss probability up to which almost all runs are examined; rarer bursts are bounded together."""
 
 
 class Stability(NamedTuple):

@@ -12,14 +12,10 @@ from noack.core.linear_systems import Matrix
 from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, inverse
 
 _ITERATIONS = 60
-
 _ROUNDEST = 1e-6
 """Smallest eigenvalue of a quadratic form, relative to the largest one."""
-
 _TINY = float(np.finfo(np.float64).tiny)
-
 _SQUARINGS = 44
-
 _SUBTRACTED = 1 - 1e-15
 
 

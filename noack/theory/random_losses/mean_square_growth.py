@@ -29,8 +29,6 @@ _MOST_ENTRIES = 2600
 """Largest size of the operator's matrix."""
 _ABOVE = 1e-7
 """The upper bound of the growth is this share above the computed one."""
-
-
 _WEIGHTS = (1.0, 1.5, 2.0, 3.0)
 """The norms are balanced for maps whose bursts count p^(weight · j/2)."""
 _PAIRS, _TRIPLES = 40, 14

@@ -39,22 +39,13 @@ from noack.theory.certificates.inequalities import solve_inequalities
 from noack.theory.certificates.scenario_certificates import CertificateScope
 
 _TERMS = 1024
-
 _CELLS = 64
-
 _A, _PI, _ONE = np.eye(3)
 """a, π and 1; every other signal is bounded by a combination of them."""
-
 ORDERS = (1, 2)
-
 _MOST_BURST = 64
-
 _CERTAIN = 1 - 1e-9
-
 _SLOWER = 0.9
-
-_A, _PI, _ONE = np.eye(3)
-"""a, π and 1; every other signal is bounded by a combination of them."""
 
 
 class Moments(NamedTuple):
