@@ -22,8 +22,7 @@ from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Vector
-from noack.observers.estimation_model import EstimationModel
-from noack.observers.observer_settings import ObserverSettings
+from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import Notice
 
 

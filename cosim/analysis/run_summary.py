@@ -34,7 +34,7 @@ from cosim.record.run_record import RunRecord, no_such_loop
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
-from noack.impairments.kept_loss import expected_loss
+from noack.impairments.loss_prediction import expected_loss
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

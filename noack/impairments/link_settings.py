@@ -5,18 +5,20 @@ between successive packets of a flow. The probability itself stays exact, unlike
 """
 
 from collections.abc import Iterable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from noack.core.errors import CallerError
+from noack.core.core_library import core
 from noack.impairments.constraints import AnyConstraint, longest_burst_of, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.settings.section import ScenarioSection
 
+NEVER_NS: int = core.NOACK_NEVER_NS
+"""A time that never comes."""
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 
@@ -76,27 +78,39 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
             )
 
 
-def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSettings:
-    """Return settings with the files' contents instead of their names.
+@dataclass(slots=True)
+class RecordedDecision:
+    """A recorded decision for a packet: the fields of ``noack_recorded``."""
 
-    Args:
-        settings: settings of one direction of a link.
-        folder: folder to which relative names refer.
-        place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
+    fate: int
+    delay_ns: int
+    """Time from arrival to departure; −1: it never left."""
+    copy_delay_ns: int
+    bit: int
+    copy_bit: int
 
-    Raises:
-        CallerError: one line; a file cannot be read, or has wrong content; or a loss rate cannot
-            be kept.
-    """
-    from noack.impairments.kept_loss import with_kept_loss  # it depends on this module
 
-    impairments = tuple(
-        one.without_files(folder, f"{place}.impairments.{number}" if place else "")
-        for number, one in enumerate(settings.impairments)
-    )
-    read = settings.model_copy(update={"impairments": impairments})
-    try:
-        with_kept_loss(read)
-    except ValueError as error:
-        raise CallerError(f"{place}: {error}" if place else str(error)) from None
-    return read
+@dataclass(slots=True)
+class Counters:
+    """Counts of one direction of a link: the fields of ``noack_counters``."""
+
+    received: int = 0
+    received_bytes: int = 0
+    delivered: int = 0
+    """Fates; see :class:`noack.protocol.record_tables.Fate`."""
+    dropped: int = 0
+    forced: int = 0
+    corrupted: int = 0
+    overflowed: int = 0
+    blacked_out: int = 0
+    duplicated: int = 0
+    held_back: int = 0
+    """Held back for the guarantee."""
+    forwarded: int = 0
+    """Packets and copies that have left."""
+    forwarded_bytes: int = 0
+    delivered_out_of_order: int = 0
+    """Packets that left after a later one of their flow: stale at the receiver."""
+    longest_loss_burst: int = 0
+    """Maximum number of consecutive losses of a flow under the present settings."""
+    most_in_flight: int = 0

@@ -10,21 +10,28 @@ delivered packet. Then
 
 The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}). With windows
 or recovery, the states of the guarantee are part of the chain; see
-:mod:`noack.impairments.guarantee_chain`.
+:mod:`noack.impairments.markov_chain`.
 """
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.errors import CallerError
 from noack.impairments.constraints import guarantee_of
-from noack.impairments.guarantee_chain import constrained_rate, pattern_rate
+from noack.impairments.feature import Impairment
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.markov_chain import (
     LONGEST_PATTERN,
     MOST_STATES,
@@ -32,8 +39,25 @@ from noack.impairments.markov_chain import (
     Chain,
     NotPredictableError,
     Pattern,
+    constrained_rate,
+    moves_of,
+    pattern_rate,
     stochastic,
 )
+from noack.impairments.words import brief_percent
+
+_MOST_SQUARED = 600
+"""States of chain and guarantee up to which powers of their matrix are computed."""
+_MOST_STEPS = 20_000
+_ROUNDING = 1e-12
+_PARTS = 16
+"""In so many parts of the possible probabilities the smallest one is searched."""
+_TINY = 1e-12
+_DIGITS = 12
+"""The probability is rounded, so that every machine draws the same losses."""
+_MOST_FOUND = 1000
+_found: dict[str, float] = {}
+"""Probabilities by :func:`_key`."""
 
 
 class LossPrediction(NamedTuple):
@@ -191,3 +215,224 @@ def _stationary(start: Array, moves: Array) -> Array:
         mean, power = (mean + power @ mean) / 2, stochastic(power @ power)
     distribution: Array = start @ mean
     return distribution
+
+
+@dataclass(frozen=True)
+class LossProcess:
+    """The random losses of a link's packets."""
+
+    start: Array
+    """(n,) distribution before the first packet."""
+    moves: Array
+    """(n, n) transition matrix."""
+    lost: Array
+    """(n,) probability of a loss in each state."""
+    first_delivered: bool = True
+    """Whether the first packet is delivered in any case."""
+
+    @property
+    def is_independent(self) -> bool:
+        """Whether every packet is lost with the same probability, independently."""
+        given = self._loss_given_state
+        return bool(np.ptp(given) <= _ROUNDING)
+
+    @property
+    def largest_probability(self) -> float:
+        """The largest probability that a packet is lost, given any outcomes before it."""
+        return float(self._loss_given_state.max())
+
+    def tails(self, count: int) -> tuple[Array, float]:
+        """Bound the probability that a packet and the j − 1 packets before it are all lost.
+
+        Returns:
+            The bounds, (count,), for j = 1, 2, …; exact if the chain is stationary. And the largest
+            probability, given any past, that the next ``count`` packets are all lost.
+        """
+        lost, weights, found = self.moves * self.lost, np.ones(len(self.start)), []
+        stationary = np.abs(self.start @ self.moves - self.start).max() <= _ROUNDING
+        for _ in range(count):
+            weights = lost @ weights
+            found.append(self.start @ weights if stationary else weights.max())
+        return np.array(found), float(weights.max())
+
+    def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
+        """Return the probability that the first packets keep a guarantee by chance.
+
+        Raises:
+            NotPredictableError: there are too many states or packets.
+        """
+        n = len(self.start)
+        after_loss, after_delivery = moves_of(guarantee, _MOST_STEPS // n)
+        allowed = after_loss >= 0
+        lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
+        at = np.zeros((len(after_loss), n))
+        if self.first_delivered and packets > 0:
+            at[after_delivery[0]] = self.start @ self.moves
+            packets -= 1
+        else:
+            at[0] = self.start
+        if at.size <= _MOST_SQUARED:
+            states = np.arange(len(after_loss))
+            matrix = np.zeros((len(states), n, len(states), n))
+            matrix[states[allowed], :, after_loss[allowed]] += lost
+            matrix[states, :, after_delivery] += passed
+            power = np.linalg.matrix_power(matrix.reshape(at.size, at.size), packets)
+            return float(min((at.ravel() @ power).sum(), 1.0))
+        if packets > _MOST_STEPS:
+            raise NotPredictableError(f"{packets} packets are too many to compute with")
+        for _ in range(packets):
+            following = np.zeros_like(at)
+            np.add.at(following, after_delivery, at @ passed)
+            np.add.at(following, after_loss[allowed], at[allowed] @ lost)
+            at = following
+        return float(min(at.sum(), 1.0))
+
+    @property
+    def _loss_given_state(self) -> Array:
+        """The probability of a loss, given each state before it that can be reached; (k,)."""
+        reached, before = self.start > 0, -1
+        while before != (before := int(np.count_nonzero(reached))):
+            reached = reached | (reached @ self.moves > 0)
+        found: Array = (self.moves @ self.lost)[reached]
+        return found
+
+
+def loss_process(settings: LinkSettings) -> LossProcess:
+    """Return the losses of a link's direction without its guarantee.
+
+    Raises:
+        NotPredictableError: they cannot be computed; the message is the reason.
+    """
+    delayed, reordered = False, False
+    for one in settings.impairments:
+        delayed, reordered = one.reorders(delayed, reordered)
+        if one.prediction_note:
+            raise NotPredictableError(f"the losses are known only {one.prediction_note}")
+    if reordered:
+        raise NotPredictableError("packets may arrive out of order, which counts as a loss")
+    start, moves, lost = joint_chain(settings)
+    return LossProcess(start, moves, lost, settings.first_delivered)
+
+
+def expected_loss(settings: LinkSettings) -> LossPrediction:
+    """Predict the loss rate of a direction, see :func:`predict`; a kept one is as asked.
+
+    Raises:
+        ValueError: a loss rate cannot be kept.
+    """
+    return predict(with_kept_loss(settings))
+
+
+def with_kept_loss(settings: LinkSettings) -> LinkSettings:
+    """Return settings with the probability that gives the asked loss rate.
+
+    Raises:
+        ValueError: there is none; one line.
+    """
+    places = [
+        place
+        for place, one in enumerate(settings.impairments)
+        if isinstance(one, LossOf) and isinstance(one.loss, BernoulliLoss) and one.loss.keep
+    ]
+    if not places:
+        return settings
+    if len(places) > 1:
+        kept = settings.impairments[places[0]].text()
+        raise ValueError(f"{kept}: only one loss of a direction can be kept")
+    key = _key(settings)
+    if key not in _found:
+        remember({key: _probability(settings, places[0])})
+    return _with_probability(settings, places[0], _found[key])
+
+
+def found_probabilities(*links: LinkSettings) -> dict[str, float]:
+    """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
+    keys = [_key(one) for one in links if with_kept_loss(one) is not one]
+    return {key: _found[key] for key in keys}
+
+
+def remember(found: Mapping[str, float]) -> Mapping[str, float]:
+    """Use these probabilities, which another process found, instead of computing them."""
+    while len(_found) > _MOST_FOUND:
+        del _found[next(iter(_found))]
+    _found.update(found)
+    return found
+
+
+def _key(settings: LinkSettings) -> str:
+    """Return all that the prediction depends on."""
+    parts = [one.text() for one in settings.impairments if _matters(one)]
+    return json.dumps([parts, settings.mansd, *(one.text() for one in settings.constraints)])
+
+
+def _matters(impairment: Impairment) -> bool:
+    try:
+        return not impairment.delays or bool(impairment.chains())
+    except NotPredictableError:
+        return True
+
+
+def _with_probability(settings: LinkSettings, place: int, probability: float) -> LinkSettings:
+    kept: Any = settings.impairments[place]
+    loss = kept.loss.model_copy(update={"probability": probability, "keep": False})
+    impairments = list(settings.impairments)
+    impairments[place] = kept.model_copy(update={"loss": loss})
+    return settings.model_copy(update={"impairments": tuple(impairments)})
+
+
+def _probability(settings: LinkSettings, place: int) -> float:
+    from scipy.optimize import brentq  # slow to import
+
+    kept: Any = settings.impairments[place]
+    text, target = kept.text(), kept.loss.probability
+
+    def rate_at(probability: float, of: LinkSettings = settings) -> float:
+        rate, note = predict(_with_probability(of, place, float(probability)))
+        if rate is None:
+            raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
+        return rate
+
+    # Without the guarantee, more packets are lost: all but (1 − p)(1 − others).
+    others = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
+    if others > target and (others := rate_at(0.0)) > target + _TINY:
+        raise ValueError(
+            f"{text}: impossible, the other impairments lose {brief_percent(others)} already"
+        )
+    least = 0.0 if others >= target else (target - others) / (1 - others)
+    places = np.linspace(least, 1.0, _PARTS + 1)
+    rates = [rate_at(least)]
+    for low, high in pairwise(places):
+        if rates[-1] >= target - _TINY:
+            return round(float(low), _DIGITS)
+        rates.append(rate_at(high))
+        if rates[-1] > target + _TINY:
+            found = brentq(lambda one: rate_at(one) - target, low, high, xtol=1e-13)
+            return round(float(found), _DIGITS)
+    if rates[-1] >= target - _TINY:
+        return 1.0
+    most = brief_percent(max(rates))
+    raise ValueError(f"{text}: impossible with this guarantee, which allows at most {most}")
+
+
+def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSettings:
+    """Return settings with the files' contents instead of their names.
+
+    Args:
+        settings: settings of one direction of a link.
+        folder: folder to which relative names refer.
+        place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
+
+    Raises:
+        CallerError: one line; a file cannot be read, or has wrong content; or a loss rate cannot
+            be kept.
+    """
+    impairments = tuple(
+        one.without_files(folder, f"{place}.impairments.{number}" if place else "")
+        for number, one in enumerate(settings.impairments)
+    )
+    read = settings.model_copy(update={"impairments": impairments})
+    try:
+        with_kept_loss(read)
+    except ValueError as error:
+        raise CallerError(f"{place}: {error}" if place else str(error)) from None
+    return read

@@ -11,8 +11,14 @@ import numpy as np
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, PlantStart
-from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
+from noack.plants.plant_settings import (
+    Names,
+    PlantEquations,
+    PlantSettings,
+    PlantStart,
+    PlantSystem,
+    SystemFailedError,
+)
 from noack.settings.user_class import (
     ClassSettings,
     new_instance,

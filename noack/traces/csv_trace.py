@@ -17,8 +17,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from noack.core.errors import shortened
-from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace
-from noack.traces.relative_delay import relative_delays
+from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace, relative_delays
 from noack.traces.trace_formats import TraceFormat
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}

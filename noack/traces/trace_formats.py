@@ -9,12 +9,14 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import IO, Any
 
-from noack.core.errors import CallerError, one_line, why
+from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
 from noack.traces.packet_trace import MAX_PACKETS, PacketTrace
 
 _HEAD_BYTES = 4096
 _GZIP = b"\x1f\x8b"
+_FOLDER = Path(__file__).parent / "shipped"
+_LONGEST = 100
 
 
 @dataclass(frozen=True)
@@ -91,3 +93,26 @@ def _decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
     head = content.read(_HEAD_BYTES)
     content.seek(0)
     return head, content
+
+
+def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
+    """Return the path of a trace given by path, or by the name of a shipped one.
+
+    Args:
+        name: as the user gave it.
+        folder: a relative path is relative to it.
+        named: what a message calls the name; by default the name.
+
+    Raises:
+        CallerError: a bare name that is neither that of a file nor that of a shipped trace.
+    """
+    path = folder / name
+    if len(Path(name).parts) != 1 or Path(name).suffix or len(name) > _LONGEST or path.exists():
+        return path
+    shipped = {one.stem: one for one in _FOLDER.glob("*/*.csv")}
+    if name in shipped:
+        return shipped[name]
+    raise CallerError(
+        f"{named or shortened(name)}: no such file, nor a shipped trace; "
+        f"there are {', '.join(sorted(shipped))}"
+    )

@@ -18,8 +18,7 @@ from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.core.core_library import core, ffi
 from noack.impairments.constraints import guarantee_of
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.impairments.loss_guarantee import LossAutomaton
 from tests.netem import any_settings
 from tests.netem.loss_language import is_allowed

@@ -13,8 +13,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import shortened
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import OWN_TIME_S, TIME, WordReader, time_text
 from noack.settings.named_file import NamedFile
 
 _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"

@@ -9,8 +9,14 @@ from pydantic import Field, model_validator
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
-from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text, without_defaults
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import (
+    COUNT,
+    RATE_BPS,
+    SIGNED_COUNT,
+    WordReader,
+    rate_text,
+    without_defaults,
+)
 
 _QUEUE = 1000
 _HEADERS_BYTES = 28

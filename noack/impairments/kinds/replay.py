@@ -11,32 +11,36 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
-from noack.impairments.markov_chain import NotPredictableError, Pattern
-from noack.impairments.quantities import (
-    OWN_TIME_NS,
-    PERCENT,
-    TIME,
-    brief_number,
-    brief_percent,
-    percent_text,
-    time_ns_text,
-)
-from noack.impairments.trace_offset import (
+from noack.impairments.feature import (
     LONGEST_NS,
+    Impairment,
     Offset,
+    Stage,
+    StageTables,
+    Table,
+    Word,
+    add_numbers,
     offset_meaning,
     offset_ns,
     offset_text,
     read_offset,
     require_inside,
 )
-from noack.impairments.word_reader import WordReader
+from noack.impairments.markov_chain import NotPredictableError, Pattern
+from noack.impairments.words import (
+    OWN_TIME_NS,
+    PERCENT,
+    TIME,
+    WordReader,
+    brief_number,
+    brief_percent,
+    percent_text,
+    time_ns_text,
+)
 from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
 from noack.traces.packet_trace import LOST_NS, PacketTrace
-from noack.traces.shipped_traces import find_trace
-from noack.traces.trace_formats import read_trace
+from noack.traces.trace_formats import find_trace, read_trace
 
 MOST_RECORDS = 1_000_000
 LONGEST_DELAY_NS = 3600 * NS_PER_S

@@ -26,10 +26,11 @@ from noack.impairments.feature import (
     Word,
 )
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.quantities import (
+from noack.impairments.words import (
     NUMBER,
     OWN_TIME_S,
     PERCENT,
+    WordReader,
     brief_number,
     brief_percent,
     number_text,
@@ -37,7 +38,6 @@ from noack.impairments.quantities import (
     percents_text,
     time_text,
 )
-from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
 
 

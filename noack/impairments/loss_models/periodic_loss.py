@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
 from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
-from noack.impairments.quantities import COUNT
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, WordReader
 
 _EXPECTED = "losses per packets, e.g. 2/100"
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import logm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.systems.plant_system import PlantSystem
+from noack.plants.plant_settings import PlantSystem
 
 _STEP_NS = 10_000_000
 _OFF = 1e-4

@@ -23,7 +23,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     outcome_letters,
 )
-from noack.impairments.loss_process import LossProcess
+from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.margins.joint_spectral_radius import (
     ACCURACY,

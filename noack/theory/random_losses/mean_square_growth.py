@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.loss_process import LossProcess
+from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.exact_matrices import exactly

@@ -28,7 +28,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_process import LossProcess, loss_process
+from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains

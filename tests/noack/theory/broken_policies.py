@@ -6,9 +6,9 @@ from typing import Any
 from unittest.mock import patch
 
 from noack.config.scenario import Scenario
-from noack.theory import certificate, scenario_certificates
 from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.certificates import scenario_certificates, solution
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.inequalities import ErrorInequalities, ErrorWay
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
@@ -80,7 +80,7 @@ def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCert
 def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
     """Each part bounds e_c in the way that is tighter for it, and the bounds are added."""
 
-    true = certificate._smallest
+    true = solution._smallest
 
     def smallest(
         steps: Sequence[ErrorInequalities], spacing_s: float
@@ -88,7 +88,7 @@ def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertifi
         found = [true([step], spacing_s) for step in steps]
         return [constants for (constants,), _ in found], found[0][1]
 
-    with patch.object(certificate, "_smallest", smallest):
+    with patch.object(solution, "_smallest", smallest):
         return certify(resolved, conditions)
 
 

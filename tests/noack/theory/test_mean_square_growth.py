@@ -8,7 +8,7 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
-from noack.impairments.loss_process import LossProcess
+from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
 from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.random_losses.mean_square_growth import mean_square_growth, sure_growth

@@ -5,7 +5,7 @@ import pytest
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import simulate_continuous
-from noack.impairments.loss_process import LossProcess
+from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, VoidError
 from noack.theory.random_losses.moments import moment_at_events, moments

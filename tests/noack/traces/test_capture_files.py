@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.traces.capture_blocks import captured_packets
-from noack.traces.udp_headers import CapturedFlow, udp_of
+from noack.traces.capture_packets import CapturedFlow, captured_packets, udp_of
 from tests.noack.traces.capture_files import LINKS, Sent, pcap_of, pcapng_of
 
 families = st.one_of(
