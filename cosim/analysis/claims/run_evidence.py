@@ -31,13 +31,16 @@ from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
 from noack.theory.certificates.conditions import (
     allowed_conditions,
     ideal_conditions,
     nominal_conditions,
 )
-from noack.theory.certificates.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.certificates.scenario_certificates import certify, certify_box
 from noack.theory.paper.error_bounds import ErrorMonitor
 from noack.theory.paper.theorems import Theorem2, theorem_2

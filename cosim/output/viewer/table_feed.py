@@ -41,9 +41,12 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
 from noack.theory.certificates.conditions import allowed_conditions
-from noack.theory.certificates.known_state import KnownStateBounds, known_state_bounds
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper.error_bounds import ErrorMonitor
 

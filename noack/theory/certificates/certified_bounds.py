@@ -1,16 +1,25 @@
 """What a certificate guarantees: bounds over time, under its conditions and assumptions."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.disturbances import forcing_of
+from noack.theory.bounds.enclosure import KernelBounds, response
+from noack.theory.bounds.gains import Output, PlantGains, error_gains
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import Assumption
 from noack.theory.certificates.conditions import OWN_PLANT
+
+Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -147,3 +156,192 @@ def envelope_formula(
         parts.append(formula)
         one = one.other
     return f"{quantity} ≤ {' and ≤ '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class KnownStatePart:
+    """What decays at a rate, or what persists: its constants, with the gains for their rate."""
+
+    plant: PlantGains
+    constants: Constants
+    unit: float
+    """The unit of Δ and of β̃ in the constants."""
+    floor_share: float = 0.0
+    """ε/β: the bounds decay to this share of themselves."""
+
+    @cached_property
+    def _forced(self) -> KernelBounds:
+        return self.plant.forced[Output.STATE]
+
+    @cached_property
+    def _estimated(self) -> KernelBounds:
+        followed = response(self.plant.closed_loop, self.plant.error.inverse_weight)
+        return followed.through(np.eye(len(self.plant.A)))
+
+    def level(self, t_s: Vector) -> Vector:
+        """Return what the scaled bounds are multiplied with, (k,)."""
+        decayed = np.exp(-self.constants.rate_per_s * t_s)
+        return np.asarray(np.maximum(decayed, self.floor_share))
+
+    @property
+    def controller_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖e_c‖_W by the number of missing events, and one for any number."""
+        found = self.constants
+        return self._by_missing(Output.WEIGHTED, self._event_error), found.delta * self.unit
+
+    @property
+    def input_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖u − Kx‖ by the number of missing events, and one for any number."""
+        found = self.constants
+        by_missing = self._by_missing(Output.GAIN, found.received_input_error)
+        return by_missing, max(found.input_error, found.start_error)
+
+    @property
+    def _event_error(self) -> float:
+        """β̃ + η, the largest x_s − x̂ at an event, scaled."""
+        return self.constants.overshoot * self.unit
+
+    def _by_missing(self, output: Output, none: float) -> Vector:
+        """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
+        error, most = self.plant.error, self.constants.missing_events
+        if not error.decays:
+            return np.array([none])
+        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
+        sums = np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
+        return np.asarray(none + sums * self._event_error)
+
+    def deviation(
+        self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float
+    ) -> Vector:
+        """Return the scaled bound of the deviation from the prediction, (k,)."""
+        known, forced = _entries(input_errors, missing), self._forced
+        whole = integral_until(forced, age_s)
+        # In the time d after the event, updates before it may be in flight.
+        latest = np.minimum(age_s, delay_s) * forced.sups(np.maximum(age_s - delay_s, 0.0))
+        found = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
+        if self.constants.estimation_error:
+            found = found + self.constants.estimation_error * self._estimated.sups(age_s)
+        return np.asarray(found)
+
+
+@dataclass(frozen=True)
+class KnownStateBounds:
+    """The bounds of a run from its newest event on, under the conditions of a certificate."""
+
+    parts: tuple[KnownStatePart, ...]
+    """Their bounds are added."""
+    delay_s: float
+    disturbances: Matrix
+    """Columns D_i of disturbances, with the largest value of each, (n, k)."""
+    other: "KnownStateBounds | None" = None
+    """Those of a second certificate, which hold, too."""
+
+    def state_deviation(self, t_s: Vector, age_s: Vector, missing: Counts) -> Vector:
+        """Bound ‖x(t) − e^{M(t−t_k)} x(t_k)‖ at times t, (k,).
+
+        Args:
+            t_s: t, (k,).
+            age_s: t − t_k, the time since the newest event, (k,).
+            missing: number of events after the newest one that the controller has received, (k,).
+        """
+        each = [
+            part.level(t_s) * part.deviation(errors, age_s, missing, self.delay_s)
+            for part, errors in zip(self.parts, self._input_errors, strict=True)
+        ]
+        found = np.asarray(sum(each) + self._disturbed(age_s))
+        if self.other is None:
+            return found
+        return np.asarray(np.minimum(found, self.other.state_deviation(t_s, age_s, missing)))
+
+    def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
+        """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
+        each = [
+            part.level(t_s) * _entries(errors, missing)
+            for part, errors in zip(self.parts, self._controller_errors, strict=True)
+        ]
+        found = np.asarray(sum(each))
+        if self.other is None:
+            return found
+        return np.asarray(np.minimum(found, self.other.controller_error(t_s, missing)))
+
+    @cached_property
+    def _controller_errors(self) -> list[Vector]:
+        return _together([part.controller_errors for part in self.parts])
+
+    @cached_property
+    def _input_errors(self) -> list[Vector]:
+        return _together([part.input_errors for part in self.parts])
+
+    def _disturbed(self, age_s: Vector) -> Vector:
+        if not self.disturbances.size:
+            return np.zeros(len(age_s))
+        edges_s, sums = self._pushed
+        return np.asarray(sums[np.searchsorted(edges_s, age_s, side="left")])
+
+    @cached_property
+    def _pushed(self) -> tuple[Vector, Vector]:
+        """Nodes, and Σ_i ∫‖e^{Ms} D_i‖ds up to each node and over all times."""
+        plant, total = self.parts[-1].plant, 0.0
+        unscaled = plant.closed_loop - plant.alpha_per_s * np.eye(len(plant.A))
+        followed = response(unscaled, self.disturbances)
+        identity = np.eye(len(plant.A))
+        for column in self.disturbances.T:
+            total += response(unscaled, column[:, None]).through(identity).integral()
+        sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
+        return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
+
+
+def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
+    """Return each part's bounds by the number of missing events; the last holds for any number.
+
+    For each number all parts take the bound that is made for it, or all the one for any number:
+    bounds of parts may be added only if they bound the signal in the same way.
+    """
+    count = min(len(by_missing) for by_missing, _ in parts)
+    is_smaller = np.all([by_missing[:count] <= most for by_missing, most in parts], axis=0)
+    return [
+        np.append(np.where(is_smaller, by_missing[:count], most), most)
+        for by_missing, most in parts
+    ]
+
+
+def _entries(table: Vector, missing: Counts) -> Vector:
+    return np.asarray(table[np.clip(missing, 0, len(table) - 1)])
+
+
+def integral_until(kernel: KernelBounds, age_s: Vector) -> Vector:
+    """Return bounds of ∫₀^a k for each a, (j,)."""
+    sums = np.append(0.0, np.cumsum(kernel.area))
+    cell = np.searchsorted(kernel.edges_s, age_s, side="right") - 1
+    inside = np.minimum(cell, len(kernel.area) - 1)
+    within = kernel.highest[inside] * (age_s - kernel.edges_s[inside])
+    part = sums[inside] + np.minimum(within, kernel.area[inside])
+    return np.asarray(np.where(cell < len(kernel.area), part, kernel.integral()))
+
+
+def known_state_bounds(
+    resolved: Scenario, certificate: ScenarioCertificate
+) -> KnownStateBounds | None:
+    """Return the bounds from the newest event; None without a certificate, or for a box."""
+    first, late, rest = (
+        certificate.constants, certificate.floor_constants, certificate.persistent_constants,
+    )  # fmt: skip
+    if first is None or certificate.scope != OWN_PLANT:
+        return None
+    loop = loop_of(resolved)
+
+    def part(constants: Constants, unit: float, floor_share: float = 0.0) -> KnownStatePart:
+        rate = constants.rate_per_s
+        error = error_gains(loop, rate)
+        plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], rate)
+        return KnownStatePart(plant, constants, unit, floor_share)
+
+    level = max(certificate.beta, certificate.floor if first.rate_per_s == 0 else 0.0)
+    parts = [part(first, level or 1.0, 0.0 if late is None else certificate.floor / level)]
+    parts += [] if rest is None else [part(rest, 1.0)]
+    forcing = forcing_of(resolved, loop.B)
+    pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
+    return KnownStateBounds(
+        tuple(parts), certificate.conditions.delay_s, pushes,
+        None if certificate.other is None else known_state_bounds(resolved, certificate.other),
+    )  # fmt: skip

@@ -17,9 +17,8 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.disturbances import forcing_of
+from noack.theory.bounds.disturbances import EstimationError, forcing_of
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.estimation_error import EstimationError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part, TriggerBound, VoidError
 from noack.theory.bounds.trigger_bounds import TriggerBounds

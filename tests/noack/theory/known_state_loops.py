@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from noack.theory.bounds.gains import Output
 from noack.theory.bounds.terms import Constants
-from noack.theory.certificates.known_state import KnownStateBounds, KnownStatePart
+from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownStatePart
 from tests.noack.theory.disturbed_loops import DisturbedLoop, random_disturbed_loop
 from tests.noack.theory.loops import STEPS, System, Trace, random_system, times_s
 

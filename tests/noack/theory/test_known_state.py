@@ -10,7 +10,11 @@ from scipy.linalg import expm
 from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import Constants
-from noack.theory.certificates.known_state import KnownStateBounds, KnownStatePart, integral_until
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    KnownStatePart,
+    integral_until,
+)
 from tests.noack.theory.loops import (
     SEARCH,
     STEPS,

@@ -15,8 +15,7 @@ import numpy as np
 
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import VoidError
-from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.known_state import KnownStateBounds
+from noack.theory.certificates.certified_bounds import KnownStateBounds, ScenarioCertificate
 from tests.noack.theory import disturbed_loops, known_state_loops
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
