@@ -43,12 +43,12 @@ class LinkSettings(ScenarioSection):
 
         A rate limit counts as the transmission time of a full queue of packets of 1,500 bytes.
         """
-        return sum(one.longest_s for one in self.impairments)
+        return sum(impairment.longest_s for impairment in self.impairments)
 
     @property
     def delay_is_bounded(self) -> bool:
         """Whether that is a true bound; packets that must pass a rate limit may take longer."""
-        return all(one.is_bounded for one in self.impairments)
+        return all(impairment.is_bounded for impairment in self.impairments)
 
     @property
     def longest_burst(self) -> int | None:

@@ -20,7 +20,7 @@ _FORBIDDEN, _UNKNOWN = -1, -2
 
 def outcome_letters(delivered: Iterable[bool]) -> str:
     """Return the outcomes of successive packets as text: ``D`` delivered, ``L`` lost."""
-    return "".join("D" if one else "L" for one in delivered)
+    return "".join("D" if outcome else "L" for outcome in delivered)
 
 
 class LossRule(Protocol):

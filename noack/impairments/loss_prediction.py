@@ -78,17 +78,21 @@ def predict(settings: LinkSettings) -> LossPrediction:
     """
     impairments = settings.impairments
     try:
-        parts = [part for one in impairments for part in one.chains()]
+        parts = [part for impairment in impairments for part in impairment.chains()]
         if settings.constraints:
             rate = _constrained_rate(parts, guarantee_of(settings.mansd, settings.constraints))
         else:
             rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:
         return LossPrediction(None, str(error))
-    notes = list(dict.fromkeys(one.prediction_note for one in impairments if one.prediction_note))
+    notes = list(
+        dict.fromkeys(
+            impairment.prediction_note for impairment in impairments if impairment.prediction_note
+        )
+    )
     delayed, reordered = False, False
-    for one in impairments:
-        delayed, reordered = one.reorders(delayed, reordered)
+    for impairment in impairments:
+        delayed, reordered = impairment.reorders(delayed, reordered)
     if settings.longest_burst != 0 and reordered:
         notes.append("not counting packets delivered out of order (stale)")
     return LossPrediction(rate, "; ".join(notes))
@@ -102,7 +106,7 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
     Raises:
         NotPredictableError: there is no such chain; the message is the reason.
     """
-    return _together([part for one in settings.impairments for part in one.chains()])
+    return _together([part for impairment in settings.impairments for part in impairment.chains()])
 
 
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
@@ -166,7 +170,9 @@ def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
         n, others = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
         moves = np.kron(moves, chain.moves).astype(np.float64)
-        done = [one._replace(acts=np.repeat(one.acts, n)) for one in done]
+        done = [
+            chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in done
+        ]
         done.append(chain._replace(acts=np.tile(chain.acts, others)))
     return start, moves, _ineffective(done, states)
 
@@ -304,10 +310,10 @@ def loss_process(settings: LinkSettings) -> LossProcess:
         NotPredictableError: they cannot be computed; the message is the reason.
     """
     delayed, reordered = False, False
-    for one in settings.impairments:
-        delayed, reordered = one.reorders(delayed, reordered)
-        if one.prediction_note:
-            raise NotPredictableError(f"the losses are known only {one.prediction_note}")
+    for impairment in settings.impairments:
+        delayed, reordered = impairment.reorders(delayed, reordered)
+        if impairment.prediction_note:
+            raise NotPredictableError(f"the losses are known only {impairment.prediction_note}")
     if reordered:
         raise NotPredictableError("packets may arrive out of order, which counts as a loss")
     start, moves, lost = joint_chain(settings)
@@ -330,9 +336,11 @@ def with_kept_loss(settings: LinkSettings) -> LinkSettings:
         ValueError: there is none; one line.
     """
     places = [
-        place
-        for place, one in enumerate(settings.impairments)
-        if isinstance(one, LossOf) and isinstance(one.loss, BernoulliLoss) and one.loss.keep
+        number
+        for number, impairment in enumerate(settings.impairments)
+        if isinstance(impairment, LossOf)
+        and isinstance(impairment.loss, BernoulliLoss)
+        and impairment.loss.keep
     ]
     if not places:
         return settings
@@ -347,7 +355,7 @@ def with_kept_loss(settings: LinkSettings) -> LinkSettings:
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
     """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
-    keys = [_key(one) for one in links if with_kept_loss(one) is not one]
+    keys = [_key(link) for link in links if with_kept_loss(link) is not link]
     return {key: _found[key] for key in keys}
 
 
@@ -361,8 +369,10 @@ def remember(found: Mapping[str, float]) -> Mapping[str, float]:
 
 def _key(settings: LinkSettings) -> str:
     """Return all that the prediction depends on."""
-    parts = [one.text() for one in settings.impairments if _matters(one)]
-    return json.dumps([parts, settings.mansd, *(one.text() for one in settings.constraints)])
+    parts = [impairment.text() for impairment in settings.impairments if _matters(impairment)]
+    return json.dumps(
+        [parts, settings.mansd, *(constraint.text() for constraint in settings.constraints)]
+    )
 
 
 def _matters(impairment: Impairment) -> bool:
@@ -372,22 +382,22 @@ def _matters(impairment: Impairment) -> bool:
         return True
 
 
-def _with_probability(settings: LinkSettings, place: int, probability: float) -> LinkSettings:
-    kept: Any = settings.impairments[place]
+def _with_probability(settings: LinkSettings, number: int, probability: float) -> LinkSettings:
+    kept: Any = settings.impairments[number]
     loss = kept.loss.model_copy(update={"probability": probability, "keep": False})
     impairments = list(settings.impairments)
-    impairments[place] = kept.model_copy(update={"loss": loss})
+    impairments[number] = kept.model_copy(update={"loss": loss})
     return settings.model_copy(update={"impairments": tuple(impairments)})
 
 
-def _probability(settings: LinkSettings, place: int) -> float:
+def _probability(settings: LinkSettings, number: int) -> float:
     from scipy.optimize import brentq  # slow to import
 
-    kept: Any = settings.impairments[place]
+    kept: Any = settings.impairments[number]
     text, target = kept.text(), kept.loss.probability
 
     def rate_at(probability: float, of: LinkSettings = settings) -> float:
-        rate, note = predict(_with_probability(of, place, float(probability)))
+        rate, note = predict(_with_probability(of, number, float(probability)))
         if rate is None:
             raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
         return rate
@@ -406,7 +416,7 @@ def _probability(settings: LinkSettings, place: int) -> float:
             return round(float(low), _DIGITS)
         rates.append(rate_at(high))
         if rates[-1] > target + _TINY:
-            found = brentq(lambda one: rate_at(one) - target, low, high, xtol=1e-13)
+            found = brentq(lambda probability: rate_at(probability) - target, low, high, xtol=1e-13)
             return round(float(found), _DIGITS)
     if rates[-1] >= target - _TINY:
         return 1.0
@@ -427,8 +437,8 @@ def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSet
             be kept.
     """
     impairments = tuple(
-        one.without_files(folder, f"{place}.impairments.{number}" if place else "")
-        for number, one in enumerate(settings.impairments)
+        impairment.without_files(folder, f"{place}.impairments.{number}" if place else "")
+        for number, impairment in enumerate(settings.impairments)
     )
     read = settings.model_copy(update={"impairments": impairments})
     try:

@@ -307,7 +307,7 @@ class WordReader:
 
     def unknown(self, word: str, known: Collection[str]) -> NoReturn:
         """Raise a CallerError for an unknown word; name the nearest known word."""
-        longer = sorted(one for one in known if one.startswith(word))
+        longer = sorted(name for name in known if name.startswith(word))
         if longer:
             self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")
         close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)

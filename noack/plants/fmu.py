@@ -187,7 +187,7 @@ class FmuSystem:
         name = description.coSimulation.modelIdentifier + fmpy.sharedLibraryExtension
         if (folder / "binaries" / platform / name).is_file():
             return
-        there = sorted(one.name for one in (folder / "binaries").glob("*") if one.is_dir())
+        there = sorted(entry.name for entry in (folder / "binaries").glob("*") if entry.is_dir())
         has = f"binaries for {', '.join(there)} only" if there else "no binaries"
         sources = (folder / "sources").is_dir()
         hint = "; it has sources, which `fmpy compile` can compile" if sources else ""
@@ -197,7 +197,7 @@ class FmuSystem:
         """Set the start values and initialise the FMU."""
         fmu, variables = self._instance.fmu, _Variables(description)
 
-        def port(key: str, names: Sequence[str], refusal: Refusal = lambda one: None) -> _Port:
+        def port(key: str, names: Sequence[str], refusal: Refusal = lambda variable: None) -> _Port:
             return _Port(fmu, variables.real(key, names, refusal))
 
         self._states = port("state_variables", settings.state_variables, _not_readable)
@@ -272,7 +272,9 @@ class _Variables:
     """
 
     def __init__(self, description: Any) -> None:
-        self._known: Mapping[str, Any] = {one.name: one for one in description.modelVariables}
+        self._known: Mapping[str, Any] = {
+            variable.name: variable for variable in description.modelVariables
+        }
 
     def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Any]:
         """Return real scalars that are not refused."""
@@ -280,22 +282,24 @@ class _Variables:
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
             raise CallerError(f'plant.system.{key}: "{twice}" is named twice')
-        for one in found:
-            if why := _not_a_real_scalar(one) or refusal(one):
-                _refuse(key, one, why)
+        for variable in found:
+            if why := _not_a_real_scalar(variable) or refusal(variable):
+                _refuse(key, variable, why)
         return found
 
     def parameter(self, name: str, value: object) -> tuple[Any, Any]:
         """Return a variable and its start value."""
-        one = self._named("parameters", name)
-        kinds, needed = _VALUES.get(one.type, ((int,), "a whole number"))
+        variable = self._named("parameters", name)
+        kinds, needed = _VALUES.get(variable.type, ((int,), "a whole number"))
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            _refuse("parameters", one, f"is of type {one.type}; give {needed}, not {value!r}")
-        if one.causality == "input":
-            _refuse("parameters", one, "is an input; its value at rest is operating_input")
-        if why := _not_settable(one):
-            _refuse("parameters", one, why)
-        return one, value
+            _refuse(
+                "parameters", variable, f"is of type {variable.type}; give {needed}, not {value!r}"
+            )
+        if variable.causality == "input":
+            _refuse("parameters", variable, "is an input; its value at rest is operating_input")
+        if why := _not_settable(variable):
+            _refuse("parameters", variable, why)
+        return variable, value
 
     def _named(self, key: str, name: str) -> Any:
         if name in self._known:
@@ -316,9 +320,9 @@ class _Port:
     def __init__(self, fmu: Any, variables: Sequence[Any]) -> None:
         self._fmu, self._size = fmu, len(variables)
         places: dict[str, tuple[list[int], list[int]]] = {}
-        for place, variable in enumerate(variables):
+        for index, variable in enumerate(variables):
             at, references = places.setdefault(variable.type, ([], []))
-            at.append(place)
+            at.append(index)
             references.append(variable.valueReference)
         self._places = [(kind, at, references) for kind, (at, references) in places.items()]
 
@@ -341,33 +345,33 @@ def _set(fmu: Any, kind: str, references: Sequence[int], values: Sequence[Any]) 
     getattr(fmu, f"set{kind}")(references, values)
 
 
-def _not_a_real_scalar(one: Any) -> str | None:
-    if one.type not in _REAL:
-        return f"is of type {one.type}; real numbers are needed"
-    return "is an array; name scalar variables" if one.dimensions else None
+def _not_a_real_scalar(variable: Any) -> str | None:
+    if variable.type not in _REAL:
+        return f"is of type {variable.type}; real numbers are needed"
+    return "is an array; name scalar variables" if variable.dimensions else None
 
 
-def _not_readable(one: Any) -> str | None:
-    readable = one.causality in ("output", "local")
-    return None if readable else f"is neither output nor local, but {one.causality}"
+def _not_readable(variable: Any) -> str | None:
+    readable = variable.causality in ("output", "local")
+    return None if readable else f"is neither output nor local, but {variable.causality}"
 
 
-def _not_an_input(one: Any) -> str | None:
-    return None if one.causality == "input" else f"is no input, but {one.causality}"
+def _not_an_input(variable: Any) -> str | None:
+    return None if variable.causality == "input" else f"is no input, but {variable.causality}"
 
 
-def _not_settable(one: Any) -> str | None:
+def _not_settable(variable: Any) -> str | None:
     """Refuse a variable that cannot be set before the initialisation."""
     from fmpy.simulation import settable_in_instantiated
 
-    if settable_in_instantiated(one):
+    if settable_in_instantiated(variable):
         return None
     return "cannot be set at the start"
 
 
-def _not_initial(one: Any) -> str | None:
+def _not_initial(variable: Any) -> str | None:
     """Refuse a variable to which x(0) cannot be written."""
-    why = _not_settable(one)
+    why = _not_settable(variable)
     return why and f"{why}; name variables whose initial is exact or approx, or none: []"
 
 

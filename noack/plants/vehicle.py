@@ -386,7 +386,7 @@ def _compiled(model: str) -> Any:
     from numba.extending import overload, register_jitable
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
-    own = [one for _, one in inspect.getmembers(jump_integrator, inspect.isfunction)]
+    own = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
     functions: set[Callable[..., Any]] = {*_needed(dynamics), *own, rates}
     for function in functions - {lateral}:
         register_jitable(**_OPTIONS)(function)
@@ -431,19 +431,19 @@ def _folder(model: str) -> Path | None:
 def _needed(function: FunctionType) -> list[FunctionType]:
     """Return a function of the library and all library functions that it calls, also indirectly."""
     needed = [function]
-    for one in needed:  # grows
-        needed += [other for other in dict.fromkeys(_named(one)) if other not in needed]
+    for caller in needed:  # grows
+        needed += [other for other in dict.fromkeys(_named(caller)) if other not in needed]
     return needed
 
 
 def _named(function: FunctionType) -> Iterator[FunctionType]:
     names = function.__code__.co_names
     reachable = [function.__globals__.get(name) for name in names]
-    for module in [one for one in reachable if isinstance(one, ModuleType)]:
+    for module in [value for value in reachable if isinstance(value, ModuleType)]:
         reachable += [getattr(module, name, None) for name in names]
-    for one in reachable:
-        if isinstance(one, FunctionType) and one.__module__.partition(".")[0] == _LIBRARY:
-            yield one
+    for value in reachable:
+        if isinstance(value, FunctionType) and value.__module__.partition(".")[0] == _LIBRARY:
+            yield value
 
 
 def _record(parameters: Any) -> NDArray[np.void]:

@@ -242,10 +242,10 @@ def udp_of(interface: int, link_type: int, data: bytes) -> tuple[CapturedFlow, b
     Raises:
         ValueError: the link type is not supported.
     """
-    place = _IP_AT.get(link_type)
-    if place is None:
+    ip_at = _IP_AT.get(link_type)
+    if ip_at is None:
         raise ValueError(f"link type {link_type} is not supported; capture Ethernet or raw IP")
-    at = place(data)
+    at = ip_at(data)
     if at >= len(data):
         return None
     udp = _udp_in_ipv4(data, at) if data[at] >> 4 == 4 else _udp_in_ipv6(data, at)

@@ -140,7 +140,7 @@ def two_captures(
 
     The addresses may differ (NAT, a relay); only the reverse flow of an echo is left out.
     """
-    back = [k for k, one in enumerate(receiver.names) if one.is_reverse_of(flow)]
+    back = [k for k, name in enumerate(receiver.names) if name.is_reverse_of(flow)]
     received = receiver.payloads()
     sent = sender.payloads()
     return (
@@ -156,7 +156,7 @@ def one_capture(
     everything = flows.payloads()
     number = flows.names.index(flow)
     mine = _where(everything, everything.flow == number)
-    back = [k for k, one in enumerate(flows.names) if one.is_reverse_of(flow)]
+    back = [k for k, name in enumerate(flows.names) if name.is_reverse_of(flow)]
     others = _where(everything, ~np.isin(everything.flow, [number, *back]))
     if not len(mine.t_ns):
         return None
@@ -191,24 +191,24 @@ def matched_trace(
             "--sequence-at OFFSET:BYTES"
         )
     matches = _matches(sent, received)
-    place, first = np.unique(matches.sent, return_index=True)
-    if not len(place):
+    arrived, first = np.unique(matches.sent, return_index=True)
+    if not len(arrived):
         raise ValueError(
             "none of the complete datagrams sent is in the receiver's capture; are both captures "
             "of whole packets (tcpdump -s 0), and of the same time?"
         )
-    if len(matches.sent) > len(place):
-        notes.append(f"duplicates at the receiver: {len(matches.sent) - len(place)}")
-    for where, outside in (("first", place[0]), ("last", len(sent.t_ns) - 1 - place[-1])):
+    if len(matches.sent) > len(arrived):
+        notes.append(f"duplicates at the receiver: {len(matches.sent) - len(arrived)}")
+    for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
         if outside:
             notes.append(
                 f"the {where} {outside} sent datagrams did not arrive; if the receiver's capture "
                 "did not run then, they are no losses"
             )
     received_ns = np.zeros(len(sent.t_ns), np.int64)
-    received_ns[place] = received.t_ns[matches.received[first]]
+    received_ns[arrived] = received.t_ns[matches.received[first]]
     lost = np.ones(len(sent.t_ns), bool)
-    lost[place] = False
+    lost[arrived] = False
     trace = packet_trace(
         sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most
     )

@@ -52,7 +52,7 @@ class _Column(NamedTuple):
 def _columns(header: Sequence[str]) -> tuple[_Column | None, _Column, _Column]:
     """Return the columns of numbers (if there is one), of sending and of receiving times."""
     found: dict[str, _Column] = {}
-    for place, name in enumerate(header):
+    for index, name in enumerate(header):
         time = _TIME_COLUMN.fullmatch(name)
         what = time[1].removesuffix(_OTHER) if time else name
         if what in found and (time or what == "sequence"):
@@ -60,7 +60,7 @@ def _columns(header: Sequence[str]) -> tuple[_Column | None, _Column, _Column]:
                 f"line 1: has the columns {found[what].name} and {name}; one is needed"
             )
         if time or what == "sequence":
-            found[what] = _Column(name, place, _UNITS_NS[time[2]] if time else 1)
+            found[what] = _Column(name, index, _UNITS_NS[time[2]] if time else 1)
     for what in ("sent", "received"):
         if what not in found:
             raise ValueError(

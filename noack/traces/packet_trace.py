@@ -140,14 +140,14 @@ def _check_numbers(number: Int64s, row: NDArray[Any], most_packets: int) -> None
 
 def _with_missing(number: Int64s, sent_ns: Int64s, received_ns: Int64s) -> PacketTrace:
     """Return the trace with the missing packets; ``number`` ascends."""
-    place = number - number[0]
-    k = int(place[-1]) + 1
+    index = number - number[0]
+    k = int(index[-1]) + 1
     received = np.full(k, LOST_NS)
-    received[place] = received_ns
-    before = np.searchsorted(place, np.arange(k), side="right") - 1
-    after = np.minimum(before + 1, len(place) - 1)
-    gap = np.maximum(place[after] - place[before], 1)
-    steps = np.arange(k) - place[before]
+    received[index] = received_ns
+    before = np.searchsorted(index, np.arange(k), side="right") - 1
+    after = np.minimum(before + 1, len(index) - 1)
+    gap = np.maximum(index[after] - index[before], 1)
+    steps = np.arange(k) - index[before]
     each, rest = np.divmod(sent_ns[after] - sent_ns[before], gap)
     sent = sent_ns[before] + each * steps + rest * steps // gap
     return PacketTrace(np.arange(k) + number[0], sent, received)

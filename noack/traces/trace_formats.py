@@ -38,7 +38,9 @@ class TraceFormat:
 def _formats() -> Sequence[TraceFormat]:
     entries = iter_modules(import_module(__package__).__path__, f"{__package__}.")
     modules = (vars(import_module(entry.name)) for entry in entries if entry.name != __name__)
-    return [one for module in modules for one in module.values() if isinstance(one, TraceFormat)]
+    return [
+        value for module in modules for value in module.values() if isinstance(value, TraceFormat)
+    ]
 
 
 def read_trace(
@@ -67,12 +69,12 @@ def read_trace(
     try:
         with open_regular(path) as file:
             head, file = _decompressed(file)
-            found = next((one for one in known if one.recognises(head)), None)
+            found = next((candidate for candidate in known if candidate.recognises(head)), None)
             if found is None:
-                names = ", ".join(sorted(one.name for one in known))
+                names = ", ".join(sorted(candidate.name for candidate in known))
                 raise ValueError(
                     f"not a packet trace; {names} can be read, also compressed by gzip"
-                    f"{''.join(f', {one}' for one in others)}; a CSV file "
+                    f"{''.join(f', {other}' for other in others)}; a CSV file "
                     "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
             return found.read(file, most_packets, clocks_differ)
@@ -109,7 +111,7 @@ def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
     path = folder / name
     if len(Path(name).parts) != 1 or Path(name).suffix or len(name) > _LONGEST or path.exists():
         return path
-    shipped = {one.stem: one for one in _FOLDER.glob("*/*.csv")}
+    shipped = {path.stem: path for path in _FOLDER.glob("*/*.csv")}
     if name in shipped:
         return shipped[name]
     raise CallerError(

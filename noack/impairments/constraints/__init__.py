@@ -30,7 +30,7 @@ def longest_burst_of(mansd: int | None, constraints: Sequence[AnyConstraint]) ->
 def guarantee_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
     """Return the rules of cap and constraints together."""
     cap = () if mansd is None else (LongestBurst(mansd),)
-    return LossGuarantee((*cap, *(one.rule for one in constraints)))
+    return LossGuarantee((*cap, *(constraint.rule for constraint in constraints)))
 
 
 def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) -> None:
@@ -40,10 +40,12 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
         ValueError: they cannot; the message begins with the key.
     """
     seen: set[str] = set()
-    for number, one in enumerate(constraints):
-        if one.scope in seen:
-            raise ValueError(f"constraints.{number}: {one.text()}: there is a {one.scope} already")
-        seen.add(one.scope)
+    for number, constraint in enumerate(constraints):
+        if constraint.scope in seen:
+            raise ValueError(
+                f"constraints.{number}: {constraint.text()}: there is a {constraint.scope} already"
+            )
+        seen.add(constraint.scope)
     if constraints and longest_burst_of(mansd, constraints) is None:
         raise ValueError(
             f"constraints: {constraints[0].text()}: needs a maximum of losses, too: "

@@ -115,12 +115,12 @@ class Rate(Impairment):
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
-        disciplines = [one for kind in DISCIPLINES for one in kind.examples()]
+        disciplines = [example for kind in DISCIPLINES for example in kind.examples()]
         rates = ((5_000_000, 1), (5_000_000, 50), (10**8, 5))
         return [
             *(
-                cls(rate_bps=rate_bps, queue=queue, discipline=one)
-                for rate_bps, queue in rates for one in disciplines
+                cls(rate_bps=rate_bps, queue=queue, discipline=discipline)
+                for rate_bps, queue in rates for discipline in disciplines
             ),
             cls(rate_bps=10**9, overhead_bytes=-10, cell_bytes=48, cell_overhead_bytes=5),
         ]  # fmt: skip
@@ -145,7 +145,9 @@ class Rate(Impairment):
 
     def stage(self, tables: StageTables) -> Stage:
         names = ("rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes")
-        return self.discipline.queue_stage({one: getattr(self, one) for one in names}, self.queue)
+        return self.discipline.queue_stage(
+            {name: getattr(self, name) for name in names}, self.queue
+        )
 
     def tc_text(self) -> str:
         cells = (self.cell_bytes, self.cell_overhead_bytes)

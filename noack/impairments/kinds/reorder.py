@@ -73,5 +73,5 @@ class Reorder(CorrelatedChance, Impairment):
         return stage._replace(numbers={**stage.numbers, "gap": self.gap})
 
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        delayed = any(getattr(one, "delay_s", 0) for one in before)
+        delayed = any(getattr(impairment, "delay_s", 0) for impairment in before)
         return "" if delayed else "reordering without a delay before it"

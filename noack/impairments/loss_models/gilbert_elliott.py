@@ -147,7 +147,11 @@ class GilbertElliottLoss(LossModel):
         ]
         means = cls(mean_loss=0.4, mean_burst=3.0)
         common = {"state": "link", "step_s": 0.002}
-        return [*chains, means, *(one.model_copy(update=common) for one in (chains[1], means))]
+        return [
+            *chains,
+            means,
+            *(example.model_copy(update=common) for example in (chains[1], means)),
+        ]
 
     def text(self) -> str:
         common = "" if self.step_s is None else f" common {time_text(self.step_s)}"

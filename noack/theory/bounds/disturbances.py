@@ -57,7 +57,9 @@ class NormalBounds(NamedTuple):
 def normal_bounds(resolved: Scenario) -> NormalBounds | None:
     """Return the bounds for a run; None if nothing is normally distributed."""
     timing, plant = resolved.timing, resolved.plant
-    values = sum(int(one.deviations().any(axis=0).sum()) for one in plant.disturbances)
+    values = sum(
+        int(disturbance.deviations().any(axis=0).sum()) for disturbance in plant.disturbances
+    )
     noisy = any(plant.measurement.noise_std or ())
     if not values and not noisy:
         return None
@@ -73,9 +75,9 @@ def forcing_of(resolved: Scenario, B: Matrix) -> Forcing | None:
         return None
     columns, normal, durations_s = [np.zeros((n, 0))], [np.zeros((n, 0))], list[float]()
     at_input, period_s = np.zeros(m), resolved.timing.plant_period_ns / NS_PER_S
-    for one in plant.disturbances:
-        extent, deviations = one.extent(), one.deviations()
-        if one.at == "input":
+    for disturbance in plant.disturbances:
+        extent, deviations = disturbance.extent(), disturbance.deviations()
+        if disturbance.at == "input":
             at_input = at_input + np.abs(extent).sum(axis=1)
             if bounds is not None:
                 at_input = at_input + bounds.limit * np.abs(deviations).sum(axis=1)
@@ -84,7 +86,7 @@ def forcing_of(resolved: Scenario, B: Matrix) -> Forcing | None:
         columns.append(extent)
         normal.append(deviations[:, deviations.any(axis=0)])
         # The last step begins before the end.
-        durations_s += [one.longest_s + period_s] * extent.shape[1]
+        durations_s += [disturbance.longest_s + period_s] * extent.shape[1]
     D = np.hstack(normal)
     of_normal = None
     if bounds is not None and D.size:
@@ -344,7 +346,7 @@ def _sums_of(C: Matrix, effects: list[Stack]) -> Stack:
     """Return Σ‖C S‖ over each of several numbers of S, (n, r, j) each."""
     if not effects:
         return np.zeros(0)
-    counts = np.cumsum([0, *(one.shape[2] for one in effects[:-1])])
+    counts = np.cumsum([0, *(effect.shape[2] for effect in effects[:-1])])
     norms = largest_gains(times(C, np.concatenate(effects, axis=2)))
     return np.asarray(np.add.reduceat(norms, counts))
 

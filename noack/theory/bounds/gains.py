@@ -228,7 +228,11 @@ class ErrorGains:
             return 0.0
         third = self.outputs[Output.GAIN_CURVATURE] @ self.H
         responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
-        return hold_s**3 / 6 * max(one.through(third).sup_on_grid() for one in responses)
+        return (
+            hold_s**3
+            / 6
+            * max(response_bounds.through(third).sup_on_grid() for response_bounds in responses)
+        )
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
@@ -381,7 +385,9 @@ class PlantGains:
         error = self.error
         lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
         forced = response_until(self.closed_loop, self.input_matrix, until_s, cells)
-        areas = {output: one.area for output, one in forced.through_each(self.stacked).items()}
+        areas = {
+            output: kernel.area for output, kernel in forced.through_each(self.stacked).items()
+        }
         return lost.through(error.outputs[Output.GAIN]).highest, areas
 
     @cached_method

@@ -142,7 +142,7 @@ class TriggerBounds:
             found.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
         if not found:
             raise VoidError(_NONE)
-        is_separated = apart_s or conditions.spacing_s or any(one.reached for one in found)
+        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in found)
         grows_first = level > 0 and self.promise is not None and self.promise.least > 0
         if not is_separated and not grows_first:
             raise VoidError(_ACCUMULATE)
@@ -164,10 +164,10 @@ class TriggerBounds:
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
         alone = [
-            one._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
-            for one in whole.every
+            bound._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
+            for bound in whole.every
         ]
-        return [(one._replace(beta=0.0), one) for one in alone]
+        return [(bound._replace(beta=0.0), bound) for bound in alone]
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""

@@ -68,7 +68,10 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
         found.append(_unstable_and_distinct(loop.A))
     found += [_mansd(resolved), _continuous_time(resolved)]
     if resolved.plant.disturbances:
-        kinds = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
+        kinds = ", ".join(
+            f"{disturbance.kind} at the {disturbance.at}"
+            for disturbance in resolved.plant.disturbances
+        )
         found.append(
             _violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
         )

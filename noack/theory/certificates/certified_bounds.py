@@ -142,19 +142,21 @@ def envelope_formula(
     """Return a certificate's bound of a quantity; ``{:.4g}`` stands for its first constant."""
     in_levels = constant in {"delta", "overshoot"}
     parts: list[str] = []
-    one: ScenarioCertificate | None = certificate
-    while one is not None and one.constants is not None:
-        rate = one.constants.rate_per_s
+    present: ScenarioCertificate | None = certificate
+    while present is not None and present.constants is not None:
+        rate = present.constants.rate_per_s
         decay = f"e^(−{rate:.3g}t)" if rate else ""
-        formula = f"{getattr(one.constants, constant):.4g}" if parts else "{:.4g}"
-        formula += f" {level}" if (level := one.level if in_levels else decay) else ""
-        if (late := one.floor_constants) is not None:
+        formula = f"{getattr(present.constants, constant):.4g}" if parts else "{:.4g}"
+        formula += f" {level}" if (level := present.level if in_levels else decay) else ""
+        if (late := present.floor_constants) is not None:
             unit = " ε" if in_levels else ""
-            formula += f", from {one.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
-        if (rest := one.persistent_constants) is not None:
+            formula += (
+                f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
+            )
+        if (rest := present.persistent_constants) is not None:
             formula += f" + {getattr(rest, constant):.4g}"
         parts.append(formula)
-        one = one.other
+        present = present.other
     return f"{quantity} ≤ {' and ≤ '.join(parts)}"
 
 

@@ -171,9 +171,13 @@ class Starts:
         """
         n = self.flow.n
         moved, h = self.late
-        one, none = np.eye(n), np.zeros((n, n))
-        moved = moved @ np.block([[one, -one], [none, one]])
-        rows = [np.hstack([one, none]) / h, np.hstack([none, one]) / limit, moved[n:] / limit]
+        identity, none = np.eye(n), np.zeros((n, n))
+        moved = moved @ np.block([[identity, -identity], [none, identity]])
+        rows = [
+            np.hstack([identity, none]) / h,
+            np.hstack([none, identity]) / limit,
+            moved[n:] / limit,
+        ]
         return np.array([row.T @ row for row in rows]), moved
 
 
@@ -343,10 +347,10 @@ class _Stage:
         self, reach: Reach, window_s: float, earlier: float, r_s: Vector, flows: Stack
     ) -> None:
         self._flow, self._r_s, self._earlier = reach.starts.flow, r_s, earlier
-        n, one = self._flow.n, np.eye(2 * self._flow.n)
+        n, identity = self._flow.n, np.eye(2 * self._flow.n)
         half = exponential(self._flow.generator * window_s / 2)
-        rows = [one[n:] / earlier, half[n:] / earlier, (half @ half)[n:] / earlier]
-        rows.append(reach.starts.shape @ one[:n] / reach.size)
+        rows = [identity[n:] / earlier, half[n:] / earlier, (half @ half)[n:] / earlier]
+        rows.append(reach.starts.shape @ identity[:n] / reach.size)
         forms = np.array([row.T @ row for row in rows])
         self._forms = np.broadcast_to(forms, (len(r_s), *forms.shape))
         self._z = flows @ half @ half

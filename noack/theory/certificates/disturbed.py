@@ -98,7 +98,7 @@ class DisturbedCertificate:
         for of_start, of_rest in self.trigger.divided(conditions, apart_s):
             with contextlib.suppress(VoidError, NotDecayingError):
                 found.append(self._divided(of_start, of_rest, conditions))
-        return sorted(found, key=lambda one: 0.0 if one[1] is None else one[1].state)
+        return sorted(found, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
 
     def _divided(
         self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
@@ -219,10 +219,10 @@ def soonest(solved: Callable[[float], Found], decay_per_s: float, start: Vector)
     for share in _RATES:
         rate_per_s = share * decay_per_s
         try:
-            one = solved(rate_per_s)
+            constants = solved(rate_per_s)
         except (NotDecayingError, VoidError):
             if not found:
                 raise
             break  # larger rates have larger gains
-        found.append((math.log(max(10 * one[0].state / size, 1.0)) / rate_per_s, one))
-    return min(found, key=lambda one: one[0])[1]
+        found.append((math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants))
+    return min(found, key=lambda timed: timed[0])[1]

@@ -191,7 +191,9 @@ class ErrorInequalities:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._growths = [growths_of(plant, conditions.sampling_s, one) for one in bound.every]
+        self._growths = [
+            growths_of(plant, conditions.sampling_s, part_bound) for part_bound in bound.every
+        ]
 
     def use_windows(self) -> None:
         """Use how many updates may be lost in a window, too."""
@@ -327,9 +329,9 @@ class ErrorInequalities:
             return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
 
         # Of each bound one growth applies, and all bounds hold.
-        found = [_largest([solved(one) for one in growths]) for growths in self._growths]
-        gain = min(one.loop_gain for one in found)
-        bounds = [one.bound for one in found if one.bound is not None]
+        found = [_largest([solved(growth) for growth in growths]) for growths in self._growths]
+        gain = min(solution.loop_gain for solution in found)
+        bounds = [solution.bound for solution in found if solution.bound is not None]
         if not bounds:
             raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
         return gain, np.min(bounds, axis=0)
@@ -371,16 +373,18 @@ class ErrorInequalities:
         passages_s = [
             first_passage_s(
                 self._plant,
-                one.reached - estimation,
+                bound.reached - estimation,
                 found.mismatch,
                 max(others, self._beyond),
                 own,
                 estimation,
             )
-            for one in self._bound.every
-            if one.reached is not None
+            for bound in self._bound.every
+            if bound.reached is not None
         ]
-        limits_s = [one.ago_s or math.inf for one in self._bound.every if one.reached is not None]
+        limits_s = [
+            bound.ago_s or math.inf for bound in self._bound.every if bound.reached is not None
+        ]
         found_s = max(map(min, passages_s, limits_s))
         found_s = max(min(found_s, self._bound.due_s), self._bound.apart_s)
         grid_s = self._conditions.spacing_s
@@ -429,6 +433,6 @@ class _Signals(NamedTuple):
 
 def _largest(found: Sequence[Solution]) -> Solution:
     """Return the larger of several solutions; no bound if one has none."""
-    bounds = [one.bound for one in found if one.bound is not None]
-    gain = max(one.loop_gain for one in found)
+    bounds = [solution.bound for solution in found if solution.bound is not None]
+    gain = max(solution.loop_gain for solution in found)
     return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(found) else None)

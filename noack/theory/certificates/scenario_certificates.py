@@ -174,7 +174,7 @@ class CertificateScope:
             kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
         assumptions = certificate_assumptions(
             self._resolved, conditions, self._decay, first, void,
-            max((one.loop_gain for one in (first, rest) if one is not None), default=0.0),
+            max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
             trigger.text(), kept,
         )  # fmt: skip
         return replace(found, assumptions=tuple(assumptions))
@@ -188,7 +188,7 @@ class CertificateScope:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
             return math.inf
-        return max(one.loop_gain for one in constants[0] if one is not None)
+        return max(phase.loop_gain for phase in constants[0] if phase is not None)
 
     def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> list[Phases]:
         """Return the constants of each bound of the run; all of them hold.
@@ -226,7 +226,7 @@ class CertificateScope:
         alpha = self._trigger.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
         found = self._disturbed.constants(conditions, decays=decays, longest=longest)
-        return [self._checked(*one) for one in found]
+        return [self._checked(*pair) for pair in found]
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:

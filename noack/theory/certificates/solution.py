@@ -166,11 +166,11 @@ def solve_sum(
 
     def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
         found, _ = _smallest(steps, spacing_s)
-        return [one._replace(inter_event_s=inter_event_s) for one in found]
+        return [part_constants._replace(inter_event_s=inter_event_s) for part_constants in found]
 
     apart_s = max(part.bound.apart_s for part in parts)
     least_s = max(conditions.spacing_s, apart_s)
-    if any(all(one.reached is None for one in part.bound.every) for part in parts):
+    if any(all(bound.reached is None for bound in part.bound.every) for part in parts):
         return constants(least_s, apart_s or None)
     void = None
     if not longest:
@@ -187,8 +187,8 @@ def solve_sum(
             found, way = _smallest(steps, spacing_s)
         except VoidError:
             break
-        for step, one in zip(reversed(steps), reversed(found), strict=True):
-            found_s = min(found_s, step.inter_event_s(one, way))
+        for step, part_constants in zip(reversed(steps), reversed(found), strict=True):
+            found_s = min(found_s, step.inter_event_s(part_constants, way))
             if found_s <= least_s:  # often by what persists, which is the last part
                 break
         if found_s >= spacing_s:
@@ -214,10 +214,10 @@ def _smallest(
             try:
                 found.append(([step.constants(spacing_s, way) for step in steps], way))
             except VoidError as error:
-                void = min(void, error, key=lambda one: one.loop_gain)
+                void = min(void, error, key=lambda error: error.loop_gain)
     if not found:
         raise void
-    return min(found, key=lambda one: sum(constants.state for constants in one[0]))
+    return min(found, key=lambda candidate: sum(constants.state for constants in candidate[0]))
 
 
 class SharpenedBounds(NamedTuple):
@@ -285,7 +285,7 @@ class InvariantEllipsoids:
         if not math.isfinite(size):
             return None
         reaches = (Reach(starts, size * margin, limit) for margin in _MARGINS)
-        return next((one for one in reaches if one.is_invariant()), None)
+        return next((reach for reach in reaches if reach.is_invariant()), None)
 
     @cached_property
     def flow(self) -> DeliveryFlow:

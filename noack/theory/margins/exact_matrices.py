@@ -121,9 +121,9 @@ class FixedPointMatrix:
 def fixed(matrix: Matrix) -> FixedPointMatrix:
     """Return a matrix of finite doubles; digits beyond the last are dropped."""
     entries = np.empty(matrix.shape, dtype=object)
-    for place, value in np.ndenumerate(matrix):
+    for index, value in np.ndenumerate(matrix):
         numerator, denominator = float(value).as_integer_ratio()
-        entries[place] = numerator * _ONE // denominator
+        entries[index] = numerator * _ONE // denominator
     return FixedPointMatrix(entries, 1)
 
 

@@ -103,7 +103,9 @@ def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> J
     if only is None:
         cycle = _best_cycle(system, balanced, _SEARCH)
     else:
-        lowers, uppers = zip(*(growth_bounds(one, only) for one in (system, balanced)), strict=True)
+        lowers, uppers = zip(
+            *(growth_bounds(part, only) for part in (system, balanced)), strict=True
+        )
         cycle, upper = Cycle(only if max(lowers) else (), max(lowers)), min(uppers)
     while cycle.growth * (1 + accuracy) < upper and accuracy < _COARSEST:
         growth = max(cycle.growth, _LEAST_GROWTH * _largest(balanced)) * (1 + accuracy)
@@ -147,7 +149,7 @@ def _representatives(system: SwitchedSystem, growths: Vector) -> list[int]:
         steady = sorted(members, key=lambda number: system.edges[number].duration)
         places = np.linspace(0, len(steady) - 1, min(_STEADY, len(steady)))
         found.update(fastest)
-        found.update(steady[place] for place in places.round().astype(int).tolist())
+        found.update(steady[index] for index in places.round().astype(int).tolist())
     return sorted(found)
 
 
@@ -201,7 +203,7 @@ def quadratic_norms(system: SwitchedSystem) -> QuadraticNorms:
         if growths.max() <= growths[numbers].max() + _SETTLED:
             break
         numbers = np.union1d(numbers, np.argsort(-growths)[:_FURTHER_EDGES])
-    return min(best, QuadraticNorms(search.forms, search.bounds()), key=lambda one: one.upper)
+    return min(best, QuadraticNorms(search.forms, search.bounds()), key=lambda norms: norms.upper)
 
 
 def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
@@ -215,8 +217,8 @@ def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
     for number, edge in enumerate(system.edges):
         ends.setdefault(edge.target, []).append(number)
     kinds = {
-        number: place * classes // len(members)
-        for members in ends.values() for place, number in enumerate(members)
+        number: index * classes // len(members)
+        for members in ends.values() for index, number in enumerate(members)
     }  # fmt: skip
     return SwitchedSystem(tuple(
         Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
@@ -235,7 +237,7 @@ def norms_above(matrices: IntervalMatrix) -> Vector:
     turned = exactly(V.middle.swapaxes(1, 2))
     square = turned @ (transposed @ M) @ V
     defect = exactly(np.eye(M.middle.shape[2])) - turned @ V
-    size, missed = (one.magnitude.sum(axis=2).max(axis=1) for one in (square, defect))
+    size, missed = (matrix.magnitude.sum(axis=2).max(axis=1) for matrix in (square, defect))
     with np.errstate(divide="ignore", invalid="ignore"):
         bounds = np.sqrt(size / (1 - missed)) * _ENLARGED
     return np.where(missed < 0.5, bounds, np.inf)
@@ -308,12 +310,12 @@ class _Search:
             yield _Steps(source, target, np.array(members), stack)
 
     def _matrices(self, entries: Vector) -> dict[int, Matrix]:
-        found, place = {}, 0
+        found, begin = {}, 0
         for node, lower in self._nodes.items():
             size = len(lower[0])
             found[node] = np.zeros_like(self.forms[node])
-            found[node][lower] = entries[place : place + size]
-            place += size
+            found[node][lower] = entries[begin : begin + size]
+            begin += size
         return found
 
     def _smooth_maximum(

@@ -131,7 +131,7 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
     while len(set(classes.values())) > count:
         count = len(set(classes.values()))
         seen = {
-            node: frozenset((*one[2:], classes[one.target]) for one in ones)
+            node: frozenset((*burst[2:], classes[burst.target]) for burst in ones)
             for node, ones in leaving.items()
         }
         numbers = {future: number for number, future in enumerate(dict.fromkeys(seen.values()))}
@@ -260,8 +260,8 @@ class LossMargin:
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, refine: bool) -> Stability:
         edges = [
-            Edge(one.source, one.target, self._maps(one.slot, one.steps - 1), one.steps)
-            for one in bursts
+            Edge(burst.source, burst.target, self._maps(burst.slot, burst.steps - 1), burst.steps)
+            for burst in bursts
         ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
@@ -307,9 +307,11 @@ class LossMargin:
 
     def _stability(self, found: JointSpectralRadius, bursts: list[Burst]) -> Stability:
         path = [bursts[number] for number in found.cycle]
-        pattern = [delivered for one in path for delivered in (True, *[False] * one.losses)]
+        pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
         intervals_s = (
-            steps * self._unit_ns / NS_PER_S for one in path for steps in one.intervals(self._times)
+            steps * self._unit_ns / NS_PER_S
+            for burst in path
+            for steps in burst.intervals(self._times)
         )
         return Stability(
             found.lower**self._times.longest, found.upper**self._times.longest,
@@ -356,13 +358,15 @@ def _step_ns(resolved: Scenario) -> int:
 def update_delay_ns(resolved: Scenario) -> int:
     """Return the constant delay of the updates; raise CallerError if it may vary."""
     delay_ns = 0
-    for number, one in enumerate(resolved.network.impairments):
-        constant = isinstance(one, Delay) and not (one.jitter_s or one.samples_s or one.file)
-        if isinstance(one, Delay) and constant:
-            delay_ns += round(one.delay_s * NS_PER_S)
-        elif one.kind not in _TIMELESS:
+    for number, impairment in enumerate(resolved.network.impairments):
+        constant = isinstance(impairment, Delay) and not (
+            impairment.jitter_s or impairment.samples_s or impairment.file
+        )
+        if isinstance(impairment, Delay) and constant:
+            delay_ns += round(impairment.delay_s * NS_PER_S)
+        elif impairment.kind not in _TIMELESS:
             raise CallerError(
-                f"network.impairments.{number}: {one.kind}: the margin is for a constant delay; "
+                f"network.impairments.{number}: {impairment.kind}: the margin is for a constant delay; "
                 "use delay_s alone"
             )
     return delay_ns

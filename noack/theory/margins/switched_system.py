@@ -223,17 +223,17 @@ def find_cycle(system: SwitchedSystem, most_edges: int, beam: int) -> Cycle:
         leaving.setdefault(edge.source, []).append(step)
     paths = [step for steps in leaving.values() for step in steps]
     for _ in range(most_edges):
-        closed = [one for one in paths if one.source == one.target]
-        for one in closed:
+        closed = [path for path in paths if path.source == path.target]
+        for path in closed:
             # A product cannot grow faster than its norm.
-            if one.norm <= (growth * (1 + 1e-12)) ** one.duration:
+            if path.norm <= (growth * (1 + 1e-12)) ** path.duration:
                 continue
-            found = float(np.abs(np.linalg.eigvals(one.product)).max()) ** (1 / one.duration)
+            found = float(np.abs(np.linalg.eigvals(path.product)).max()) ** (1 / path.duration)
             if found > growth * (1 + 1e-12):
-                best, growth = one.edges, found
+                best, growth = path.edges, found
         scale = growth or 1.0
-        paths.sort(key=lambda one: one.norm / max(scale**one.duration, _TINY), reverse=True)
-        paths = [_joined(one, step) for one in paths[:beam] for step in leaving[one.target]]
+        paths.sort(key=lambda path: path.norm / max(scale**path.duration, _TINY), reverse=True)
+        paths = [_joined(path, step) for path in paths[:beam] for step in leaving[path.target]]
     if not best:
         return NO_CYCLE
     return Cycle(best, growth_bounds(system, best)[0])
@@ -260,10 +260,12 @@ def only_cycle(system: SwitchedSystem) -> tuple[int, ...] | None:
     return tuple(path)
 
 
-def _joined(one: _Path, step: _Path) -> _Path:
-    product = step.product @ one.product
-    duration = one.duration + step.duration
-    return _Path(one.edges + step.edges, one.source, step.target, duration, product, _size(product))
+def _joined(path: _Path, step: _Path) -> _Path:
+    product = step.product @ path.product
+    duration = path.duration + step.duration
+    return _Path(
+        path.edges + step.edges, path.source, step.target, duration, product, _size(product)
+    )
 
 
 def _size(matrix: Matrix) -> float:

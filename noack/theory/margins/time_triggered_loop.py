@@ -172,7 +172,7 @@ class TimeTriggeredLoop:
         both = [(t_ns, 0, self._latch) for t_ns in steps]
         both += [(t_ns, 1, self._tick) for t_ns in ticks]
         result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
-        for t_ns, _, occurrence in sorted(both, key=lambda one: one[:2]):
+        for t_ns, _, occurrence in sorted(both, key=lambda occurrence: occurrence[:2]):
             result = occurrence @ self._flow(t_ns - now_ns) @ result
             now_ns = t_ns
         return self._flow(until_ns - now_ns) @ result

@@ -135,20 +135,20 @@ class ErrorMonitor:
         """Add k measurements as :meth:`sample` does; return both bounds, (k, 2)."""
         found = np.zeros((len(t_ns), 2))
         changes = [*np.flatnonzero(events >= 0).tolist(), len(t_ns)]
-        place = 0
+        index = 0
         for event in changes:
-            while place < event:
-                arrived = np.flatnonzero(received[place:event] >= self._oldest)
-                end = place + int(arrived[0]) if len(arrived) else event
-                if place < end:
-                    found[place:end] = self._stretch(t_ns[place:end], e_s[place:end])
+            while index < event:
+                arrived = np.flatnonzero(received[index:event] >= self._oldest)
+                end = index + int(arrived[0]) if len(arrived) else event
+                if index < end:
+                    found[index:end] = self._stretch(t_ns[index:end], e_s[index:end])
                 if end < event:
                     found[end] = self.sample(int(t_ns[end]), e_s[end], -1, int(received[end]))
-                place = end + 1
+                index = end + 1
             if event < len(t_ns):
                 number, newest = int(events[event]), int(received[event])
                 found[event] = self.sample(int(t_ns[event]), e_s[event], number, newest)
-            place = event + 1
+            index = event + 1
         return found
 
     @property

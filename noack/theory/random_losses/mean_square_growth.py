@@ -99,8 +99,8 @@ def _check(operator: Matrix, bound: float, size: int) -> None:
     """
     identity = np.tile(np.eye(size).ravel(), len(operator) // size**2)
     found = np.linalg.solve(bound * np.eye(len(operator)) - operator, identity)
-    forms, images = (one.reshape(-1, size, size) for one in (found, operator @ found))
-    forms, images = ((one + one.transpose(0, 2, 1)) / 2 for one in (forms, images))
+    forms, images = (stack.reshape(-1, size, size) for stack in (found, operator @ found))
+    forms, images = ((form + form.transpose(0, 2, 1)) / 2 for form in (forms, images))
     rounding = 1e-13 * len(operator) * float(np.abs(forms).max()) * max(bound, 1.0)
     for positive in (forms, bound * forms - images):
         if not float(np.linalg.eigvalsh(positive).min()) > rounding:
@@ -153,16 +153,16 @@ def _mean_log_norm(maps: Stack, likely: Vector) -> float:
     Products with a long burst are bounded by the norms of their factors.
     """
     pairs, triples = (min(len(maps), most) for most in (_PAIRS, _TRIPLES))
-    one = _log_norms(maps)
-    two = np.add.outer(one, one)
+    single = _log_norms(maps)
+    two = np.add.outer(single, single)
     both = np.einsum("aij,bjk->abik", maps[:pairs], maps[:pairs])
     two[:pairs, :pairs] = _log_norms(both)
-    three = np.add.outer(two, one)
+    three = np.add.outer(two, single)
     three[:triples, :triples, :triples] = _log_norms(
         np.einsum("abij,cjk->abcik", both[:triples, :triples], maps[:triples])
     )
     return min(
-        float(likely @ one),
+        float(likely @ single),
         float(likely @ two @ likely) / 2,
         float(np.einsum("abc,a,b,c", three, likely, likely, likely)) / 3,
     )

@@ -118,9 +118,9 @@ def moments(
     solved = [
         _Inequalities(error, plant, conditions, beta, share, by_tests=by).solve() for by in ways
     ]
-    best = min(solved, key=lambda one: one.get("state", np.inf))
+    best = min(solved, key=lambda solution: solution.get("state", np.inf))
     if "state" not in best:
-        gain = min(one["loop_gain"] for one in solved)
+        gain = min(solution["loop_gain"] for solution in solved)
         raise VoidError(f"the loop gain of the moments is {gain:.3g}, not below 1")
     return Moments(order=order, rate_per_s=error.alpha_per_s, **best)
 
@@ -191,7 +191,10 @@ class _Inequalities:
         drives, found = (self._state(Output.MISMATCH), self._input), error.now(output) * _A
         recent = [0.0, 0.0]
         if delay_s > 0:
-            recent = [one.through(C).integral_on_grid() for one in self._recent_drive]
+            recent = [
+                drive_response.through(C).integral_on_grid()
+                for drive_response in self._recent_drive
+            ]
             found = found + error.kernels[output].sup(delay_s) * _A
         for drive, area in zip(drives, recent, strict=True):
             found = found + (1.0 if self._by_tests else 1 - self._share) * area * drive
@@ -258,8 +261,8 @@ class UnlimitedLosses:
         """Return all fields for JSON."""
         return {
             **{name: getattr(self, name) for name in self.__dataclass_fields__},
-            "bursts": [one._asdict() for one in self.bursts],
-            "moments": [one._asdict() for one in self.moments],
+            "bursts": [burst._asdict() for burst in self.bursts],
+            "moments": [moment._asdict() for moment in self.moments],
         }
 
 
