@@ -2,8 +2,8 @@
 
 Each packet of the trace is taken as an update of the scenario, sent when it was sent. The
 conditions are those of the scenario's certificates
-(:func:`noack.theory.certificates.conditions.allowed_conditions`). Losses are counted as the claims about a
-run count them: by the rules of the guarantee, and
+(:func:`noack.theory.certificates.conditions.allowed_conditions`). Losses are counted as the claims
+about a run count them: by the rules of the guarantee, and
 :class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
 
 * by losses: from the sending of the packet whose loss is one too many, until a later packet is

@@ -11,7 +11,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from noack.core.core_library import core
-from noack.impairments.constraints import AnyConstraint, longest_burst_of, require_consistent
+from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
@@ -53,7 +53,7 @@ class LinkSettings(ScenarioSection):
     @property
     def longest_burst(self) -> int | None:
         """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
-        return longest_burst_of(self.mansd, self.constraints)
+        return find_longest_burst(self.mansd, self.constraints)
 
     @model_validator(mode="after")
     def _check(self) -> Self:

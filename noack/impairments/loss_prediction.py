@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.errors import CallerError
-from noack.impairments.constraints import guarantee_of
+from noack.impairments.constraints import join_guarantee
 from noack.impairments.feature import Impairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
@@ -40,7 +40,7 @@ from noack.impairments.markov_chain import (
     NotPredictableError,
     Pattern,
     constrained_rate,
-    moves_of,
+    list_moves,
     pattern_rate,
     stochastic,
 )
@@ -80,7 +80,7 @@ def predict(settings: LinkSettings) -> LossPrediction:
     try:
         parts = [part for impairment in impairments for part in impairment.chains()]
         if settings.constraints:
-            rate = _constrained_rate(parts, guarantee_of(settings.mansd, settings.constraints))
+            rate = _constrained_rate(parts, join_guarantee(settings.mansd, settings.constraints))
         else:
             rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:
@@ -254,12 +254,12 @@ class LossProcess:
             The bounds, (count,), for j = 1, 2, …; exact if the chain is stationary. And the largest
             probability, given any past, that the next ``count`` packets are all lost.
         """
-        lost, weights, found = self.moves * self.lost, np.ones(len(self.start)), []
+        lost, weights, tails = self.moves * self.lost, np.ones(len(self.start)), []
         stationary = np.abs(self.start @ self.moves - self.start).max() <= _ROUNDING
         for _ in range(count):
             weights = lost @ weights
-            found.append(self.start @ weights if stationary else weights.max())
-        return np.array(found), float(weights.max())
+            tails.append(self.start @ weights if stationary else weights.max())
+        return np.array(tails), float(weights.max())
 
     def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
         """Return the probability that the first packets keep a guarantee by chance.
@@ -268,7 +268,7 @@ class LossProcess:
             NotPredictableError: there are too many states or packets.
         """
         n = len(self.start)
-        after_loss, after_delivery = moves_of(guarantee, _MOST_STEPS // n)
+        after_loss, after_delivery = list_moves(guarantee, _MOST_STEPS // n)
         allowed = after_loss >= 0
         lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
         at = np.zeros((len(after_loss), n))
@@ -299,8 +299,8 @@ class LossProcess:
         reached, before = self.start > 0, -1
         while before != (before := int(np.count_nonzero(reached))):
             reached = reached | (reached @ self.moves > 0)
-        found: Array = (self.moves @ self.lost)[reached]
-        return found
+        loss_given_state: Array = (self.moves @ self.lost)[reached]
+        return loss_given_state
 
 
 def loss_process(settings: LinkSettings) -> LossProcess:
@@ -359,12 +359,12 @@ def found_probabilities(*links: LinkSettings) -> dict[str, float]:
     return {key: _found[key] for key in keys}
 
 
-def remember(found: Mapping[str, float]) -> Mapping[str, float]:
+def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:
     """Use these probabilities, which another process found, instead of computing them."""
     while len(_found) > _MOST_FOUND:
         del _found[next(iter(_found))]
-    _found.update(found)
-    return found
+    _found.update(probabilities)
+    return probabilities
 
 
 def _key(settings: LinkSettings) -> str:
@@ -416,8 +416,8 @@ def _probability(settings: LinkSettings, number: int) -> float:
             return round(float(low), _DIGITS)
         rates.append(rate_at(high))
         if rates[-1] > target + _TINY:
-            found = brentq(lambda probability: rate_at(probability) - target, low, high, xtol=1e-13)
-            return round(float(found), _DIGITS)
+            root = brentq(lambda probability: rate_at(probability) - target, low, high, xtol=1e-13)
+            return round(float(root), _DIGITS)
     if rates[-1] >= target - _TINY:
         return 1.0
     most = brief_percent(max(rates))

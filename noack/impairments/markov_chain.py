@@ -121,7 +121,7 @@ class Moves(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def moves_of(guarantee: LossGuarantee, most: int) -> Moves:
+def list_moves(guarantee: LossGuarantee, most: int) -> Moves:
     """Return all states of a guarantee.
 
     Raises:
@@ -180,7 +180,7 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
     from scipy import sparse
 
     n = len(start)
-    after_loss, after_delivery = moves_of(guarantee, MOST_JOINT_STATES // n)
+    after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // n)
     count = len(after_loss)
     allowed = after_loss >= 0
 
@@ -228,15 +228,17 @@ def _balance(moves: Any) -> Array:
     from scipy.sparse import eye_array, linalg
 
     count = moves.shape[0]
-    found: Array = np.ones(count)
+    distribution: Array = np.ones(count)
     if count == 1:
-        return found
+        return distribution
     for _ in range(_WARM_UP):
-        found = (found + moves.T @ found) / 2
-    others = np.delete(np.arange(count), likely := int(np.argmax(found)))
+        distribution = (distribution + moves.T @ distribution) / 2
+    others = np.delete(np.arange(count), likely := int(np.argmax(distribution)))
     system = (eye_array(count) - moves.T).tocsc()
     flow = moves[[likely]].toarray()[0, others]
-    found[likely] = 1.0
-    found[others] = np.maximum(linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0)
-    found /= found.sum()
-    return found
+    distribution[likely] = 1.0
+    distribution[others] = np.maximum(
+        linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0
+    )
+    distribution /= distribution.sum()
+    return distribution

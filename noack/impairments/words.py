@@ -62,10 +62,10 @@ class Quantity(Generic[T]):
 
 
 def _split(text: str) -> tuple[Decimal, str]:
-    found = _SPLIT.fullmatch(text)
-    if found is None:
+    match = _SPLIT.fullmatch(text)
+    if match is None:
         raise ValueError
-    return Decimal(found[1]), found[2]
+    return Decimal(match[1]), match[2]
 
 
 def _float(number: Decimal) -> float:

@@ -278,14 +278,14 @@ class _Variables:
 
     def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Any]:
         """Return real scalars that are not refused."""
-        found = [self._named(key, name) for name in names]
+        variables = [self._named(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
             raise CallerError(f'plant.system.{key}: "{twice}" is named twice')
-        for variable in found:
+        for variable in variables:
             if why := _not_a_real_scalar(variable) or refusal(variable):
                 _refuse(key, variable, why)
-        return found
+        return variables
 
     def parameter(self, name: str, value: object) -> tuple[Any, Any]:
         """Return a variable and its start value."""

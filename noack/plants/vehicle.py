@@ -146,7 +146,7 @@ class VehicleSettings(EquationSettings):
             CallerError: the library is not installed, or the vehicle cannot reach the speed.
         """
         self.require_installed()
-        model, parameters = _MODELS[self.library_model], _parameters_of(self)
+        model, parameters = _MODELS[self.library_model], _load_parameters(self)
         speed, servo_s, gain = self.speed_m_per_s, self.steering_s, self.speed_gain_per_s
         if speed > (fastest := parameters.longitudinal.v_max):
             raise CallerError(
@@ -194,7 +194,7 @@ class _Model(NamedTuple):
 
 
 @cache
-def _parameters_of(settings: VehicleSettings) -> Any:
+def _load_parameters(settings: VehicleSettings) -> Any:
     number = _PARAMETERS[settings.parameters]
     parameters = library(f"parameters_vehicle{number}")()
     parameters.tire.p_dx1 *= settings.friction
@@ -375,9 +375,9 @@ def rates(
     for k in range(_WHEELS):
         tyre.signs[k] = signs[k]
     inputs = (v[0] + v[1] * z[2], v[2] + v[3] * z[3])
-    found = dynamics(z.copy(), inputs, parameters[0])  # it modifies z
-    for n in range(len(found)):
-        slope[n] = found[n]
+    derivatives = dynamics(z.copy(), inputs, parameters[0])  # it modifies z
+    for n in range(len(derivatives)):
+        slope[n] = derivatives[n]
     for k in range(_WHEELS):
         cambers[k] = tyre.cambers[k]
 
@@ -413,10 +413,10 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
         turned = p.signs[wheel] * gamma < 0.0
         if turned:
             p.p_hy1, p.p_vy1 = -p.p_hy1, -p.p_vy1
-        found = formula(alpha, gamma, F_z, p)
+        force = formula(alpha, gamma, F_z, p)
         if turned:
             p.p_hy1, p.p_vy1 = -p.p_hy1, -p.p_vy1
-        return found
+        return force
 
     return lateral
 

@@ -141,15 +141,15 @@ def _body(file: IO[bytes], order: str, begin: bytes, done: int) -> bytes:
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
     """Return the options at the end of a block; of several with one code, the last."""
-    found = {}
+    options = {}
     at = 0
     while at + 4 <= len(data):
         code, size = struct.unpack_from(f"{order}HH", data, at)
         if code == 0:
             break
-        found[code] = data[at + 4 : at + 4 + size]
+        options[code] = data[at + 4 : at + 4 + size]
         at += 4 + size + -size % 4
-    return found
+    return options
 
 
 def _interface(order: str, body: bytes) -> _Interface:
@@ -234,7 +234,9 @@ _IP_AT: Mapping[int, Callable[[bytes], int]] = {
 """Place of the IP header, by link type."""
 
 
-def udp_of(interface: int, link_type: int, data: bytes) -> tuple[CapturedFlow, bytes, bool] | None:
+def find_udp(
+    interface: int, link_type: int, data: bytes
+) -> tuple[CapturedFlow, bytes, bool] | None:
     """Return the flow of a packet, the payload, and whether the payload is complete.
 
     None: it is no UDP datagram, or a fragment of one.

@@ -17,8 +17,8 @@ from noack.traces.capture_packets import (
     CapturedFlow,
     CutCaptureError,
     captured_packets,
+    find_udp,
     is_capture,
-    udp_of,
 )
 from noack.traces.packet_trace import (
     MAX_PACKETS,
@@ -94,10 +94,10 @@ class CaptureFlows:
         """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
         try:
             for packet in captured_packets(self._file):
-                found = udp_of(packet.interface, packet.link_type, packet.data)
-                if found is None or _is_end_of_probe(found[1]):
+                datagram = find_udp(packet.interface, packet.link_type, packet.data)
+                if datagram is None or _is_end_of_probe(datagram[1]):
                     continue
-                flow, payload, is_complete = found
+                flow, payload, is_complete = datagram
                 yield CapturedDatagram(
                     packet.t_ns, flow, payload, not is_complete, packet.is_outbound
                 )
@@ -238,13 +238,13 @@ class SequenceField(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> "SequenceField":
         """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``; raise ValueError if it is neither."""
-        found = _FIELD.fullmatch(text)
-        if found is None:
+        match = _FIELD.fullmatch(text)
+        if match is None:
             raise ValueError(
                 f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; "
                 f"found {text!r}"
             )
-        return cls(int(found[1]), int(found[2]), found[3] is not None)
+        return cls(int(match[1]), int(match[2]), match[3] is not None)
 
     def read(self, payload: bytes) -> int | None:
         """Return the number; None if the payload is too short."""
@@ -267,9 +267,9 @@ def _numbered(
     columns = array("q"), array("q"), array("q")
     outbound = 0
     for datagram in flows.datagrams():
-        if datagram.flow == flow and (found := read(datagram.payload)) is not None:
+        if datagram.flow == flow and (fields := read(datagram.payload)) is not None:
             outbound += datagram.is_outbound
-            values = found[0], datagram.t_ns, found[1]
+            values = fields[0], datagram.t_ns, fields[1]
             for column, value in zip(columns, values, strict=True):
                 column.append(value)
     if columns[0] and outbound == len(columns[0]):
@@ -280,13 +280,13 @@ def _numbered(
     return _Numbered(*map(np.array, columns))
 
 
-def _first_of_each(found: _Numbered, notes: list[str]) -> _Numbered:
-    order = np.lexsort((found.received_ns, found.number))
-    number = found.number[order]
+def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
+    order = np.lexsort((numbered.received_ns, numbered.number))
+    number = numbered.number[order]
     first = order[np.flatnonzero(np.diff(number, prepend=number[0] - 1))]
     if len(first) < len(order):
         notes.append(f"duplicates: {len(order) - len(first)}; the first counts")
-    return _Numbered(*(column[first] for column in found))
+    return _Numbered(*(column[first] for column in numbered))
 
 
 def trace_of_probe(
@@ -305,17 +305,18 @@ def trace_of_probe(
         sessions[content.session] += 1
         return content.sequence, content.sent_ns
 
-    found = _numbered(flows, flow, read)
-    if not len(found.number):
+    numbered = _numbered(flows, flow, read)
+    if not len(numbered.number):
         raise ValueError(
             "has one end only, and no datagrams of `noack measure`; give the captures of both "
             "ends, or say where the payload has a sequence number: --sequence-at OFFSET:BYTES"
         )
     if len(sessions) > 1:
         raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
-    found = _first_of_each(found, notes)
+    numbered = _first_of_each(numbered, notes)
+    nothing_lost = np.zeros(len(numbered.number), bool)
     trace = packet_trace(
-        found.sent_ns, found.received_ns, np.zeros(len(found.number), bool), found.number,
+        numbered.sent_ns, numbered.received_ns, nothing_lost, numbered.number,
         clocks_differ=True, most_packets=most_packets,
     )  # fmt: skip
     return relative_delays(trace)
@@ -335,17 +336,20 @@ def trace_of_numbers(
         number = field.read(payload)
         return None if number is None or number >= _MOST else (number, 0)
 
-    found = _numbered(flows, flow, read)
-    if len(found.number) < 2:
+    numbered = _numbered(flows, flow, read)
+    if len(numbered.number) < 2:
         raise ValueError(
             f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
         )
-    order = np.argsort(found.received_ns, kind="stable")
-    number = _unwrapped(found.number[order], bits)
-    found = _first_of_each(
-        found._replace(number=number, received_ns=found.received_ns[order]), notes
+    order = np.argsort(numbered.received_ns, kind="stable")
+    number = _unwrapped(numbered.number[order], bits)
+    numbered = _first_of_each(
+        numbered._replace(number=number, received_ns=numbered.received_ns[order]), notes
     )
-    k, received_ns = found.number - found.number[0], found.received_ns - found.received_ns.min()
+    k, received_ns = (
+        numbered.number - numbered.number[0],
+        numbered.received_ns - numbered.received_ns.min(),
+    )
     if k[-1] >= most_packets:
         raise ValueError(
             f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "
@@ -358,7 +362,7 @@ def trace_of_numbers(
         f"{period_ns / 1e6:.6g} ms (lower envelope of the arrivals); delays are relative"
     )
     return packet_trace(
-        sent_ns, received_ns, np.zeros(len(k), bool), found.number,
+        sent_ns, received_ns, np.zeros(len(k), bool), numbered.number,
         clocks_differ=True, most_packets=most_packets,
     )  # fmt: skip
 
@@ -417,10 +421,10 @@ def _trace(
         notes += receiver.notes
         ends = two_captures(flows, flow, receiver)
     else:
-        found = one_capture(flows, flow, notes)
-        if found is None:
+        both_ends = one_capture(flows, flow, notes)
+        if both_ends is None:
             return trace_of_probe(flows, flow, most, notes)
-        ends = found
+        ends = both_ends
     differ = bool(others) if options.clocks_differ is None else options.clocks_differ
     return matched_trace(*ends, differ, most, notes)
 

@@ -69,15 +69,17 @@ def read_trace(
     try:
         with open_regular(path) as file:
             head, file = _decompressed(file)
-            found = next((candidate for candidate in known if candidate.recognises(head)), None)
-            if found is None:
+            known_format = next(
+                (candidate for candidate in known if candidate.recognises(head)), None
+            )
+            if known_format is None:
                 names = ", ".join(sorted(candidate.name for candidate in known))
                 raise ValueError(
                     f"not a packet trace; {names} can be read, also compressed by gzip"
                     f"{''.join(f', {other}' for other in others)}; a CSV file "
                     "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
-            return found.read(file, most_packets, clocks_differ)
+            return known_format.read(file, most_packets, clocks_differ)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise CallerError(f"{place or path}: cannot be decompressed: {one_line(error)}") from None
     except (OSError, ValueError) as error:

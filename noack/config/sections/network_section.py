@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.impairments.constraints import guarantee_of, require_consistent
+from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
@@ -140,4 +140,4 @@ class NetworkSection(DirectionSection):
     @property
     def guarantee(self) -> LossGuarantee:
         """What mansd and the constraints say, also if the network does not enforce it."""
-        return guarantee_of(self.mansd, self.constraints)
+        return join_guarantee(self.mansd, self.constraints)

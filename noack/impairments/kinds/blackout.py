@@ -25,10 +25,10 @@ _TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
 def _read(reader: WordReader) -> Table:
     intervals: list[tuple[float, ...]] = []
     for part in reader.word(_EXPECTED).split(","):
-        found = re.fullmatch(f"({TIME})-({TIME})", part)
-        if found is None:
+        match = re.fullmatch(f"({TIME})-({TIME})", part)
+        if match is None:
             reader.wrong(f"expected {_EXPECTED}")
-        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in found.groups()))
+        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in match.groups()))
     return {"intervals_s": intervals, **_read_every(reader)}
 
 

@@ -325,8 +325,8 @@ def _table(file: NamedFile) -> Iterator[int]:
 
 def _observed_s(file: NamedFile) -> Iterator[float]:
     for number, line in file.lines():
-        found = _DELAY.fullmatch(line)
-        scale = _UNITS_S.get(found[2]) if found else None
-        if found is None or scale is None:
+        match = _DELAY.fullmatch(line)
+        scale = _UNITS_S.get(match[2]) if match else None
+        if match is None or scale is None:
             file.wrong(f"line {number}: {line[:20]}: expected one delay, e.g. 0.0125 or 12.5ms")
-        yield float(found[1]) * scale
+        yield float(match[1]) * scale

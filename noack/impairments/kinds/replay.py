@@ -62,11 +62,11 @@ def _read(reader: WordReader) -> Table:
 def _read_records(reader: WordReader) -> Table:
     sent_ns, delays_ns = [], []
     for part in reader.word(_EXPECTED).split(","):
-        found = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
-        if found is None:
+        match = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
+        if match is None:
             reader.wrong(f"expected {_EXPECTED}")
-        sent_ns.append(reader.read(found[1], OWN_TIME_NS))
-        delays_ns.append(LOST_NS if found[2] == "lost" else reader.read(found[2], OWN_TIME_NS))
+        sent_ns.append(reader.read(match[1], OWN_TIME_NS))
+        delays_ns.append(LOST_NS if match[2] == "lost" else reader.read(match[2], OWN_TIME_NS))
     return {"sent_ns": sent_ns, "delays_ns": delays_ns}
 
 
@@ -228,15 +228,15 @@ class Replay(Impairment):
 
     def _applied_ns(self) -> Sequence[int]:
         """Return the delays as a stage has them: a lost packet has that of its predecessor."""
-        found: list[int] = []
+        applied_ns: list[int] = []
         latest_ns = 0
         for delay_ns in self.delays_ns or ():
             if delay_ns >= 0:
                 latest_ns = (
                     delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
                 )
-            found.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
-        return found
+            applied_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
+        return applied_ns
 
     def chains(self) -> Sequence[Pattern]:
         if self.delays_ns is None:

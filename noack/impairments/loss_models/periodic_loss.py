@@ -14,10 +14,10 @@ _EXPECTED = "losses per packets, e.g. 2/100"
 
 
 def _read(reader: WordReader) -> Table:
-    found = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
-    if found is None:
+    match = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
+    if match is None:
         reader.wrong(f"expected {_EXPECTED}")
-    burst, period = (reader.read(part, COUNT) for part in found.groups())
+    burst, period = (reader.read(part, COUNT) for part in match.groups())
     table: Table = {"burst": burst, "period": period}
     if reader.accept("from"):
         table["first"] = reader.value(COUNT)

@@ -200,8 +200,8 @@ def _to_the_end() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, found in delayed.items():
-            signal.signal(number, found)
+        for number, handler in delayed.items():
+            signal.signal(number, handler)
         if came:
             signal.raise_signal(came[0])
 

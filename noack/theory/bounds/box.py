@@ -43,19 +43,19 @@ class BoxGains(PlantGains):
             NotDecayingError: the model decays too slowly, or the box is too large.
         """
         free, gain = self._model_error
-        found = {
+        states = {
             output: Coefficients(
                 peaks.start + float(peaks.from_w @ free), peaks.forced + float(peaks.from_w @ gain)
             )
             for output, peaks in self._peaks.items()
         }
-        nominal = found[Output.MISMATCH]
+        nominal = states[Output.MISMATCH]
         # sup‖(R_E x, S w)‖ ≤ sup‖R_E x‖ + sup‖S w‖
-        found[Output.MISMATCH] = Coefficients(
+        states[Output.MISMATCH] = Coefficients(
             nominal.free + float(np.linalg.norm(self._scales * free)),
             nominal.gain + float(np.linalg.norm(self._scales * gain)),
         )
-        return found
+        return states
 
     @cached_method
     def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
@@ -76,12 +76,12 @@ class BoxGains(PlantGains):
         error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
         impulse = error * start_s
         w = self._bound_of_w(impulse * np.array([peaks.impulse for peaks in self._coordinates]))
-        found = {
+        states = {
             output: impulse * peaks.impulse + float(peaks.from_w @ w)
             for output, peaks in self._peaks.items()
         }
-        found[Output.MISMATCH] += float(np.linalg.norm(self._scales * w))
-        return error, found
+        states[Output.MISMATCH] += float(np.linalg.norm(self._scales * w))
+        return error, states
 
     @property
     def columns(self) -> Columns:

@@ -47,20 +47,20 @@ class Decay(NamedTuple):
         return frobenius_norms(product(self.factor, states))
 
 
-def decay_of(generator: Matrix) -> Decay | None:
+def find_decay(generator: Matrix) -> Decay | None:
     """Return the better of two candidates for L; None if neither passes its check numerically."""
-    return _decay_of(np.asarray(generator, dtype=np.float64).tobytes(), len(generator))
+    return _find_decay(np.asarray(generator, dtype=np.float64).tobytes(), len(generator))
 
 
 @lru_cache(maxsize=8)
-def _decay_of(entries: bytes, n: int) -> Decay | None:
+def _find_decay(entries: bytes, n: int) -> Decay | None:
     generator = np.frombuffer(entries).reshape(n, n)
     rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
     if not spectral_abscissa(generator) < -rounding:
         return None
     candidates = (_lyapunov_factor(generator), _modal_factor(generator))
-    found = [_checked(generator, factor) for factor in candidates if factor is not None]
-    decays = [decay for decay in found if decay is not None]
+    checked = [_checked(generator, factor) for factor in candidates if factor is not None]
+    decays = [decay for decay in checked if decay is not None]
     return min(decays, key=lambda decay: decay.stretch / decay.rate_per_s, default=None)
 
 
@@ -116,8 +116,8 @@ def product(matrix: Matrix, stack: Stack) -> Stack:
 
 def times(matrix: Matrix, values: Stack) -> Stack:
     """Return M Y for matrices Y along the last axis, (n, r, k) → (q, r, k)."""
-    found = matrix @ values.reshape(len(values), -1)
-    return np.asarray(found.reshape(len(matrix), *values.shape[1:]))
+    products = matrix @ values.reshape(len(values), -1)
+    return np.asarray(products.reshape(len(matrix), *values.shape[1:]))
 
 
 def frobenius_norms(stack: Stack) -> Stack:

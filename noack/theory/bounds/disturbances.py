@@ -1,8 +1,19 @@
-"""The bounds of a scenario's disturbances and noise, which act as long as the run lasts.
+"""Bounds of a scenario's disturbances and noise, and of the estimation error that they cause.
 
-Normally distributed values have no bound. All that are used, and their sums in the state and in the
-estimation error, together exceed the assumed bounds in a run with at most the probability
-``certificate.exceedance_probability``: each with that probability over their number.
+They act as long as the run lasts. Normally distributed values have no bound. All that are used, and
+their sums in the state and in the estimation error, together exceed the assumed bounds in a run
+with at most the probability ``certificate.exceedance_probability``: each with that probability over
+their number.
+
+With an observer of gains L_k, and s steps of the plant between two measurements, e = x̂ − x is
+
+    e_k = (I − L_k C)(Âˢ e_{k−1} + Σ_i Âⁱ d_{k,i}) + L_k v_k,    e_0 from the first estimate
+    d   = (Â − A) x + (B̂ − B) u − B w_u − G w_x                   (discrete-time matrices, a step)
+
+Normal sources make a normal error, whose covariance is computed. The gains do not depend on data:
+those of a Kalman filter are computed until they have settled. The sum over all past sources of ‖W
+Φ(k, j) S‖ is largest at some k; beyond the computed ones it is bounded in a norm in which (I − L C)
+Âˢ contracts. Without an observer x̂ = y and e = v.
 """
 
 import math
@@ -68,7 +79,7 @@ def normal_bounds(resolved: Scenario) -> NormalBounds | None:
     return NormalBounds(resolved.certificate.exceedance_probability / (steps * (values + 2)))
 
 
-def forcing_of(resolved: Scenario, B: Matrix) -> Forcing | None:
+def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
     """Return the disturbances of a plant with the input matrix B, (n, m); None if it has none."""
     plant, bounds, (n, m) = resolved.plant, normal_bounds(resolved), B.shape
     if not plant.disturbances:
@@ -182,10 +193,10 @@ class EstimationError:
     @cached_property
     def _persistent_sources(self) -> list[Stack]:
         """The effects of bounded noise and of each bounded disturbance on the measurements."""
-        found = [self._sources(column[:, None], 0.0) for column in self._pushes.T]
+        effects = [self._sources(column[:, None], 0.0) for column in self._pushes.T]
         if self._noise.any():
-            found.append((self._gains * self._noise).transpose(0, 2, 1)[..., None])
-        return found
+            effects.append((self._gains * self._noise).transpose(0, 2, 1)[..., None])
+        return effects
 
     @cached_property
     def _settled_peaks(self) -> list[float]:
@@ -195,11 +206,11 @@ class EstimationError:
     @cached_property
     def _covariances(self) -> list[tuple[Matrix, Matrix]]:
         """F_k, and the covariance of what each measurement adds to e."""
-        sources, found = self._sources(self._normal_pushes, 0.0), []
+        sources, covariances = self._sources(self._normal_pushes, 0.0), []
         for k, L in enumerate(self._gains):
             pushed, noise = np.hstack([*sources[k]]), L * self._noise_deviations
-            found.append((self._rest[k] @ self._between, pushed @ pushed.T + noise @ noise.T))
-        return found
+            covariances.append((self._rest[k] @ self._between, pushed @ pushed.T + noise @ noise.T))
+        return covariances
 
     @cached_property
     def _settled_covariance(self) -> Matrix:
@@ -243,13 +254,13 @@ class EstimationError:
             NotDecayingError: it does not settle in so many measurements.
         """
         assert self._resolved.observer is not None
-        found: list[Matrix] = []
+        gains: list[Matrix] = []
         for L in islice(self._resolved.observer.gains(self._model), _MOST_GAINS):
-            if found:
-                changed, least = np.abs(L - found[-1]).max(), _SETTLED * np.abs(L).max()
+            if gains:
+                changed, least = np.abs(L - gains[-1]).max(), _SETTLED * np.abs(L).max()
                 if changed <= least and changed <= least * (1 - self._spectral_radius(L)):
-                    return np.array([*found, L])
-            found.append(L)
+                    return np.array([*gains, L])
+            gains.append(L)
         raise NotDecayingError(f"the observer's gain changes for {_MOST_GAINS} measurements")
 
     def _spectral_radius(self, L: Matrix) -> float:
@@ -337,12 +348,12 @@ def _accumulated(C: Matrix, old: Stack, steps: Stack, sources: Stack) -> tuple[S
         old = np.concatenate([times(step, old), _last_axis(new)], axis=2)
         waiting.append(old)
         if len(waiting) * old.size > _ENTRIES:
-            sums.append(_sums_of(C, waiting))
+            sums.append(_add_norms(C, waiting))
             waiting = []
-    return np.concatenate([*sums, _sums_of(C, waiting)]), old
+    return np.concatenate([*sums, _add_norms(C, waiting)]), old
 
 
-def _sums_of(C: Matrix, effects: list[Stack]) -> Stack:
+def _add_norms(C: Matrix, effects: list[Stack]) -> Stack:
     """Return Σ‖C S‖ over each of several numbers of S, (n, r, j) each."""
     if not effects:
         return np.zeros(0)
@@ -362,10 +373,10 @@ def _sums(matrices: Stack, effects: Stack) -> Stack:
 
 def _powers(step: Matrix, count: int) -> Stack:
     """Return the powers 0 … count of a matrix, (count + 1, n, n)."""
-    found = [np.eye(len(step))]
+    powers = [np.eye(len(step))]
     for _ in range(count):
-        found.append(step @ found[-1])
-    return np.array(found)
+        powers.append(step @ powers[-1])
+    return np.array(powers)
 
 
 def _contraction(step: Matrix) -> tuple[Matrix, float]:

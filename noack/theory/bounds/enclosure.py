@@ -1,6 +1,18 @@
-"""Upper bounds of the norm of a response over time: over cells of a grid, and beyond it.
+"""Rigorous upper bounds of ‖C e^{Gτ} D‖ over time: suprema and integrals, enclosed between samples.
 
-:mod:`noack.theory.bounds.enclosure` computes them.
+A response e^{Gτ}D is computed at the nodes of a grid (:func:`response`, :func:`response_until`).
+:class:`ResponseBounds` applies output matrices C to it and returns :class:`KernelBounds`. Between
+two nodes at a distance s, F(τ) = C e^{Gτ} D differs from the chord by at most s²/8 · sup‖F''‖ (its
+integral by s³/12 · sup‖F''‖), and a norm is convex along a chord. sup‖F''‖ over the cell, with F''
+= C G² e^{Gτ} D, is bounded by Taylor's formula from the left node. The remainder is bounded by the
+smaller of two bounds: e^{μ s} with the logarithmic norm μ of G; or, in coordinates L with
+logarithmic norm −ν < 0 (:mod:`noack.theory.bounds.contraction`), ‖C e^{Gs} Y‖ ≤ ‖C L^{−1}‖ ‖L Y‖
+e^{−νs}. The second one also bounds the response beyond the grid. Steps become longer when fast
+modes have decayed, so a stiff system needs hardly more steps than others.
+
+Rounding: the error of the products C Y is bounded by n ε |C| |Y|, which matters if C and D are
+ill-conditioned. All other rounding errors, about 1e-12 of a value, are covered by a relative
+inflation of 1e-9.
 """
 
 import math
@@ -19,7 +31,7 @@ from noack.theory.bounds.contraction import (
     EPSILON,
     Decay,
     Stack,
-    decay_of,
+    find_decay,
     frobenius_norms,
     largest_gains,
     logarithmic_norm,
@@ -162,7 +174,7 @@ class ResponseBounds:
 
     def through_each(self, outputs: Outputs[Name]) -> dict[Name, KernelBounds]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output."""
-        return {name: found for name, (found,) in self.through_groups(outputs).items()}
+        return {name: kernel for name, (kernel,) in self.through_groups(outputs).items()}
 
     def through_groups(self, outputs: Outputs[Name]) -> dict[Name, list[KernelBounds]]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
@@ -298,7 +310,7 @@ def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     margin = -spectral_abscissa(generator)
     if margin <= 0:
         raise NotDecayingError(f"a mode of the loop grows at {-margin:.3g} /s")
-    decay = decay_of(generator)
+    decay = find_decay(generator)
     if decay is None:
         raise NotDecayingError("no Lyapunov function of it was found to working precision")
     everything = Outputs({"": np.eye(len(generator))})
@@ -344,7 +356,7 @@ def response_until(
         generator,
         np.linspace(0.0, until_s, cells + 1),
         _propagate(generator, D, step_s, cells),
-        decay_of(generator) if step_s * np.linalg.norm(generator) > 1 else None,
+        find_decay(generator) if step_s * np.linalg.norm(generator) > 1 else None,
         endless=False,
         groups=groups,
     )

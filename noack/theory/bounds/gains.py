@@ -1,4 +1,16 @@
-"""The disturbances of a plant, as a certificate counts them."""
+"""The gains of a loop that a certificate needs, between all pairs of signals.
+
+All signals are scaled by e^{αt}, so that a decaying bound becomes a constant one. With K = U R (U
+has orthonormal columns), the input error is p = u − K x, which acts on the plant through B U:
+
+    x' = (A + BK) x + B p,      e_s' = H e_s − E x − B p,      E = A + BK − H
+
+and, by identity (I1), e_c is e_s plus the contributions of the missing events. The outputs of
+interest are the weighted norm W, the state itself, E x, and K H x (the error rate of a held input).
+
+:class:`Forcing` describes disturbances; :class:`ErrorGains` has the gains of e_s and e_c, which
+depend on the models alone; :class:`PlantGains` those of one known plant.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -149,11 +161,11 @@ class ErrorGains:
         if not self.scaled_H.any():  # a hold: a missed update's contribution does not decay
             return {output: constant_kernel(self.now(output)) for output in self.outputs}
         followed = response(self.scaled_H, self.inverse_weight)
-        found = followed.through_each(self.stacked)
+        kernels = followed.through_each(self.stacked)
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
-            norm = found[Output.WEIGHTED]
-            found[Output.WEIGHTED] = replace(norm, highest=np.minimum(norm.highest, 1.0))
-        return found
+            norm = kernels[Output.WEIGHTED]
+            kernels[Output.WEIGHTED] = replace(norm, highest=np.minimum(norm.highest, 1.0))
+        return kernels
 
     @cached_property
     def contracts(self) -> bool:

@@ -1,4 +1,4 @@
-"""What a certificate assumes of the network, what it bounds, and the constants that it states."""
+"""The terms of a certificate: conditions, promises of trigger and observer, constants."""
 
 import math
 from collections.abc import Mapping
@@ -64,7 +64,7 @@ class Constants(NamedTuple):
     """The same as π while the controller has every update: ‖KW^{−1}‖β̃ + q."""
 
 
-class VoidError(ArithmeticError):
+class NoCertificateError(ArithmeticError):
     """There is no certificate; the message has the reason."""
 
     def __init__(self, reason: str, loop_gain: float = math.inf) -> None:
@@ -124,7 +124,7 @@ class TriggerBound(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One of several bounds that are added: with its own decay rate and its own causes."""
+    """One of several bounds that are added: with its own decay rate and its own inputs."""
 
     error: ErrorGains
     plant: PlantGains

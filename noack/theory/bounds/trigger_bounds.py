@@ -1,10 +1,14 @@
-"""What a certificate uses of a trigger rule: bounds of e_s after tests, and the times of events.
+"""What a certificate uses of a trigger rule: bounds of e_s after tests, its growth, event times.
 
 Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
 
 * a comparison promises ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.error_promise`);
 * one of the integral, ∫‖e_s‖_W ≤ δ, promises ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
 * until a dwell time has passed, and up to a deadline, e_s has grown from 0.
+
+:class:`TriggerBounds` states these bounds. :class:`ErrorGrowth` is how e_s grows from them until
+the next test, and :func:`first_passage_s` how long it takes from an event until it can reach a
+level.
 """
 
 import math
@@ -18,7 +22,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, TriggerBound, VoidError
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.trigger.error_promise import ErrorPromise, error_promise
 from noack.trigger.trigger_rule import TriggerRule
 
@@ -101,13 +105,15 @@ class TriggerBounds:
         """Return the conditions with the times of the rule's comparisons.
 
         Raises:
-            VoidError: comparisons may be missed.
+            NoCertificateError: comparisons may be missed.
         """
         if not self.rule.grid_ns:
             return conditions
         grid_s, step_s = self.rule.grid_ns / NS_PER_S, conditions.spacing_s
         if conditions.sampling_s != step_s:
-            raise VoidError("the rule compares on a grid, and measurements there may be missing")
+            raise NoCertificateError(
+                "the rule compares on a grid, and measurements there may be missing"
+            )
         grid_s = spacing_s = _rounded_up(grid_s, step_s)
         due_ns = self.rule.longest_ns
         if self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
@@ -125,31 +131,31 @@ class TriggerBounds:
             reached: the smallest threshold; None if it may be arbitrarily small.
 
         Raises:
-            VoidError: nothing bounds e_s, or nothing separates events.
+            NoCertificateError: nothing bounds e_s, or nothing separates events.
         """
         due_s, apart_s = self._between_events(conditions)
         h_s = conditions.sampling_s
         idle_s = self._after(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
-        found: list[TriggerBound] = []
+        bounds: list[TriggerBound] = []
         if self.promise is not None:
             if reached is not None:
                 reached = reached * self.promise.least / self.promise.size or None
             shares = dict.fromkeys(self.outputs, 1.0)
             for ago_s, beta, least in self._levels(conditions, level, reached):
-                found.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
+                bounds.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
         if math.isfinite(due_s):
-            found.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
-        if not found:
-            raise VoidError(_NONE)
-        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in found)
+            bounds.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
+        if not bounds:
+            raise NoCertificateError(_NONE)
+        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
         grows_first = level > 0 and self.promise is not None and self.promise.least > 0
         if not is_separated and not grows_first:
-            raise VoidError(_ACCUMULATE)
+            raise NoCertificateError(_ACCUMULATE)
         if self.is_homogeneous:
             apart_s = max(apart_s, conditions.spacing_s)
-        return found[0]._replace(
-            unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(found[1:])
+        return bounds[0]._replace(
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(bounds[1:])
         )
 
     def divided(
@@ -171,7 +177,7 @@ class TriggerBounds:
 
     def text(self) -> str:
         """Return in words what the rule promises about e_s."""
-        found = []
+        promises = []
         if (promise := self.promise) is not None:
             shares = " + ".join(
                 f"{number(float(np.linalg.norm(S @ np.linalg.inv(self.weight), 2)))} ‖x‖"
@@ -180,11 +186,11 @@ class TriggerBounds:
             level = "" if self.is_homogeneous else "the threshold"
             bounded = "∫‖e_s‖ dt" if self.rule.integrates else "‖e_s‖"
             total = " + ".join(filter(None, [level, shares]))
-            found.append(f"after each test {bounded} ≤ {total or '0'}")
+            promises.append(f"after each test {bounded} ≤ {total or '0'}")
         if self.has_due_time:
             longest_s = self.rule.longest_ns / NS_PER_S
-            found.append(f"the next event at the latest {longest_s:g} s after the last one")
-        return "; ".join(found)
+            promises.append(f"the next event at the latest {longest_s:g} s after the last one")
+        return "; ".join(promises)
 
     def _levels(
         self, conditions: NetworkConditions, level: float, reached: float | None
@@ -251,14 +257,14 @@ class ErrorGrowth:
         self.shares: Mapping[str, float] = shares
 
 
-def growths_of(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
+def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
     """Return the growth from the bound after a test, and from 0 after an event."""
-    found = []
+    growths = []
     if bound.is_tested:
-        found.append(ErrorGrowth(plant, sampling_s + bound.ago_s, bound))
+        growths.append(ErrorGrowth(plant, sampling_s + bound.ago_s, bound))
     if bound.untested_s > 0 or not bound.is_tested:
-        found.append(ErrorGrowth(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
-    return found
+        growths.append(ErrorGrowth(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
+    return growths
 
 
 def first_passage_s(

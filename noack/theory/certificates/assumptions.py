@@ -50,32 +50,32 @@ class Assumption(NamedTuple):
 def assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
     loop, linear = loop_of(resolved), resolved.coverage.is_linear
-    found = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
+    checked = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
     if not resolved.coverage.is_decaying:
         why = f'the policy is "{resolved.trigger.policy}": not covered by the paper\'s theorems'
-        found.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
+        checked.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
     elif linear:
-        found.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
+        checked.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
     if not resolved.controller.is_linear:
         why = f'controller.kind = "{resolved.controller.kind}": {_NOT_COVERED}'
-        found.append(_violated("the input is u = K x_c", "eq:ModCont", why))
+        checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
     if resolved.protocol.acknowledges:
         what = "the sensor resets x_s at every event; nothing is acknowledged"
-        found.append(
+        checked.append(
             _violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}')
         )
     if linear:
-        found.append(_unstable_and_distinct(loop.A))
-    found += [_mansd(resolved), _continuous_time(resolved)]
+        checked.append(_unstable_and_distinct(loop.A))
+    checked += [_mansd(resolved), _continuous_time(resolved)]
     if resolved.plant.disturbances:
         kinds = ", ".join(
             f"{disturbance.kind} at the {disturbance.at}"
             for disturbance in resolved.plant.disturbances
         )
-        found.append(
+        checked.append(
             _violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
         )
-    return found + _estimated(loop, resolved)
+    return checked + _estimated(loop, resolved)
 
 
 def _violated(what: str, source: str, why: str) -> Assumption:
@@ -109,7 +109,7 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         entries = "1 entry" if p == 1 else f"{p} entries"
         how = f"by an observer ({resolved.observer.kind}), from y of {entries}"
     why = f"x is known {how}: {_NOT_BY_THEOREMS}"
-    found = [_violated("the sensor measures x", "Section II", why)]
+    checked = [_violated("the sensor measures x", "Section II", why)]
     decays = estimation.radius < 1
     if resolved.observer is not None:
         error = (
@@ -120,11 +120,11 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         why = f"steady-state spectral radius {estimation.radius:.4g} per measurement; {error}"
         if not np.isfinite(estimation.radius):
             why = "no steady state found: model and covariances differ by too many magnitudes"
-        found.append(_checked("the observer's error decays", "(I − LC)e^(ÂT)", decays, why))
+        checked.append(_checked("the observer's error decays", "(I − LC)e^(ÂT)", decays, why))
     least = resolved.trigger.least_threshold
     if least is not None and (decays or resolved.observer is None):
-        found.append(_above_noise(loop, least, estimation))
-    return found
+        checked.append(_above_noise(loop, least, estimation))
+    return checked
 
 
 def _above_noise(loop: LoopMatrices, least: float, estimation: SteadyState) -> Assumption:
@@ -271,7 +271,7 @@ def certificate_assumptions(
     alpha = resolved.trigger.threshold_decay_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
     why = promise or "not where it does not transmit"
-    found = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
+    checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
     for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
         holds = below(alpha, decay[of])
         why = f"α = {alpha:g} /s, {_decays(decay[of])}"
@@ -279,17 +279,17 @@ def certificate_assumptions(
             why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
         if math.isinf(decay[of]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
-        found.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
-    found += _conditions(conditions, resolved, kept)
-    found += _bounded_causes(resolved)
+        checked.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
+    checked += _conditions(conditions, resolved, kept)
+    checked += _bounded_causes(resolved)
     if constants is None:
-        found.append(_violated("there is a certificate", "certificate", void or ""))
+        checked.append(_violated("there is a certificate", "certificate", void or ""))
     else:
         why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
-        found.append(_checked("small-gain condition", "certificate", True, why))
+        checked.append(_checked("small-gain condition", "certificate", True, why))
     why = "the bounds rest on (I1), which holds for every plant"
     what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
-    return [*found, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
+    return [*checked, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
 
 
 def _bounded_causes(resolved: Scenario) -> list[Assumption]:

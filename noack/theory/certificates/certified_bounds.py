@@ -1,4 +1,19 @@
-"""What a certificate guarantees: bounds over time, under its conditions and assumptions."""
+"""What a certificate guarantees: bounds over time, under its conditions and assumptions.
+
+:class:`ScenarioCertificate` has the bounds from the start of the run on. :class:`KnownStateBounds`
+are sharper ones from the newest event on, at which the sensor knows x. With M = A + BK and the
+input error p = u − Kx, for every t from the event t_k on
+
+    ‖x(t) − e^{M(t−t_k)} x(t_k)‖ ≤ ∫ ‖e^{Ms} B U‖ ‖p(t−s)‖ ds,    0 ≤ s ≤ t − t_k.
+
+The certificate bounds ‖p‖ by πe^{−αt}. Where j events are missing at the controller, p is smaller:
+
+    ‖C e_c‖ ≤ (‖C W⁻¹‖ + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_{C,j} β̃
+    ‖p‖     ≤ D_{K,j} β̃ + q
+
+scaled by e^{αt}. From d after the event until the next one, j is the number of events after the
+newest one that the controller has received. All integrals are tabulated once for a certificate.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,7 +27,7 @@ from numpy.typing import NDArray
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.disturbances import forcing_of
+from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains, error_gains
 from noack.theory.bounds.terms import Constants, NetworkConditions
@@ -62,9 +77,9 @@ class ScenarioCertificate:
     @property
     def inter_event_s(self) -> float | None:
         """Lower bound of the inter-event time; None if there is none."""
-        found = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
-        known = [value for value in found if value is not None]
-        return min(known) if known and len(known) == len(found) else None
+        times_s = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
+        known = [value for value in times_s if value is not None]
+        return min(known) if known and len(known) == len(times_s) else None
 
     @property
     def unit(self) -> str:
@@ -188,15 +203,15 @@ class KnownStatePart:
     @property
     def controller_errors(self) -> tuple[Vector, float]:
         """Scaled bounds of ‖e_c‖_W by the number of missing events, and one for any number."""
-        found = self.constants
-        return self._by_missing(Output.WEIGHTED, self._event_error), found.delta * self.unit
+        constants = self.constants
+        return self._by_missing(Output.WEIGHTED, self._event_error), constants.delta * self.unit
 
     @property
     def input_errors(self) -> tuple[Vector, float]:
         """Scaled bounds of ‖u − Kx‖ by the number of missing events, and one for any number."""
-        found = self.constants
-        by_missing = self._by_missing(Output.GAIN, found.received_input_error)
-        return by_missing, max(found.input_error, found.start_error)
+        constants = self.constants
+        by_missing = self._by_missing(Output.GAIN, constants.received_input_error)
+        return by_missing, max(constants.input_error, constants.start_error)
 
     @property
     def _event_error(self) -> float:
@@ -220,10 +235,10 @@ class KnownStatePart:
         whole = integral_until(forced, age_s)
         # In the time d after the event, updates before it may be in flight.
         latest = np.minimum(age_s, delay_s) * forced.sups(np.maximum(age_s - delay_s, 0.0))
-        found = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
+        deviation = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
         if self.constants.estimation_error:
-            found = found + self.constants.estimation_error * self._estimated.sups(age_s)
-        return np.asarray(found)
+            deviation = deviation + self.constants.estimation_error * self._estimated.sups(age_s)
+        return np.asarray(deviation)
 
 
 @dataclass(frozen=True)
@@ -250,10 +265,10 @@ class KnownStateBounds:
             part.level(t_s) * part.deviation(errors, age_s, missing, self.delay_s)
             for part, errors in zip(self.parts, self._input_errors, strict=True)
         ]
-        found = np.asarray(sum(each) + self._disturbed(age_s))
+        bound = np.asarray(sum(each) + self._disturbed(age_s))
         if self.other is None:
-            return found
-        return np.asarray(np.minimum(found, self.other.state_deviation(t_s, age_s, missing)))
+            return bound
+        return np.asarray(np.minimum(bound, self.other.state_deviation(t_s, age_s, missing)))
 
     def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
         """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
@@ -261,10 +276,10 @@ class KnownStateBounds:
             part.level(t_s) * _entries(errors, missing)
             for part, errors in zip(self.parts, self._controller_errors, strict=True)
         ]
-        found = np.asarray(sum(each))
+        bound = np.asarray(sum(each))
         if self.other is None:
-            return found
-        return np.asarray(np.minimum(found, self.other.controller_error(t_s, missing)))
+            return bound
+        return np.asarray(np.minimum(bound, self.other.controller_error(t_s, missing)))
 
     @cached_property
     def _controller_errors(self) -> list[Vector]:
@@ -341,7 +356,7 @@ def known_state_bounds(
     level = max(certificate.beta, certificate.floor if first.rate_per_s == 0 else 0.0)
     parts = [part(first, level or 1.0, 0.0 if late is None else certificate.floor / level)]
     parts += [] if rest is None else [part(rest, 1.0)]
-    forcing = forcing_of(resolved, loop.B)
+    forcing = bound_forcing(resolved, loop.B)
     pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
     return KnownStateBounds(
         tuple(parts), certificate.conditions.delay_s, pushes,

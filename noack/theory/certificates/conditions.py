@@ -1,4 +1,9 @@
-"""The conditions of a scenario's run: those of its own schedule, and the paper's ideal ones."""
+"""The conditions of a scenario's run, its own and the paper's; and a set-point moved to 0.
+
+At a set-point x_r the loop is described in the coordinates x − x_r, x_s − x_r and x_c − x_r. The
+models rest at x_r with u_r: Âx_r + B̂u_r = 0. The plant need not. What is left, w = A x_r + B u_r,
+is a constant disturbance of the loop in these coordinates.
+"""
 
 import math
 from collections.abc import Mapping

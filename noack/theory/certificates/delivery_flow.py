@@ -6,15 +6,25 @@ system without an input, from (ξ, 0) with the state ξ at the delivery:
     x' = (A + BK + αI) x + BK e_c,    e_c' = −E x + (H − BK + αI) e_c,    z(τ) = e^{Fτ} (ξ, 0)
 
 All that is uncertain is ξ, and the time of the next delivery. Let ‖Λξ‖ ≤ 1 and ‖e_c‖_W ≤ D at all
-times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows of e_c in e^{Fs} (I, 0) for an
-s ≤ τ. So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for each λ in [0, 1].
-So ‖C z(τ)‖ is at most the norm of C e^{Fτ} on this ellipsoid, and the λ with the smallest is used.
-If no ‖Λx(τ)‖ found in this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery, whenever it happens,
-and by induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
+times. At the time τ, ξ has ‖Λξ‖ ≤ 1 and ‖Nξ‖_W ≤ D, N the rows of e_c in e^{Fs} (I, 0) for an s ≤
+τ. So ξ is in the ellipsoid λ‖Λξ‖² + (1 − λ)‖Nξ‖²/D² ≤ 1, for each λ in [0, 1]. So ‖C z(τ)‖ is at
+most the norm of C e^{Fτ} on this ellipsoid, and the λ with the smallest is used. If no ‖Λx(τ)‖
+found in this way exceeds 1, ‖Λx‖ ≤ 1 holds at the next delivery, whenever it happens, and by
+induction at all times: the set ‖Λx‖ ≤ 1 is invariant.
 
 All matrices are in coordinates in which W is the identity. Between two nodes of the grid the bounds
-are those of :mod:`noack.theory.bounds.enclosure`, with s the left node. From the last node T on, x + e_c =
-e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D.
+are those of :mod:`noack.theory.bounds.enclosure`, with s the left node. From the last node T on, x
++ e_c = e^{Hτ} ξ has decayed, and z has followed the system for T' from a state with ‖e_c‖_W ≤ D.
+
+**After lost events.** Without the flow, each missing event adds its ‖e_s‖_W in full, as if all had
+one direction. But until the next delivery everything follows from z at one time. Let an event be
+lost at least w after the delivery, and ‖e_c‖_W ≤ D up to it. z is the value w before it, z' =
+e^{Fw} z:
+
+    ‖Λx‖ ≤ c,  ‖e_c‖ ≤ D at z, half way and at z',  ‖e_s‖ = ‖C_r z'‖ ≤ β for r until the next event
+
+With positive weights of sum 1, z is in the ellipsoid of the sum of these forms, which bounds e_c =
+(0, I) e^{Fr} z' after r. The weights are improved step by step; all weights give a bound.
 """
 
 import math
@@ -57,7 +67,7 @@ _LATEST = 6.0
 """Largest r in units of δ at which events are looked for."""
 _SOUGHT = 0.8
 """‖e^{(H+αI)r}‖_W at the last r, if possible."""
-_WORTH = 0.999
+_NEARLY_PLAIN = 0.999
 """Share of the bound without the flow from which on nothing is gained."""
 _NOTHING = 1e-3
 """Bound of ‖e_c‖ at a delivery, where it is 0, in β."""
@@ -211,8 +221,8 @@ class Reach:
         values, V = np.linalg.eigh(np.tensordot(SHARES, grams, axes=1))
         usable = values[:, 0] > 1e-12 * values[:, -1]  # others are too flat for their rounding
         sizes = spectral_norms(C @ moved @ V[usable] / np.sqrt(values[usable])[:, None])
-        found = float(sizes.min(initial=math.inf)) * ROUNDING
-        return found if math.isfinite(found) else math.inf
+        largest = float(sizes.min(initial=math.inf)) * ROUNDING
+        return largest if math.isfinite(largest) else math.inf
 
 
 class _CellBounds:
@@ -304,24 +314,24 @@ def errors_after_losses(
         kernel: of ‖e^{(H+αI)τ}‖_W.
         bend: that of e_s, see :func:`bend_of_error`.
     """
-    found, since_s, flow = plain.copy(), 0.0, reach.starts.flow
+    errors, since_s, flow = plain.copy(), 0.0, reach.starts.flow
     most_s = float(flow.edges_s[-1]) / 4  # e^{Fτ} is accurate until 4 times as late
     if spacing_s >= most_s or len(plain) == 1:
-        return found
+        return errors
     r_s = _nodes_s(spacing_s, kernel, 2 * most_s)
     flows = np.array([exponential(flow.generator * time_s) for time_s in r_s.tolist()])
     for lost in range(len(plain)):
-        earlier = float(found[lost - 1]) if lost else _NOTHING * size
+        earlier = float(errors[lost - 1]) if lost else _NOTHING * size
         stage = _Stage(reach, min(since_s, most_s), earlier, r_s, flows)
         if lost:
             added = size + kernel.sups(r_s) * earlier
             largest = max(stage.largest_error(size, added), float(added[-1]), earlier)
-            found[lost] = min(plain[lost], largest)
-            if lost > 1 and found[lost] > _WORTH * float(added[0]):
+            errors[lost] = min(plain[lost], largest)
+            if lost > 1 and errors[lost] > _NEARLY_PLAIN * float(added[0]):
                 break  # later stages gain nothing, either
         if lost + 1 < len(plain):
             since_s += max(spacing_s, stage.next_event_s(level, bend, _LATEST * spacing_s))
-    return found
+    return errors
 
 
 def bend_of_error(reach: Reach, level: float) -> float:
@@ -334,10 +344,10 @@ def bend_of_error(reach: Reach, level: float) -> float:
 
 def _nodes_s(spacing_s: float, kernel: KernelBounds, most_s: float) -> Vector:
     """Return times r, if possible up to one at which ‖e^{(H+αI)r}‖_W has fallen below a value."""
-    found = [spacing_s * share for share in _NEAR]
-    while len(found) < _MOST_NODES and kernel.sup(found[-1]) > _SOUGHT:
-        found.append(found[-1] * _RATIO)
-    return np.array([time_s for time_s in found if time_s <= most_s])
+    nodes_s = [spacing_s * share for share in _NEAR]
+    while len(nodes_s) < _MOST_NODES and kernel.sup(nodes_s[-1]) > _SOUGHT:
+        nodes_s.append(nodes_s[-1] * _RATIO)
+    return np.array([time_s for time_s in nodes_s if time_s <= most_s])
 
 
 class _Stage:
@@ -392,9 +402,9 @@ class _Stage:
 
 def error_after(flow: DeliveryFlow, time_s: float) -> Matrix:
     """Return C_r: e_s a time after an event is C_r z."""
-    found = np.asarray(exponential(flow.generator * time_s)[flow.n :])
-    found[:, flow.n :] -= exponential(flow.H * time_s)
-    return found
+    rows = np.asarray(exponential(flow.generator * time_s)[flow.n :])
+    rows[:, flow.n :] -= exponential(flow.H * time_s)
+    return rows
 
 
 def _largest(
@@ -404,7 +414,7 @@ def _largest(
 
     None below ``enough`` is improved, and only the largest ones unless all of them are wanted.
     """
-    found, weights = np.full(len(forms), np.inf), np.full(forms.shape[:2], 1 / forms.shape[1])
+    bounds, weights = np.full(len(forms), np.inf), np.full(forms.shape[:2], 1 / forms.shape[1])
     active, best = np.arange(len(forms)), weights.copy()
     for _ in range(_ROUNDS):
         some = forms[active]
@@ -413,19 +423,19 @@ def _largest(
         )
         values, vectors = np.linalg.eigh(Y[active] @ Z)
         sizes = np.sqrt(values[:, -1].clip(min=0.0)) * ROUNDING
-        better = sizes < found[active]
+        better = sizes < bounds[active]
         best[active[better]] = weights[active[better]]
-        found[active] = np.minimum(found[active], sizes)
+        bounds[active] = np.minimum(bounds[active], sizes)
         # The forms of the z with the largest ‖Y z‖: those above the mean need more weight.
         z = (Z @ vectors[:, :, -1:])[..., 0]
         sizes = np.einsum("ja,jiab,jb->ji", z, some, z)
         weights[active] *= (sizes / sizes.max(axis=1, keepdims=True).clip(min=1e-300)) ** _POWER
         weights = weights.clip(min=_LEAST_WEIGHT)
         weights /= weights.sum(axis=1, keepdims=True)
-        least = enough if all_of_them else max(enough, _NEARLY * float(found.max()))
-        active = np.flatnonzero(found > least)
+        least = enough if all_of_them else max(enough, _NEARLY * float(bounds.max()))
+        active = np.flatnonzero(bounds > least)
         if not len(active):
             break
     sums = np.linalg.eigvalsh(np.einsum("ji,jiab->jab", best, forms))
-    found[~(sums[:, 0] > _CONDITION * sums[:, -1])] = np.inf
-    return found, best
+    bounds[~(sums[:, 0] > _CONDITION * sums[:, -1])] = np.inf
+    return bounds, best

@@ -1,8 +1,11 @@
-"""The certificate of a loop with disturbances, noise or an observer.
+"""The certificate of a loop with disturbances, noise, an observer or a constant threshold.
 
-The bounds are those of what decays (the start, βe^{−αt}, the first estimate) plus those of what
-persists (disturbances, noise, the floor). If α is too large, all are bounded together, without
-decay.
+For given events all inequalities of a certificate are linear in functions of time, v ≤ T v + g,
+with a positive T. So for g = g₁ + g₂, v is at most the sum of both solutions: one for what decays
+(the start, βe^{−αt}, the first estimate), scaled by e^{αt}; the other, not scaled, for what
+persists (disturbances, noise, the floor ε of the threshold, which is at most βe^{−αt} + ε). Both
+use the same δ. An event needs a threshold of at least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1]. If
+α is too large, all are bounded together, without decay.
 """
 
 import contextlib
@@ -17,12 +20,18 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.disturbances import EstimationError, forcing_of
+from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, Part, TriggerBound, VoidError
+from noack.theory.bounds.terms import (
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    Part,
+    TriggerBound,
+)
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.solution import solve_sum
+from noack.theory.certificates.solution import solve_parts
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -57,18 +66,20 @@ class DisturbedCertificate:
         for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
-            VoidError: the loop gain is not below 1, or the estimation error is not known.
+            NoCertificateError: the loop gain is not below 1, or the estimation error is not known.
             NotDecayingError: a mode of the loop or of the observer does not decay.
         """
         if self.resolved.observer is not None and (
             self.start_error or loop_of(self.resolved).setpoint is not None
         ):
-            raise VoidError("after a change or at a set-point the estimation error is not known")
+            raise NoCertificateError(
+                "after a change or at a set-point the estimation error is not known"
+            )
         conditions = self.trigger.tested(conditions)
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
-                return [solve_divided(
+                return [solve_two_parts(
                     self._decaying, self._persistent, conditions, self.start_error,
                     structured=structured, shares=SHARES if longest else (),
                 )]  # fmt: skip
@@ -77,44 +88,44 @@ class DisturbedCertificate:
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
-        (found,) = solve_sum(
+        (constants,) = solve_parts(
             [part], conditions, self.start_error, structured=structured, longest=longest
         )
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[Added] = []
         if decays and is_divided and longest:
-            divided = self._of_constant_threshold(conditions, found.inter_event_s or 0.0)
-        return divided or [(found, None)]
+            divided = self._of_constant_threshold(conditions, constants.inter_event_s or 0.0)
+        return divided or [(constants, None)]
 
     def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> list[Added]:
-        """Return the constants of what the start causes, and of what persists, if anything does.
+        """Return the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
-        first. The threshold has no rate; that of :func:`soonest` is taken. ``apart_s`` is a lower
-        bound of the inter-event time, certified without dividing the causes.
+        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``apart_s`` is a
+        lower bound of the inter-event time, certified without dividing into parts.
         """
-        found: list[Added] = []
+        pairs: list[Added] = []
         for of_start, of_rest in self.trigger.divided(conditions, apart_s):
-            with contextlib.suppress(VoidError, NotDecayingError):
-                found.append(self._divided(of_start, of_rest, conditions))
-        return sorted(found, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
+            with contextlib.suppress(NoCertificateError, NotDecayingError):
+                pairs.append(self._divided(of_start, of_rest, conditions))
+        return sorted(pairs, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
 
     def _divided(
         self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
     ) -> Added:
         """Return the constants that one bound of e_s gives.
 
-        Raises: as :func:`soonest`.
+        Raises: as :func:`choose_rate`.
         """
         rest = self._persistent._replace(bound=of_rest)
         persists = of_rest.beta or rest.plant.forcing is not None or rest.estimation.fixed
         others = [rest] if persists else []
 
         def solved(rate_per_s: float) -> list[Constants]:
-            return solve_sum([self._at_rate(rate_per_s, of_start), *others], conditions)
+            return solve_parts([self._at_rate(rate_per_s, of_start), *others], conditions)
 
-        first, *added = soonest(solved, self.slowest_per_s, loop_of(self.resolved).x0)
+        first, *added = choose_rate(solved, self.slowest_per_s, loop_of(self.resolved).x0)
         return first, added[0] if added else None
 
     @cached_property
@@ -122,7 +133,7 @@ class DisturbedCertificate:
         return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
 
     def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> Part:
-        """What the start causes, scaled by a rate."""
+        """What follows from the start, scaled by a rate."""
         plant = self._plant(rate_per_s)
         return Part(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
 
@@ -135,7 +146,7 @@ class DisturbedCertificate:
 
     @cached_property
     def _together(self) -> Part:
-        """All causes without decay; the trigger's bound depends on the conditions."""
+        """Everything without decay; the trigger's bound depends on the conditions."""
         plant = self._plant(0.0)
         pushed = replace(plant, forcing=self._forcing(plant))
         first, rest = self._estimation.decaying(0.0), self._estimation.persistent()
@@ -149,24 +160,26 @@ class DisturbedCertificate:
         return replace(plant, further_outputs=outputs)
 
     def _forcing(self, plant: PlantGains) -> Forcing | None:
-        return forcing_of(self.resolved, plant.B)
+        return bound_forcing(self.resolved, plant.B)
 
     @cached_property
     def _estimation(self) -> EstimationError:
         """The estimation error of the plant.
 
         Raises:
-            VoidError: the plant is not known.
+            NoCertificateError: the plant is not known.
         """
         loop = loop_of(self.resolved)
         models = error_gains(loop, 0.0)
         plant = self.plant_at(models, loop.x0[:, None], 0.0)
         if self.resolved.observer is not None and not plant.is_one_plant:
-            raise VoidError("an observer's error is bounded for one plant only, not for a box")
+            raise NoCertificateError(
+                "an observer's error is bounded for one plant only, not for a box"
+            )
         return EstimationError(self.resolved, plant.A, plant.B, self._forcing(plant))
 
 
-def solve_divided(
+def solve_two_parts(
     decaying: Part,
     persistent: Part,
     conditions: NetworkConditions,
@@ -180,7 +193,7 @@ def solve_divided(
     Without ``shares`` δ is searched for only if there is no certificate otherwise.
 
     Raises:
-        VoidError: the loop gain of one part is not below 1.
+        NoCertificateError: the loop gain of one part is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than a part's bounds.
     """
     beta, floor = decaying.bound.beta, persistent.bound.beta
@@ -191,19 +204,19 @@ def solve_divided(
             part._replace(bound=part.bound._replace(reached=level))
             for part, level in zip((decaying, persistent), reached, strict=True)
         ]
-        first, second = solve_sum(parts, conditions, earlier_error, structured=structured)
+        first, second = solve_parts(parts, conditions, earlier_error, structured=structured)
         return first, second
 
     if floor == 0:
         return solved(None)
     if not shares:
-        with contextlib.suppress(VoidError):
+        with contextlib.suppress(NoCertificateError):
             return solved(None)
     tried = [solved(share) for share in shares or SHARES[:1]]
-    return max(tried, key=lambda found: found[0].inter_event_s or 0.0)
+    return max(tried, key=lambda pair: pair[0].inter_event_s or 0.0)
 
 
-def soonest(solved: Callable[[float], Found], decay_per_s: float, start: Vector) -> Found:
+def choose_rate(solved: Callable[[float], Found], decay_per_s: float, start: Vector) -> Found:
     """Return the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
@@ -215,14 +228,16 @@ def soonest(solved: Callable[[float], Found], decay_per_s: float, start: Vector)
 
     Raises: what ``solved`` raises at the smallest rate.
     """
-    size, found = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Found]]()
+    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Found]]()
     for share in _RATES:
         rate_per_s = share * decay_per_s
         try:
             constants = solved(rate_per_s)
-        except (NotDecayingError, VoidError):
-            if not found:
+        except (NotDecayingError, NoCertificateError):
+            if not candidates:
                 raise
             break  # larger rates have larger gains
-        found.append((math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants))
-    return min(found, key=lambda timed: timed[0])[1]
+        candidates.append(
+            (math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants)
+        )
+    return min(candidates, key=lambda timed: timed[0])[1]

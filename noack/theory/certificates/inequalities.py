@@ -9,11 +9,28 @@ its guarantee about losses, and the input is held. With all signals scaled by e^
     π = sup‖p‖  ≤ D_K β̃ + q
     β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
 
-with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Γ_C is smaller if
-few updates may be lost in a window (:mod:`noack.theory.certificates.inequalities`). A policy's threshold
-may contain more than β (:mod:`noack.theory.bounds.trigger_bounds`). These inequalities are linear in q and β̃
-and hold on every [0, T]. So their solution (:mod:`noack.theory.certificates.inequalities`) bounds the run
-if the loop gain is below 1.
+with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. A policy's
+threshold may contain more than β (:mod:`noack.theory.bounds.trigger_bounds`). These inequalities
+are linear in q and β̃ and hold on every [0, T]. So their solution bounds the run if the loop gain
+is below 1.
+
+**Solution.** For v ≤ F v + g with F, g ≥ 0: if some w > 0 has F w < w, the spectral radius of F is
+below 1, and v ≤ x for every x with x − F x ≥ g. Both are checked with a bound of all rounding, so
+nothing depends on how w and x were computed. x begins as the computed (I − F)⁻¹ g. Where x − F x
+misses g by r, adding w max r/(w − F w) is enough.
+
+**Losses in windows.** Γ_C is smaller if few updates may be lost in a window. A lost event k moves
+the input error by K e^{(H+αI)(s−t_k)} e_s(t_k⁻) until an update arrives, so it moves C x by at most
+β̃ c(t − t_k), with
+
+    c(τ) = ∫_d^τ k(τ−s) g(s) ds,   k(τ) = ‖C e^{(A+BK+αI)τ} B U‖,   g(τ) = ‖R e^{(H+αI)τ} W⁻¹‖
+
+Its first d seconds count as those of an update in flight. Events are at least δ apart: n·δ seconds
+contain at most n of them. If at most m of n consecutive updates are lost, the sum of c(t − t_k) is
+at most, in each n·δ seconds of age, the sum of the m largest of the suprema over δ seconds. The
+kernels are enclosed on a common grid of equal cells. For τ in a cell, a cell of k meets the ages of
+two cells of g. Beyond the grid, c(τ) is at most sup_{s ≥ τ/2} g(s) ∫k + sup g ∫_{s ≥ τ/2} k, and
+both kernels fall exponentially there.
 """
 
 import math
@@ -30,12 +47,12 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossWindow
 from noack.theory.bounds.enclosure import KernelBounds
 from noack.theory.bounds.gains import Coefficients, Output, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, Part, VoidError
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part
 from noack.theory.bounds.trigger_bounds import (
     COARSE_CELLS,
     ErrorGrowth,
     first_passage_s,
-    growths_of,
+    list_growths,
 )
 
 _SIGNALS = 6
@@ -170,8 +187,8 @@ def _over_bins(cells: Vector, per_bin: float, bins: int) -> Vector:
     return np.asarray(np.maximum(np.maximum.reduceat(cells, edges[:-1]), cells[edges[1:]]))
 
 
-class ErrorWay(Enum):
-    """How e_c is bounded. Bounds of several parts may be added only if they use the same way."""
+class BoundMethod(Enum):
+    """How e_c is bounded. Bounds of parts may be added only if they use the same method."""
 
     MISSING = "by e_s and by the errors of all missing events"
     DRIFTING = "by its value d ago, and by what has driven it since"
@@ -192,7 +209,7 @@ class ErrorInequalities:
             for output, (free, gain) in plant.states.items()
         }
         self._growths = [
-            growths_of(plant, conditions.sampling_s, part_bound) for part_bound in bound.every
+            list_growths(plant, conditions.sampling_s, part_bound) for part_bound in bound.every
         ]
 
     def use_windows(self) -> None:
@@ -201,20 +218,20 @@ class ErrorInequalities:
             self._lost = LossAccumulation(self._plant, self._conditions.delay_s)
 
     @property
-    def ways(self) -> Sequence[ErrorWay]:
-        """The ways in which e_c can be bounded."""
+    def methods(self) -> Sequence[BoundMethod]:
+        """The methods by which e_c can be bounded."""
         if self._conditions.delay_s > 0 and self._error.decays:
-            return [*ErrorWay]
-        return [ErrorWay.MISSING]
+            return [*BoundMethod]
+        return [BoundMethod.MISSING]
 
-    def constants(self, spacing_s: float, way: ErrorWay) -> Constants:
+    def constants(self, spacing_s: float, method: BoundMethod) -> Constants:
         """Return all constants but δ, given inter-event times of at least ``spacing_s``.
 
         Raises:
-            VoidError: the loop gain is not below 1.
+            NoCertificateError: the loop gain is not below 1.
         """
         events = self._missing(spacing_s)
-        if way is ErrorWay.DRIFTING:
+        if method is BoundMethod.DRIFTING:
             return self._constants(self._drifting(spacing_s), events, spacing_s)
         error = self._error
         bound = _ErrorBound(
@@ -294,7 +311,7 @@ class ErrorInequalities:
         """Return the loop gain and the bounds of the signals.
 
         Raises:
-            VoidError: the loop gain is not below 1.
+            NoCertificateError: the loop gain is not below 1.
         """
         free, errors = signals.free, signals.errors
         hold_s = self._conditions.hold_s
@@ -329,11 +346,13 @@ class ErrorInequalities:
             return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
 
         # Of each bound one growth applies, and all bounds hold.
-        found = [_largest([solved(growth) for growth in growths]) for growths in self._growths]
-        gain = min(solution.loop_gain for solution in found)
-        bounds = [solution.bound for solution in found if solution.bound is not None]
+        solutions = [_largest([solved(growth) for growth in growths]) for growths in self._growths]
+        gain = min(solution.loop_gain for solution in solutions)
+        bounds = [solution.bound for solution in solutions if solution.bound is not None]
         if not bounds:
-            raise VoidError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
+            raise NoCertificateError(
+                f"the loop gain of the errors is {gain:.3g}, not below 1", gain
+            )
         return gain, np.min(bounds, axis=0)
 
     def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
@@ -349,32 +368,32 @@ class ErrorInequalities:
         """
         present = bound.present[Output.GAIN] + bound.in_flight
         share = bound.present[Output.GAIN] + bound.missing[Output.GAIN]
-        found = {output: gain * share for output, (_, gain) in self._states.items()}
+        sizes = {output: gain * share for output, (_, gain) in self._states.items()}
         if self._lost is None:
-            return found
+            return sizes
         windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
         lasting = density * self._error.kernels[Output.GAIN].integral()
         if not lasting < (share - present) * spacing_s:
-            return found
+            return sizes
         for output, (_, gain) in self._states.items():
             together = gain * present + self._lost.total(output, spacing_s, windows)
-            found[output] = min(found[output], together)
-        return found
+            sizes[output] = min(sizes[output], together)
+        return sizes
 
-    def inter_event_s(self, found: Constants, way: ErrorWay) -> float:
+    def inter_event_s(self, constants: Constants, method: BoundMethod) -> float:
         """Return the time that ‖e_s‖_W needs to the next event, given the constants until then."""
         # The part of D_K that is the e_s of now.
-        own = 0.0 if way is ErrorWay.DRIFTING else self._error.now(Output.GAIN)
-        sensor_error = found.overshoot * self.unit - found.estimation_error
-        others = found.input_error - own * sensor_error
-        estimation = found.estimation_error
+        own = 0.0 if method is BoundMethod.DRIFTING else self._error.now(Output.GAIN)
+        sensor_error = constants.overshoot * self.unit - constants.estimation_error
+        others = constants.input_error - own * sensor_error
+        estimation = constants.estimation_error
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
         passages_s = [
             first_passage_s(
                 self._plant,
                 bound.reached - estimation,
-                found.mismatch,
+                constants.mismatch,
                 max(others, self._beyond),
                 own,
                 estimation,
@@ -395,7 +414,9 @@ class ErrorInequalities:
         if delay_s == 0:
             return dropouts
         if spacing_s == 0:
-            raise VoidError("events may be arbitrarily close, so that any number may be under way")
+            raise NoCertificateError(
+                "events may be arbitrarily close, so that any number may be in flight"
+            )
         return dropouts + math.ceil(delay_s / spacing_s)
 
 
@@ -431,8 +452,8 @@ class _Signals(NamedTuple):
         return np.array([gains.get(name, 0.0) for name in self.names])
 
 
-def _largest(found: Sequence[Solution]) -> Solution:
+def _largest(solutions: Sequence[Solution]) -> Solution:
     """Return the larger of several solutions; no bound if one has none."""
-    bounds = [solution.bound for solution in found if solution.bound is not None]
-    gain = max(solution.loop_gain for solution in found)
-    return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(found) else None)
+    bounds = [solution.bound for solution in solutions if solution.bound is not None]
+    gain = max(solution.loop_gain for solution in solutions)
+    return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(solutions) else None)

@@ -1,4 +1,8 @@
-"""Certificates of a scenario: their constants, assumptions and conditions."""
+"""Certificates of a scenario: their constants, assumptions and conditions, and the largest times.
+
+:class:`CertificateScope` is a scenario's own plant, or its uncertainty box. :func:`network_limits`
+searches for the largest sampling period, delay and age of inputs for which a certificate exists.
+"""
 
 import contextlib
 import math
@@ -16,12 +20,12 @@ from noack.settings.matrices import Rows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, VoidError
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
-from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, soonest
+from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
 from noack.theory.certificates.solution import solve
 
 MOST_S = 10.0
@@ -37,7 +41,7 @@ _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _TOO_LARGE = "intermediate results are too large or too small for floating point"
 Phases = tuple[Constants, Constants | None, Constants | None]
-"""The constants, those from the floor on, and those under persistent causes."""
+"""The constants, those from the floor on, and those under persistent disturbances."""
 
 
 def trigger_bounds(resolved: Scenario) -> TriggerBounds:
@@ -154,7 +158,7 @@ class CertificateScope:
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
             phases = self._constants(conditions)
-        except (NotDecayingError, VoidError) as error:
+        except (NotDecayingError, NoCertificateError) as error:
             void = str(error)
 
         def certificate(
@@ -167,24 +171,24 @@ class CertificateScope:
                 certificate(*others) if others else None,
             )  # fmt: skip
 
-        found = certificate(*phases)
-        first, rest = found.constants, found.persistent_constants
+        unchecked = certificate(*phases)
+        first, rest = unchecked.constants, unchecked.persistent_constants
         kept = None
         if not self._resolved.network.enforce_mansd:
-            kept = kept_probability(self._resolved, conditions.guarantee, found.inter_event_s)
+            kept = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
         assumptions = certificate_assumptions(
             self._resolved, conditions, self._decay, first, void,
             max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
             trigger.text(), kept,
         )  # fmt: skip
-        return replace(found, assumptions=tuple(assumptions))
+        return replace(unchecked, assumptions=tuple(assumptions))
 
     def loop_gain(self, conditions: NetworkConditions) -> float:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
             constants = self._constants(conditions, longest=self._start_error > 0)
-        except VoidError as error:
+        except NoCertificateError as error:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
             return math.inf
@@ -196,17 +200,17 @@ class CertificateScope:
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
 
         Raises:
-            VoidError: there is no certificate.
+            NoCertificateError: there is no certificate.
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
             with np.errstate(all="ignore"):
                 if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
                     return [(*self._phases(conditions, longest=longest), None)]
-                found = self._disturbed_phases(conditions, longest=longest)
-                return [(first, None, rest) for first, rest in found]
+                pairs = self._disturbed_phases(conditions, longest=longest)
+                return [(first, None, rest) for first, rest in pairs]
         except (OverflowError, np.linalg.LinAlgError):
-            raise VoidError(_TOO_LARGE) from None
+            raise NoCertificateError(_TOO_LARGE) from None
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool
@@ -222,11 +226,11 @@ class CertificateScope:
     def _disturbed_phases(
         self, conditions: NetworkConditions, *, longest: bool
     ) -> list[tuple[Constants, Constants | None]]:
-        """Return the constants, and those that are added to them under persistent causes."""
+        """Return the constants, and those that are added to them under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
-        found = self._disturbed.constants(conditions, decays=decays, longest=longest)
-        return [self._checked(*pair) for pair in found]
+        pairs = self._disturbed.constants(conditions, decays=decays, longest=longest)
+        return [self._checked(*pair) for pair in pairs]
 
     @cached_property
     def _disturbed(self) -> DisturbedCertificate:
@@ -241,16 +245,16 @@ class CertificateScope:
         """Return the constants.
 
         Raises:
-            VoidError: they do not cover the inputs at the start, or are not finite.
+            NoCertificateError: they do not cover the inputs at the start, or are not finite.
         """
         if first.input_error < self._start_error:
-            raise VoidError(
+            raise NoCertificateError(
                 f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
                 f"covers at most {first.input_error:.3g}"
             )
         for constants in (first, other):
             if constants is not None and not _is_finite(constants):
-                raise VoidError(_TOO_LARGE)
+                raise NoCertificateError(_TOO_LARGE)
         return first, other
 
     def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Constants:
@@ -258,7 +262,7 @@ class CertificateScope:
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
             if not longest:
-                with contextlib.suppress(VoidError):
+                with contextlib.suppress(NoCertificateError):
                     return self._solve(conditions, 0.0, 0.0, None, longest=False)
             return self._fastest(conditions, decay)
         if not self._held and below(alpha, decay) and floor < beta:
@@ -277,12 +281,12 @@ class CertificateScope:
         """Return bounds for a threshold that is a share of the state: any rate may be certified.
 
         Raises:
-            VoidError: there are no bounds, not even without decay.
+            NoCertificateError: there are no bounds, not even without decay.
         """
         # Inputs of an earlier run are bounded without a rate.
         if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
-            with contextlib.suppress(NotDecayingError, VoidError):
-                return soonest(
+            with contextlib.suppress(NotDecayingError, NoCertificateError):
+                return choose_rate(
                     lambda rate: (self._solve(conditions, rate, 0.0, None),),
                     decay, self._loop.x0,
                 )[0]  # fmt: skip
@@ -407,8 +411,8 @@ def _next_s(low_s: float, high_s: float, known: Points, *, middle: bool) -> floa
 def _interpolated_s(known: Points) -> float:
     """Return the time at which the gain is 1, from the gains nearest to it, in logarithms."""
     nearest = sorted(known, key=lambda point: abs(point[0]))[:3]
-    found = 0.0
+    interpolated = 0.0
     for gain, time in nearest:
         others = [other for other, _ in nearest if other != gain]
-        found += time * math.prod(other / (other - gain) for other in others)
-    return math.exp(min(found, math.log(MOST_S)))
+        interpolated += time * math.prod(other / (other - gain) for other in others)
+    return math.exp(min(interpolated, math.log(MOST_S)))

@@ -1,9 +1,19 @@
 """Tight certificates: guaranteed bounds of a loop, for the longest time between events.
 
-The bounds are the solution of the inequalities of :mod:`noack.theory.certificates.inequalities`. The
-minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
+The bounds are the solution of the inequalities of :mod:`noack.theory.certificates.inequalities`.
+The minimum inter-event time δ is the time that ‖e_s‖_W needs from 0 to β under these bounds. If an
 assumed δ gives a time of at least δ, it holds by induction over the events; the largest such δ is
 used.
+
+**Sharpened by the flow between two deliveries**, for the paper's conditions. Given ‖e_c‖_W ≤ D at
+all times, an ellipsoid ‖Λx‖ ≤ 1 is found that x never leaves
+(:mod:`noack.theory.certificates.delivery_flow`). It bounds x and E x, and the flow from it bounds K
+e_c. After an event e_s begins at 0; after r it is C_r z(t_k), C_r = (0, I) e^{Fr} − e^{(H+αI)r} (0,
+I), as long as no update is received. At the event z(t_k) is (ξ, 0), or up to it ‖e_c‖_W ≤ D', since
+one event less is missing than may be. So the next event comes later than certified without the
+flow, and D is smaller with this longer time. Every step uses bounds that hold already. Λ comes from
+a Lyapunov equation with three parameters. They are chosen by samples; what they give is checked
+with all enclosures.
 """
 
 import contextlib
@@ -26,9 +36,9 @@ from noack.theory.bounds.terms import (
     Constants,
     EstimationBound,
     NetworkConditions,
+    NoCertificateError,
     Part,
     TriggerBound,
-    VoidError,
 )
 from noack.theory.bounds.trigger_bounds import LONGEST_S
 from noack.theory.certificates.delivery_flow import (
@@ -40,7 +50,7 @@ from noack.theory.certificates.delivery_flow import (
     error_after,
     errors_after_losses,
 )
-from noack.theory.certificates.inequalities import ErrorInequalities, ErrorWay
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
 
 _SETTLED = 1e-3
 _SHARPER = 0.99
@@ -81,15 +91,17 @@ def solve(
     ``longest``: search for the longest δ; otherwise only if there is no certificate without it.
 
     Raises:
-        VoidError: the loop gain is not below 1.
+        NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     part = Part(error, plant, bound, estimation)
-    (found,) = solve_sum([part], conditions, earlier_error, structured=structured, longest=longest)
+    (constants,) = solve_parts(
+        [part], conditions, earlier_error, structured=structured, longest=longest
+    )
     if longest and structured and earlier_error == 0.0 and _is_reset_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
-            return _sharpened(found, part, conditions)
-    return found
+            return _sharpened(constants, part, conditions)
+    return constants
 
 
 def _is_reset_flow(part: Part, conditions: NetworkConditions) -> bool:
@@ -109,37 +121,37 @@ def _is_reset_flow(part: Part, conditions: NetworkConditions) -> bool:
     )
 
 
-def _sharpened(found: Constants, part: Part, conditions: NetworkConditions) -> Constants:
+def _sharpened(constants: Constants, part: Part, conditions: NetworkConditions) -> Constants:
     """Return the constants with the bounds from the flow between deliveries."""
     error, plant, bound, _ = part
     dropouts, unit = conditions.dropouts, bound.beta if bound.unit is None else bound.unit
-    size = found.overshoot * unit
+    size = constants.overshoot * unit
 
     def plain(spacing_s: float | None) -> Vector:
         """Bound ‖e_c‖_W while at most 0, 1, … events are missing."""
         missing = [error.missing(Output.WEIGHTED, j, spacing_s or 0.0) for j in range(dropouts + 1)]
         return (1 + np.array(missing)) * size
 
-    errors = plain(found.inter_event_s)
+    errors = plain(constants.inter_event_s)
     ellipsoids = InvariantEllipsoids(plant, float(errors[-1]))
     while True:
-        before = found
+        before = constants
         known = SharpenedBounds(
-            found.input_error,
-            found.state,
-            found.state_weighted,
-            found.mismatch,
-            found.inter_event_s,
+            constants.input_error,
+            constants.state,
+            constants.state_weighted,
+            constants.mismatch,
+            constants.inter_event_s,
         )
         known, errors = ellipsoids.sharpened(known, errors, bound.reached, size)
         errors = np.minimum(errors, plain(known.inter_event_s))
         delta = float(errors[-1]) / unit
-        found = found._replace(**known._asdict(), delta=min(delta, found.delta))
-        if not found.delta < _SHARPER * before.delta:
-            return found
+        constants = constants._replace(**known._asdict(), delta=min(delta, constants.delta))
+        if not constants.delta < _SHARPER * before.delta:
+            return constants
 
 
-def solve_sum(
+def solve_parts(
     parts: Sequence[Part],
     conditions: NetworkConditions,
     earlier_error: float = 0.0,
@@ -149,9 +161,9 @@ def solve_sum(
 ) -> list[Constants]:
     """Return the constants of several parts, whose bounds hold when they are added.
 
-    All inequalities are linear in functions of time, for given events. So the causes may be
+    All inequalities are linear in functions of time, for given events. So they may be
     divided: what decays is one part, what persists another one. All parts bound e_c in the same
-    way, since the sum of solutions of different inequalities bounds nothing. The threshold is at
+    method, since the sum of solutions of different inequalities bounds nothing. The threshold is at
     least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
     The ``earlier_error`` is that of the first part.
 
@@ -165,8 +177,11 @@ def solve_sum(
             step.use_windows()
 
     def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
-        found, _ = _smallest(steps, spacing_s)
-        return [part_constants._replace(inter_event_s=inter_event_s) for part_constants in found]
+        constants_of_parts, _ = _smallest(steps, spacing_s)
+        return [
+            part_constants._replace(inter_event_s=inter_event_s)
+            for part_constants in constants_of_parts
+        ]
 
     apart_s = max(part.bound.apart_s for part in parts)
     least_s = max(conditions.spacing_s, apart_s)
@@ -176,7 +191,7 @@ def solve_sum(
     if not longest:
         try:
             return constants(least_s, least_s or None)
-        except VoidError as error:
+        except NoCertificateError as error:
             void = error
     spacing_s = LONGEST_S
     for _ in range(_ATTEMPTS):
@@ -184,11 +199,11 @@ def solve_sum(
             break
         found_s = math.inf
         try:
-            found, way = _smallest(steps, spacing_s)
-        except VoidError:
+            constants_of_parts, method = _smallest(steps, spacing_s)
+        except NoCertificateError:
             break
-        for step, part_constants in zip(reversed(steps), reversed(found), strict=True):
-            found_s = min(found_s, step.inter_event_s(part_constants, way))
+        for step, part_constants in zip(reversed(steps), reversed(constants_of_parts), strict=True):
+            found_s = min(found_s, step.inter_event_s(part_constants, method))
             if found_s <= least_s:  # often by what persists, which is the last part
                 break
         if found_s >= spacing_s:
@@ -202,22 +217,22 @@ def solve_sum(
 
 def _smallest(
     steps: Sequence[ErrorInequalities], spacing_s: float
-) -> tuple[list[Constants], ErrorWay]:
-    """Return the constants of all parts with the way to bound e_c that bounds x tighter.
+) -> tuple[list[Constants], BoundMethod]:
+    """Return the constants of all parts with the method for e_c that bounds x tighter.
 
     Raises:
-        VoidError: no loop gain is below 1.
+        NoCertificateError: no loop gain is below 1.
     """
-    found, void = list[tuple[list[Constants], ErrorWay]](), VoidError("")
-    for way in ErrorWay:
-        if all(way in step.ways for step in steps):
+    candidates, void = list[tuple[list[Constants], BoundMethod]](), NoCertificateError("")
+    for method in BoundMethod:
+        if all(method in step.methods for step in steps):
             try:
-                found.append(([step.constants(spacing_s, way) for step in steps], way))
-            except VoidError as error:
+                candidates.append(([step.constants(spacing_s, method) for step in steps], method))
+            except NoCertificateError as error:
                 void = min(void, error, key=lambda error: error.loop_gain)
-    if not found:
+    if not candidates:
         raise void
-    return min(found, key=lambda candidate: sum(constants.state for constants in candidate[0]))
+    return min(candidates, key=lambda candidate: sum(constants.state for constants in candidate[0]))
 
 
 class SharpenedBounds(NamedTuple):
@@ -259,7 +274,7 @@ class InvariantEllipsoids:
         def of_state(C: Matrix) -> float:
             return float(np.linalg.norm(C @ inverse, 2)) * ROUNDING
 
-        found = SharpenedBounds(
+        sharper = SharpenedBounds(
             min(known.input_error, reach.sup(np.hstack([np.zeros_like(gain), gain]))),
             min(known.state, of_state(flow.inverse)),
             min(known.state_weighted, of_state(np.eye(flow.n))),
@@ -267,14 +282,14 @@ class InvariantEllipsoids:
             known.inter_event_s,
         )
         if level is None or not known.inter_event_s:
-            return found, errors
+            return sharper, errors
         at_event = max(float(errors_at_events(errors)[-1]), _LEAST_SHARE * limit)
         bend = bend_of_error(reach, level)
         at_events = replace(reach, limit=at_event)
         next_s = _next_event_s(at_events, level, known.inter_event_s, bend)
         kernel = self.plant.error.kernels[Output.WEIGHTED]
         errors = errors_after_losses(reach, errors, size, level, next_s, kernel, bend)
-        return found._replace(inter_event_s=next_s), errors
+        return sharper._replace(inter_event_s=next_s), errors
 
     def within(self, limit: float) -> Reach | None:
         """Return the flow from an ellipsoid for these bounds; None if none is found."""
@@ -311,12 +326,12 @@ class InvariantEllipsoids:
         """Return the bounds of ‖x‖ that some parameters give, (c,)."""
         factors = self._factors(parameters)
         usable = np.isfinite(factors).all(axis=(1, 2))
-        found = np.full(len(parameters), np.inf)
+        merits = np.full(len(parameters), np.inf)
         if usable.any():
             factors = factors[usable]
             sizes = self._sizes(factors, self.largest)
-            found[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
-        return found
+            merits[usable] = sizes * np.linalg.norm(self.flow.inverse @ factors, 2, axis=(1, 2))
+        return merits
 
     def _factors(self, parameters: Matrix) -> Stack:
         """Return Λ⁻¹ with Λ⁻¹Λ⁻ᵀ = X, (M + νI)X + X(M + νI)ᵀ = −Q, (c, n, n); not finite if none.
@@ -324,13 +339,13 @@ class InvariantEllipsoids:
         M = A + BK, and Q is BK Kᵀ Bᵀ with shares of the identity and of x(0) x(0)ᵀ. Its scale is
         arbitrary.
         """
-        found = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
+        factors = np.full((len(parameters), self.flow.n, self.flow.n), np.nan)
         for index, (logit, all_x, x0) in enumerate(parameters.clip(-15.0, 15.0)):
             by_input, by_all, by_start = self._grown(float(logit))
             X = by_input + math.exp(all_x) * by_all + math.exp(x0) * by_start
             with contextlib.suppress(np.linalg.LinAlgError):
-                found[index] = np.linalg.cholesky(X)
-        return found
+                factors[index] = np.linalg.cholesky(X)
+        return factors
 
     @cached_method
     def _grown(self, logit: float) -> list[Matrix]:
@@ -339,14 +354,14 @@ class InvariantEllipsoids:
         share = 0.1 + 0.85 / (1 + math.exp(-logit))
         rate = share * -spectral_abscissa(flow.closed_loop)
         moved = flow.closed_loop + rate * np.eye(n)
-        found = []
+        solutions = []
         for columns in (flow.BK, np.eye(n), flow.start):
             Q = columns @ columns.T / max(float((columns**2).sum()), 1e-300)
             if not np.isfinite(Q).all():
                 raise np.linalg.LinAlgError("the squares of the entries overflow")
             X = solve_lyapunov(moved, -Q)
-            found.append(np.asarray(0.5 * (X + X.T)))
-        return found
+            solutions.append(np.asarray(0.5 * (X + X.T)))
+        return solutions
 
     @cached_property
     def _nodes(self) -> Stack:
@@ -371,7 +386,7 @@ class InvariantEllipsoids:
                 self._nodes[:, n:] @ factors[:, None] / limit,
             )
         )
-        found = np.linalg.norm(shapes @ self.flow.start, 2, axis=(1, 2)) ** 2 * ROUNDING
+        largest = np.linalg.norm(shapes @ self.flow.start, 2, axis=(1, 2)) ** 2 * ROUNDING
         which, nodes = np.nonzero(np.linalg.eigvalsh(image)[..., -1] >= 1)
         if len(which):
             image, error = image[which, nodes], error[which, nodes]
@@ -380,8 +395,8 @@ class InvariantEllipsoids:
             rank = np.arange(len(which)) - np.searchsorted(which[order], which[order])
             last = order[rank < _CRITICAL]
             squares, _ = _squares(image[last], error[last], best[last, None] * _FINE)
-            np.maximum.at(found, which[last], squares)
-        return np.asarray(np.sqrt(found))
+            np.maximum.at(largest, which[last], squares)
+        return np.asarray(np.sqrt(largest))
 
 
 def errors_at_events(errors: Vector) -> Vector:
@@ -420,7 +435,7 @@ def _squares(image: Stack, error: Stack, multipliers: Matrix) -> tuple[Vector, V
     """Return the smallest c² over the multipliers, (k, j), and its multiplier, for k nodes."""
     forms = image[:, None] - multipliers[..., None, None] * error[:, None]
     left = np.linalg.eigvalsh(forms)[..., -1]
-    found = np.where(left < 1, multipliers / (1 - left.clip(min=0.0)), np.inf)
-    best = found.argmin(axis=1)
-    rows = np.arange(len(found))
-    return found[rows, best], multipliers[rows, best]
+    squares = np.where(left < 1, multipliers / (1 - left.clip(min=0.0)), np.inf)
+    best = squares.argmin(axis=1)
+    rows = np.arange(len(squares))
+    return squares[rows, best], multipliers[rows, best]

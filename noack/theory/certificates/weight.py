@@ -20,7 +20,7 @@ from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.bounds.contraction import Stack, product, spectral_norms
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, TriggerBound, VoidError
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 
 _ROUNDS_PER_SCALE, _ROUNDS, _ROUNDS_PER_ENTRY = 15, 40, 12
@@ -119,10 +119,10 @@ class _Samples:
             error, loop.A, loop.B, loop.x0[:, None], self.alpha_per_s, samples=self
         )
         try:
-            found = solve(error, plant, conditions, bound, structured=False)
-        except VoidError as void:
+            constants = solve(error, plant, conditions, bound, structured=False)
+        except NoCertificateError as void:
             return _VOID + min(void.loop_gain, _VOID)
-        return math.log(found.state) - 3 * math.log(found.inter_event_s or math.inf)
+        return math.log(constants.state) - 3 * math.log(constants.inter_event_s or math.inf)
 
 
 @dataclass(frozen=True)
@@ -144,15 +144,15 @@ class _SampledPlant(PlantGains):
 
     @cached_property
     def states(self) -> Mapping[str, Coefficients]:
-        found = {}
+        coefficients = {}
         for output, C in self.outputs.items():
             nodes_s, states = self.samples.plant
             followed = product(C, states)
-            found[output] = Coefficients(
+            coefficients[output] = Coefficients(
                 _sampled(nodes_s, followed[:, :, :1]).sup(),
                 _sampled(nodes_s, followed[:, :, 1:]).integral(),
             )
-        return found
+        return coefficients
 
     @cached_property
     def forced(self) -> Mapping[str, KernelBounds]:
@@ -165,9 +165,9 @@ class _SampledPlant(PlantGains):
 
 def _thinned(generator: Matrix, D: Matrix) -> tuple[Vector, Stack]:
     """Return some of the nodes of a response, and e^{Gτ} D there."""
-    found = response(generator, D)
-    kept = np.unique(np.linspace(0, len(found.edges_s) - 1, _NODES).astype(int))
-    return found.edges_s[kept], found.states[kept]
+    followed = response(generator, D)
+    kept = np.unique(np.linspace(0, len(followed.edges_s) - 1, _NODES).astype(int))
+    return followed.edges_s[kept], followed.states[kept]
 
 
 def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
@@ -192,5 +192,5 @@ def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:
     except np.linalg.LinAlgError:
         return None
     scale = float(np.exp(np.linalg.slogdet(weight)[1] / n))
-    found = np.asarray(weight / scale)
-    return found if ErrorGains(H, np.zeros((1, n)), found, alpha_per_s).contracts else None
+    scaled = np.asarray(weight / scale)
+    return scaled if ErrorGains(H, np.zeros((1, n)), scaled, alpha_per_s).contracts else None

@@ -1,8 +1,14 @@
-"""The norm whose unit ball is a symmetric polytope, of many points at once, by the simplex method.
+"""Upper bounds of the joint spectral radius by polytopes, one per node of a switched system.
 
-‖y‖ = min Σ|c_i| over all y = Σ c_i v_i, v_i the vertices. Each basis of n vertices gives an upper
-bound of ‖y‖, and an exchange of one vertex improves it. Every basis is thus a proof; how it was
-found does not matter.
+If every edge takes the polytope of its source, shrunk by γ^duration, into that of its target, no
+path grows faster than γ. The polytopes are built as by Guglielmi and Protasov (2013): each begins
+with a few vertices; images of vertices that are outside are added until none is left. For γ above
+the joint spectral radius this ends. Whatever vertices result, the bound is then computed from them
+anew with all rounding included, so it does not depend on how they were found.
+
+The norm whose unit ball is a symmetric polytope is ‖y‖ = min Σ|c_i| over all y = Σ c_i v_i, v_i the
+vertices. It is computed for many points at once by the simplex method. Each basis of n vertices
+gives an upper bound of ‖y‖, and an exchange of one vertex improves it. Every basis is thus a proof.
 """
 
 from dataclasses import dataclass, field
@@ -71,9 +77,9 @@ class PolytopeNorm:
         """
         numbers = np.arange(first, len(self.vertices))
         norms = self._in_chunks(self.vertices[first:], enough, numbers).norms
-        found = np.zeros(len(self.vertices), dtype=bool)
-        found[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
-        return found
+        redundant = np.zeros(len(self.vertices), dtype=bool)
+        redundant[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
+        return redundant
 
     def _in_chunks(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
         chunk = max(_PRODUCTS // self.vertices.size, 16)
@@ -125,17 +131,17 @@ class PolytopeNorm:
         A bound that is at most ``enough`` is not improved further.
         Nothing is assumed about the combinations; what they miss is a combination of unit vectors.
         """
-        found = self.combinations(points.middle, enough)
-        basis = exactly(self.vertices[found.vertices])
-        sums = exactly(found.coefficients[:, None, :]) @ basis
+        combinations = self.combinations(points.middle, enough)
+        basis = exactly(self.vertices[combinations.vertices])
+        sums = exactly(combinations.coefficients[:, None, :]) @ basis
         missed = (points - IntervalMatrix(sums.middle[:, 0], sums.radius[:, 0])).magnitude
-        bounds = (found.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
+        bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
         return np.where(np.isnan(bounds), np.inf, bounds)
 
 
 def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dict[int, Matrix]:
     """Return small unit vectors, and the leading eigenvectors of a cycle, at each node."""
-    found = {node: [UNIT * np.eye(n)] for node, n in system.dimensions.items()}
+    vertices = {node: [UNIT * np.eye(n)] for node, n in system.dimensions.items()}
     if cycle.path:
         values, vectors = np.linalg.eig(system.product(cycle.path).middle)
         leading = vectors[:, int(np.abs(values).argmax())]
@@ -143,9 +149,9 @@ def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dic
         rows = rows[np.linalg.norm(rows, axis=1) > 1e-9]
         for number in cycle.path:
             edge = system.edges[number]
-            found[edge.source].append(rows)
+            vertices[edge.source].append(rows)
             rows = rows @ edge.matrix.middle.T / growth**edge.duration
-    return {node: np.concatenate(parts) for node, parts in found.items()}
+    return {node: np.concatenate(parts) for node, parts in vertices.items()}
 
 
 @dataclass

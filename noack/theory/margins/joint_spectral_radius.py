@@ -2,8 +2,15 @@
 
 It is the largest growth per unit of time that a path can have in the long run; all paths are stable
 exactly if it is below 1. A cycle bounds it from below
-(:mod:`noack.theory.margins.switched_system`), polytopes (:mod:`noack.theory.margins.invariant_polytopes`) or
-quadratic norms (:mod:`noack.theory.margins.joint_spectral_radius`) from above. All bounds include all rounding.
+(:mod:`noack.theory.margins.switched_system`), polytopes
+(:mod:`noack.theory.margins.invariant_polytopes`) or quadratic norms from above. All bounds include
+all rounding.
+
+Quadratic norms, one per node: if ‖T_w M x‖ ≤ γ^d ‖T_v x‖ for every edge from v to w with the matrix
+M and the duration d, no path grows faster than γ. The matrices T_v are chosen so that the largest γ
+is as small as possible; the bound is then computed from them, so it does not depend on the search.
+Many edges, for which polytopes would need many vertices, cost little more here; but the bound may
+stay above the joint spectral radius.
 """
 
 import math
@@ -85,11 +92,11 @@ def joint_spectral_radius(
     lower, upper, vertices = 0.0, 0.0, 0
     path: tuple[int, ...] = ()
     for part in strongly_connected(edges):
-        found = _connected(part, accuracy, most_vertices)
-        if found.lower > lower:
-            lower = found.lower
-            path = tuple(numbers[id(part.edges[i])] for i in found.cycle)
-        upper, vertices = max(upper, found.upper), vertices + found.vertices
+        bounds = _connected(part, accuracy, most_vertices)
+        if bounds.lower > lower:
+            lower = bounds.lower
+            path = tuple(numbers[id(part.edges[i])] for i in bounds.cycle)
+        upper, vertices = max(upper, bounds.upper), vertices + bounds.vertices
     return JointSpectralRadius(lower, upper, path, vertices)
 
 
@@ -143,14 +150,14 @@ def _representatives(system: SwitchedSystem, growths: Vector) -> list[int]:
     leaving: dict[int, list[int]] = {}
     for number, edge in enumerate(system.edges):
         leaving.setdefault(edge.source, []).append(number)
-    found: set[int] = set()
+    chosen: set[int] = set()
     for members in leaving.values():
         fastest = sorted(members, key=lambda number: -growths[number])[:_FASTEST]
         steady = sorted(members, key=lambda number: system.edges[number].duration)
         places = np.linspace(0, len(steady) - 1, min(_STEADY, len(steady)))
-        found.update(fastest)
-        found.update(steady[index] for index in places.round().astype(int).tolist())
-    return sorted(found)
+        chosen.update(fastest)
+        chosen.update(steady[index] for index in places.round().astype(int).tolist())
+    return sorted(chosen)
 
 
 def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _CycleSearch) -> Cycle:
@@ -267,24 +274,24 @@ class _Search:
 
     def growths(self) -> Vector:
         """Return the logarithm of γ per longest duration, of every edge, (k,)."""
-        found = np.zeros(len(self._edges))
+        logarithms = np.zeros(len(self._edges))
         for steps in self._all:
             turned = self.forms[steps.target] @ steps.matrices.middle
             turned = turned @ _inverse(self.forms[steps.source])
             norms = np.linalg.norm(turned, 2, axis=(1, 2))
-            found[steps.numbers] = np.log(np.maximum(norms, _SMALLEST))
-        return np.asarray(found / self._shares)
+            logarithms[steps.numbers] = np.log(np.maximum(norms, _SMALLEST))
+        return np.asarray(logarithms / self._shares)
 
     def bounds(self) -> Vector:
         """Return upper bounds of γ of every edge, with all rounding, (k,)."""
-        found = np.full(len(self._edges), np.inf)
+        bounds = np.full(len(self._edges), np.inf)
         for steps in self._all:
             undone = inverse(self.forms[steps.source])
             if undone is not None:
                 turned = exactly(self.forms[steps.target]) @ steps.matrices @ undone
                 roots = norms_above(turned) ** (1 / self._durations[steps.numbers])
-                found[steps.numbers] = roots * (1 + 1e-15)
-        return found
+                bounds[steps.numbers] = roots * (1 + 1e-15)
+        return bounds
 
     def improve(self, numbers: NDArray[np.int64]) -> None:
         """Minimise the maximum over some edges: a smooth one that becomes sharper and sharper."""
@@ -293,11 +300,11 @@ class _Search:
         groups = list(self._grouped(numbers.tolist()))
         for sharpness in _SHARPNESS:
             entries = np.concatenate([self.forms[v][lower] for v, lower in self._nodes.items()])
-            found = minimize(
+            minimum = minimize(
                 self._smooth_maximum, entries, (groups, sharpness), "L-BFGS-B", jac=True,
                 options={"maxiter": _STEPS},
             )  # fmt: skip
-            self.forms = self._matrices(found.x)
+            self.forms = self._matrices(minimum.x)
 
     def _grouped(self, numbers: Iterable[int]) -> Iterator[_Steps]:
         groups: dict[tuple[int, int], list[int]] = {}
@@ -310,13 +317,13 @@ class _Search:
             yield _Steps(source, target, np.array(members), stack)
 
     def _matrices(self, entries: Vector) -> dict[int, Matrix]:
-        found, begin = {}, 0
+        matrices, begin = {}, 0
         for node, lower in self._nodes.items():
             size = len(lower[0])
-            found[node] = np.zeros_like(self.forms[node])
-            found[node][lower] = entries[begin : begin + size]
+            matrices[node] = np.zeros_like(self.forms[node])
+            matrices[node][lower] = entries[begin : begin + size]
             begin += size
-        return found
+        return matrices
 
     def _smooth_maximum(
         self, entries: Vector, groups: list[_Steps], sharpness: float

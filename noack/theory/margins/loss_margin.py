@@ -1,12 +1,14 @@
 """The losses that a loop tolerates whatever its sensor measures: stable for all patterns, or not.
 
-The sensor is time-triggered, or transmits at unknown times with a longest time between two. A
-pattern of losses, and of such times, is a path of a graph (:mod:`noack.theory.margins.loss_margin`). Its
-edges, with the loop's maps over their times (:mod:`noack.theory.margins.time_triggered_loop`), are a
-switched system (:mod:`noack.theory.margins.switched_system`).
+The sensor is time-triggered, or transmits at unknown times with a longest time between two. What
+may happen between two deliveries under a guarantee is a graph. Its nodes are the states of the
+guarantee's automaton just after a delivery, and the times at which the sensor transmits relative to
+the controller's ticks. An edge is the time from a delivered update to the next delivered one. A
+pattern of losses, and of such times, is a path. The edges, with the loop's maps over their times
+(:mod:`noack.theory.margins.time_triggered_loop`), are a switched system
+(:mod:`noack.theory.margins.switched_system`).
 """
 
-import math
 from functools import cache
 from typing import NamedTuple
 
@@ -23,8 +25,6 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     outcome_letters,
 )
-from noack.impairments.loss_prediction import LossProcess
-from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.margins.joint_spectral_radius import (
     ACCURACY,
     MOST_VERTICES,
@@ -33,18 +33,10 @@ from noack.theory.margins.joint_spectral_radius import (
 )
 from noack.theory.margins.switched_system import Edge
 from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
-from noack.theory.random_losses.mean_square_growth import (
-    RandomGrowth,
-    mean_square_growth,
-    sure_growth,
-)
 from noack.trigger.trigger_rule import NEVER_NS
 
 MOST_EDGES = 5000
-_MOST_SLOTS = 100
-_MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
-"""Loss probability up to which almost all runs are examined; rarer bursts are bounded together."""
-_TIMELESS = ("loss", "corrupt", "blackout", "duplicate")
+_WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
 _FIRST_ACCURACY = 1e-2
 _QUICK_ACCURACY = 3e-2
 _LAST_ACCURACY = 1e-8
@@ -73,14 +65,14 @@ class Burst(NamedTuple):
 
     def intervals(self, times: EventTimes) -> list[int]:
         """Return times between the transmissions, (losses + 1,), in steps; the longest first."""
-        found, left = [], self.steps
+        intervals, left = [], self.steps
         for further in range(self.losses, -1, -1):
-            found.append(min(times.longest, left - further * times.shortest))
-            left -= found[-1]
-        return found
+            intervals.append(min(times.longest, left - further * times.shortest))
+            left -= intervals[-1]
+        return intervals
 
 
-def bursts_of(
+def list_bursts(
     guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP
 ) -> list[Burst]:
     """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
@@ -95,7 +87,7 @@ def bursts_of(
     automaton = LossAutomaton(guarantee)
     first = int(automaton.after_delivery(np.zeros(1, int))[0])
     numbers, pending = {(first, 0): 0}, [(first, 0)]
-    found: dict[tuple[int, int, int], Burst] = {}
+    bursts: dict[tuple[int, int, int], Burst] = {}
     while pending:
         state, slot = pending.pop()
         source, losses = numbers[state, slot], 0
@@ -108,15 +100,15 @@ def bursts_of(
                     numbers[target] = len(numbers)
                     pending.append(target)
                 burst = Burst(source, numbers[target], slot, losses, steps)
-                found.setdefault((source, numbers[target], steps), burst)
-            if len(found) > MOST_EDGES:
+                bursts.setdefault((source, numbers[target], steps), burst)
+            if len(bursts) > MOST_EDGES:
                 raise CallerError(
                     f"network: {guarantee.meaning}: more than {MOST_EDGES:,} transitions; reduce "
                     "mansd, the windows of the constraints, or the number of measurements between "
                     "two events"
                 )
             state, losses = int(automaton.after_loss(np.array([state]))[0]), sent
-    return _merged(list(found.values()))
+    return _merged(list(bursts.values()))
 
 
 def _merged(bursts: list[Burst]) -> list[Burst]:
@@ -230,7 +222,8 @@ class LossMargin:
                 f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
             )
         self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
-        self._maps = cache(self.loop.map)
+        self.maps = cache(self.loop.map)
+        """The loop's maps by slot and number of lost updates."""
 
     def stability(
         self,
@@ -249,7 +242,7 @@ class LossMargin:
         Raises:
             CallerError: the loop grows so much between deliveries that products overflow.
         """
-        bursts = bursts_of(guarantee or self.guarantee, self.loop.times.slots, self._times)
+        bursts = list_bursts(guarantee or self.guarantee, self.loop.times.slots, self._times)
         try:
             with np.errstate(over="raise"):
                 return self._bounded(bursts, accuracy, refine=refine)
@@ -260,42 +253,20 @@ class LossMargin:
 
     def _bounded(self, bursts: list[Burst], accuracy: float, *, refine: bool) -> Stability:
         edges = [
-            Edge(burst.source, burst.target, self._maps(burst.slot, burst.steps - 1), burst.steps)
+            Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
             for burst in bursts
         ]
         # Short steps would need many vertices.
         vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
         while True:
-            found = joint_spectral_radius(
+            radius = joint_spectral_radius(
                 edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
             )
-            finest = _LAST_ACCURACY if found.vertices else ACCURACY  # of quadratic norms
-            decided = not found.lower <= 1 <= found.upper
+            finest = _LAST_ACCURACY if radius.vertices else ACCURACY  # of quadratic norms
+            decided = not radius.lower <= 1 <= radius.upper
             if decided or not refine or accuracy < finest:
-                return self._stability(found, bursts)
-            accuracy = min(accuracy / 10, (1 - found.lower) / 2)
-
-    def random_growth(self, losses: LossProcess) -> RandomGrowth:
-        """Return the growth under random losses that nothing limits.
-
-        Raises:
-            NotPredictableError: loop and losses have too many states, or the sensor is not
-                time-triggered.
-        """
-        if self.shortest_ns != self.longest_ns:
-            raise NotPredictableError("the times between updates are not known")
-        slots = range(self.loop.times.slots)
-        if len(slots) > _MOST_SLOTS:
-            raise NotPredictableError("the times of the loop repeat only after many periods")
-        maps = [(self.loop.period(slot, True), self.loop.period(slot, False)) for slot in slots]
-        mean_square = almost_sure = mean_square_growth(maps, losses)
-        p = losses.largest_probability
-        if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
-            bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
-            between = [self._maps(0, burst).middle for burst in bursts]
-            longest, lost = self.loop.state_after(0, bursts[-1]), maps[0][1]
-            almost_sure = min(mean_square, sure_growth(between, p, longest, lost))
-        return RandomGrowth(mean_square, almost_sure)
+                return self._stability(radius, bursts)
+            accuracy = min(accuracy / 10, (1 - radius.lower) / 2)
 
     def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
         """Return coarser bounds, which decide whether all patterns are stable."""
@@ -305,8 +276,8 @@ class LossMargin:
         """Return bounds that take less than a second; they may leave stability undecided."""
         return self.stability(accuracy=_QUICK_ACCURACY, refine=False)
 
-    def _stability(self, found: JointSpectralRadius, bursts: list[Burst]) -> Stability:
-        path = [bursts[number] for number in found.cycle]
+    def _stability(self, radius: JointSpectralRadius, bursts: list[Burst]) -> Stability:
+        path = [bursts[number] for number in radius.cycle]
         pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
         intervals_s = (
             steps * self._unit_ns / NS_PER_S
@@ -314,8 +285,8 @@ class LossMargin:
             for steps in burst.intervals(self._times)
         )
         return Stability(
-            found.lower**self._times.longest, found.upper**self._times.longest,
-            tuple(pattern), tuple(intervals_s), found.vertices,
+            radius.lower**self._times.longest, radius.upper**self._times.longest,
+            tuple(pattern), tuple(intervals_s), radius.vertices,
         )  # fmt: skip
 
 
@@ -364,9 +335,9 @@ def update_delay_ns(resolved: Scenario) -> int:
         )
         if isinstance(impairment, Delay) and constant:
             delay_ns += round(impairment.delay_s * NS_PER_S)
-        elif impairment.kind not in _TIMELESS:
+        elif impairment.kind not in _WITHOUT_DELAY:
             raise CallerError(
-                f"network.impairments.{number}: {impairment.kind}: the margin is for a constant delay; "
-                "use delay_s alone"
+                f"network.impairments.{number}: {impairment.kind}: the margin is for a constant "
+                "delay; use delay_s alone"
             )
     return delay_ns

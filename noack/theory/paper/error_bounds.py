@@ -1,10 +1,15 @@
-"""Exact identities that follow from the update laws alone, for every plant.
+"""(I1) along a run, and the bounds of ‖e_c‖ that follow from it.
 
 (I1)  x_c(t) − x_s(t) = Σ_{k=r+1..q} e^{H(t−t_k)} e_s(t_k⁻)
 
-where q is the last event and r the last event with a packet that the controller received. It
-extends the paper's eq:LossEv2 to every loss pattern: x_s jumps by −e_s(t_k⁻) at each event, and x_c
-misses the jumps of events r + 1 to q.
+q is the last event and r the last event whose update the controller received. It extends the
+paper's eq:LossEv2 to every loss pattern: x_s jumps by −e_s(t_k⁻) at each event, and x_c misses the
+jumps of events r + 1 to q. :class:`ModelDifference` evaluates the right-hand side. Two bounds of
+‖e_c‖ follow, which :class:`ErrorMonitor` computes from the sensor's errors and the controller's
+updates:
+
+* the identity's: ‖e_s‖ + Σ ‖e^{H(t−t_k)} e_s(t_k⁻)‖, for every plant, trigger and network;
+* the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a continuous trigger.
 """
 
 import math
@@ -133,7 +138,7 @@ class ErrorMonitor:
         received: NDArray[np.int64],
     ) -> Matrix:
         """Add k measurements as :meth:`sample` does; return both bounds, (k, 2)."""
-        found = np.zeros((len(t_ns), 2))
+        bounds = np.zeros((len(t_ns), 2))
         changes = [*np.flatnonzero(events >= 0).tolist(), len(t_ns)]
         index = 0
         for event in changes:
@@ -141,15 +146,15 @@ class ErrorMonitor:
                 arrived = np.flatnonzero(received[index:event] >= self._oldest)
                 end = index + int(arrived[0]) if len(arrived) else event
                 if index < end:
-                    found[index:end] = self._stretch(t_ns[index:end], e_s[index:end])
+                    bounds[index:end] = self._stretch(t_ns[index:end], e_s[index:end])
                 if end < event:
-                    found[end] = self.sample(int(t_ns[end]), e_s[end], -1, int(received[end]))
+                    bounds[end] = self.sample(int(t_ns[end]), e_s[end], -1, int(received[end]))
                 index = end + 1
             if event < len(t_ns):
                 number, newest = int(events[event]), int(received[event])
-                found[event] = self.sample(int(t_ns[event]), e_s[event], number, newest)
+                bounds[event] = self.sample(int(t_ns[event]), e_s[event], number, newest)
             index = event + 1
-        return found
+        return bounds
 
     @property
     def _oldest(self) -> int:

@@ -76,9 +76,9 @@ def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float)
                 left, right = right, at(low + _GOLDEN * (high - low))
     except NotDecayingError:  # the decay is too slow to compute c in floating point
         return None
-    found = max(left, right, key=lambda theorem: theorem.inter_event_s)
-    sizes = (found.c, found.state_start, found.state_forced)
-    return None if math.isnan(found.inter_event_s) or not all(map(math.isfinite, sizes)) else found
+    best = max(left, right, key=lambda theorem: theorem.inter_event_s)
+    sizes = (best.c, best.state_start, best.state_forced)
+    return None if math.isnan(best.inter_event_s) or not all(map(math.isfinite, sizes)) else best
 
 
 def _theorem_2(

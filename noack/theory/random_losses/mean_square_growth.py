@@ -23,6 +23,7 @@ from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.contraction import Stack
 from noack.theory.margins.exact_matrices import exactly
+from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.margins.switched_system import Edge, SwitchedSystem
 
 _MOST_ENTRIES = 2600
@@ -33,6 +34,9 @@ _WEIGHTS = (1.0, 1.5, 2.0, 3.0)
 """The norms are balanced for maps whose bursts count p^(weight · j/2)."""
 _PAIRS, _TRIPLES = 40, 14
 """Bursts up to which products of two, and of three, are computed."""
+_MOST_SLOTS = 100
+_MOST_LIKELY, _LEAST_LIKELY = 0.93, 1e-12
+"""Loss probability up to which almost all runs are examined; rarer bursts are bounded together."""
 
 
 class RandomGrowth(NamedTuple):
@@ -53,6 +57,29 @@ class RandomGrowth(NamedTuple):
         sure = f"almost surely ‖z‖ changes by at most the factor {self.almost_sure:.6g}"
         verdict = "stable" if self.almost_sure < 1 else "not decided"
         return f"{square}: not stable in mean square; {sure} per period: {verdict}"
+
+
+def random_growth(margin: LossMargin, losses: LossProcess) -> RandomGrowth:
+    """Return the growth of a loop under random losses that nothing limits.
+
+    Raises:
+        NotPredictableError: loop and losses have too many states, or the sensor is not
+            time-triggered.
+    """
+    if margin.shortest_ns != margin.longest_ns:
+        raise NotPredictableError("the times between updates are not known")
+    slots = range(margin.loop.times.slots)
+    if len(slots) > _MOST_SLOTS:
+        raise NotPredictableError("the times of the loop repeat only after many periods")
+    maps = [(margin.loop.period(slot, True), margin.loop.period(slot, False)) for slot in slots]
+    mean_square = almost_sure = mean_square_growth(maps, losses)
+    p = losses.largest_probability
+    if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
+        bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
+        between = [margin._maps(0, burst).middle for burst in bursts]
+        longest, lost = margin.loop.state_after(0, bursts[-1]), maps[0][1]
+        almost_sure = min(mean_square, sure_growth(between, p, longest, lost))
+    return RandomGrowth(mean_square, almost_sure)
 
 
 def mean_square_growth(maps: Sequence[tuple[Matrix, Matrix]], losses: LossProcess) -> float:
@@ -98,8 +125,8 @@ def _check(operator: Matrix, bound: float, size: int) -> None:
         NotPredictableError: the check fails numerically.
     """
     identity = np.tile(np.eye(size).ravel(), len(operator) // size**2)
-    found = np.linalg.solve(bound * np.eye(len(operator)) - operator, identity)
-    forms, images = (stack.reshape(-1, size, size) for stack in (found, operator @ found))
+    solution = np.linalg.solve(bound * np.eye(len(operator)) - operator, identity)
+    forms, images = (stack.reshape(-1, size, size) for stack in (solution, operator @ solution))
     forms, images = ((form + form.transpose(0, 2, 1)) / 2 for form in (forms, images))
     rounding = 1e-13 * len(operator) * float(np.abs(forms).max()) * max(bound, 1.0)
     for positive in (forms, bound * forms - images):

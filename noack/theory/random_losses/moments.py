@@ -1,8 +1,8 @@
-"""Bounds of a loop without a limit on consecutive losses: moments instead of worst cases.
+"""Bounds of a loop without a limit on consecutive losses: bursts, and moments.
 
 Each update is lost with a probability of at most p̄, whatever happened before. |v| is the r-th
-moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at every
-fixed time
+moment norm, (E‖v‖ʳ)^{1/r}, r = 1 or 2, and ρ = p̄^{1/r}. With all signals scaled by e^{αt}, at
+every fixed time
 
     |C e_c| ≤ ‖C W⁻¹‖ a + f_C(a, m, π) + ρ ℓ_C(a, m, π)          (I1): in flight, and lost
     |C x|   ≤ free_C + gain_C π
@@ -10,12 +10,14 @@ fixed time
     a = |e_s|_W ≤ ḡβ + I_E m + I_B π,    m = |R_E x|
 
 A missing event's part of e_c is what E x and B p have added since the event before it. So all lost
-events together contribute at most ρ (∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π). If
-the trigger is tested every h, they contribute at most ρ a Σ_j sup_{τ≥jh} ‖C e^{(H+αI)τ} W⁻¹‖, too.
-The inequalities are linear; their solution bounds every moment if their spectral radius is below 1.
+events together contribute at most ρ (∫‖C e^{(H+αI)s} L_E‖ ds m + ∫‖C e^{(H+αI)s} B U‖ ds π). If the
+trigger is tested every h, they contribute at most ρ a Σ_j sup_{τ≥jh} ‖C e^{(H+αI)τ} W⁻¹‖, too. The
+inequalities are linear; their solution bounds every moment if their spectral radius is below 1.
 
 At an event of the continuous trigger, where ‖e_s‖_W = β, the number of missing events is known in
-distribution, and (I1) gives a bound by itself: :func:`moment_at_events`.
+distribution, and (I1) gives a bound by itself: :func:`moment_at_events`. Almost surely, x decays at
+every rate below that of the moments. Under the paper's conditions it does so for every loss
+probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
 from dataclasses import dataclass
@@ -32,7 +34,7 @@ from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
-from noack.theory.bounds.terms import NetworkConditions, VoidError
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.certificates.assumptions import below
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.inequalities import solve_inequalities
@@ -79,12 +81,12 @@ def moment_at_events(error: ErrorGains, losses: LossProcess, spacing_s: float, o
         order: r.
 
     Raises:
-        VoidError: the probability of long bursts does not fall.
+        NoCertificateError: the probability of long bursts does not fall.
         NotDecayingError: α is not below the decay rate of e^{Hτ}.
     """
     tails, longest = losses.tails(_TERMS)
     if not longest < 1:
-        raise VoidError("bursts of losses may be arbitrarily long")
+        raise NoCertificateError("bursts of losses may be arbitrarily long")
     gains = error.kernels[Output.WEIGHTED].sups(spacing_s * np.arange(1.0, _TERMS + 1))
     powers, ratio = tails ** (1 / order), longest ** (1 / order)
     beyond = gains[-1] * powers.sum() * ratio / (1 - ratio)  # a burst of N + j: longest · tails[j]
@@ -110,7 +112,7 @@ def moments(
         order: r.
 
     Raises:
-        VoidError: the spectral radius of the inequalities is not below 1.
+        NoCertificateError: the spectral radius of the inequalities is not below 1.
         NotDecayingError: α is not below the decay rate of the models, or of A + BK.
     """
     share = largest_probability ** (1 / order)
@@ -121,7 +123,7 @@ def moments(
     best = min(solved, key=lambda solution: solution.get("state", np.inf))
     if "state" not in best:
         gain = min(solution["loop_gain"] for solution in solved)
-        raise VoidError(f"the loop gain of the moments is {gain:.3g}, not below 1")
+        raise NoCertificateError(f"the loop gain of the moments is {gain:.3g}, not below 1")
     return Moments(order=order, rate_per_s=error.alpha_per_s, **best)
 
 
@@ -164,16 +166,16 @@ class _Inequalities:
             a = a + growth.mismatch.integral_on_grid() * self._state(Output.MISMATCH)
             a += growth.input_error.integral_on_grid() * self._input
         rows = np.array([a, pi])
-        found = solve_inequalities(rows[:, :2], rows[:, 2])
-        if found.bound is None:
-            return {"loop_gain": found.loop_gain}
-        values = np.append(found.bound, 1.0)
+        solution = solve_inequalities(rows[:, :2], rows[:, 2])
+        if solution.bound is None:
+            return {"loop_gain": solution.loop_gain}
+        values = np.append(solution.bound, 1.0)
         return {
             "sensor_error": float(values[0]),
             "controller_error": float(controller[Output.WEIGHTED] @ values),
             "input_error": float(values[1]),
             "state": float(self._state(Output.STATE) @ values),
-            "loop_gain": found.loop_gain,
+            "loop_gain": solution.loop_gain,
         }
 
     @property
@@ -188,26 +190,26 @@ class _Inequalities:
     def _controller_error(self, output: Output) -> Vector:
         """The bound of |C e_c|: the present error, updates in flight, lost updates."""
         error, C, delay_s = self._error, self._error.outputs[output], self._conditions.delay_s
-        drives, found = (self._state(Output.MISMATCH), self._input), error.now(output) * _A
+        drives, bound = (self._state(Output.MISMATCH), self._input), error.now(output) * _A
         recent = [0.0, 0.0]
         if delay_s > 0:
             recent = [
                 drive_response.through(C).integral_on_grid()
                 for drive_response in self._recent_drive
             ]
-            found = found + error.kernels[output].sup(delay_s) * _A
+            bound = bound + error.kernels[output].sup(delay_s) * _A
         for drive, area in zip(drives, recent, strict=True):
-            found = found + (1.0 if self._by_tests else 1 - self._share) * area * drive
+            bound = bound + (1.0 if self._by_tests else 1 - self._share) * area * drive
         if self._by_tests:
             return (
-                found
+                bound
                 + self._share
                 * _sum_of_sups(error.kernels[output], delay_s, self._conditions.spacing_s)
                 * _A
             )
         for drive, kernel in zip(drives, self._all_drive, strict=True):
-            found = found + self._share * kernel.through(C).integral() * drive
-        return found
+            bound = bound + self._share * kernel.through(C).integral() * drive
+        return bound
 
 
 def _sum_of_sups(kernel: KernelBounds, first_s: float, spacing_s: float) -> float:
@@ -275,16 +277,16 @@ def unlimited_losses(
         NotPredictableError: the losses are no Markov chain over the packets.
     """
     losses = loss_process(resolved.network.link)
-    found, void = _moments(resolved, losses, conditions)
+    bounds, void = _moments(resolved, losses, conditions)
     paper_rate, at_events = _paper(resolved, losses)
     return UnlimitedLosses(
         losses.largest_probability,
         losses.is_independent,
         resolved.timing.horizon_ns / NS_PER_S,
         tuple(_bursts(resolved, scope, losses, conditions)),
-        tuple(found),
+        tuple(bounds),
         at_events,
-        found[0].rate_per_s if found and found[0].rate_per_s > 0 else None,
+        bounds[0].rate_per_s if bounds and bounds[0].rate_per_s > 0 else None,
         paper_rate,
         void,
     )
@@ -293,7 +295,7 @@ def unlimited_losses(
 def _bursts(
     resolved: Scenario, scope: CertificateScope, losses: LossProcess, conditions: NetworkConditions
 ) -> list[BurstCertificate]:
-    found: list[BurstCertificate] = []
+    certificates: list[BurstCertificate] = []
     for most in range(_MOST_BURST + 1):
         certificate = scope.certificate(conditions._replace(dropouts=most, constraints=()))
         constants, spacing_s = certificate.constants, certificate.inter_event_s
@@ -305,10 +307,10 @@ def _bursts(
         except NotPredictableError:
             break
         state = float(certificate.state(np.zeros(1))[0])
-        found.append(BurstCertificate(most, kept, events, constants.delta, state))
+        certificates.append(BurstCertificate(most, kept, events, constants.delta, state))
         if kept > _CERTAIN:
             break
-    return found
+    return certificates
 
 
 def _moments(
@@ -325,15 +327,15 @@ def _moments(
         return [], "the models or A + BK do not decay"
     error = error_gains(loop, alpha)
     plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha)
-    level, found = max(trigger.beta, trigger.floor), []
+    level, bounds = max(trigger.beta, trigger.floor), []
     for order in ORDERS:
         try:
-            found.append(
+            bounds.append(
                 moments(error, plant, conditions, level, losses.largest_probability, order)
             )
-        except (VoidError, NotDecayingError) as reason:
-            return found, str(reason)
-    return found, None
+        except (NoCertificateError, NotDecayingError) as reason:
+            return bounds, str(reason)
+    return bounds, None
 
 
 def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple[float, ...]]:
@@ -347,7 +349,7 @@ def _paper(resolved: Scenario, losses: LossProcess) -> tuple[float | None, tuple
     error = error_gains(loop, alpha)
     try:
         return alpha, tuple(moment_at_events(error, losses, 0.0, order) for order in ORDERS)
-    except (VoidError, NotDecayingError):
+    except (NoCertificateError, NotDecayingError):
         return None, ()
 
 

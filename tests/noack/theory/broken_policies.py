@@ -10,7 +10,7 @@ from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates import scenario_certificates, solution
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.inequalities import ErrorInequalities, ErrorWay
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from noack.trigger.error_promise import ErrorPromise
 
@@ -84,7 +84,7 @@ def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertifi
 
     def smallest(
         steps: Sequence[ErrorInequalities], spacing_s: float
-    ) -> tuple[list[Constants], ErrorWay]:
+    ) -> tuple[list[Constants], BoundMethod]:
         found = [true([step], spacing_s) for step in steps]
         return [constants for (constants,), _ in found], found[0][1]
 

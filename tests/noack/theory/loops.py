@@ -23,7 +23,7 @@ from noack.impairments.loss_guarantee import (
     LossRule,
 )
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound, VoidError
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 from tests.noack.theory.compiled_loops import (
     Given,
@@ -133,7 +133,7 @@ def certified_or_skipped(
 ) -> Constants:
     try:
         return system.certify(conditions, structured=structured)
-    except VoidError:
+    except NoCertificateError:
         assume(False)
         raise
 
