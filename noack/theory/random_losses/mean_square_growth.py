@@ -76,7 +76,7 @@ def random_growth(margin: LossMargin, losses: LossProcess) -> RandomGrowth:
     p = losses.largest_probability
     if len(slots) == 1 and losses.is_independent and 0 < p < _MOST_LIKELY:
         bursts = range(math.ceil(math.log(_LEAST_LIKELY) / math.log(p)))
-        between = [margin._maps(0, burst).middle for burst in bursts]
+        between = [margin.maps(0, burst).middle for burst in bursts]
         longest, lost = margin.loop.state_after(0, bursts[-1]), maps[0][1]
         almost_sure = min(mean_square, sure_growth(between, p, longest, lost))
     return RandomGrowth(mean_square, almost_sure)
