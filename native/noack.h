@@ -300,6 +300,12 @@ void noack_product(
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 
+/* e^x, e^x - 1, ln x, and the cube root of x >= 0. See native/elementary.h. */
+double noack_exp(double x);
+double noack_expm1(double x);
+double noack_log(double x);
+double noack_cube_root(double x);
+
 /* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 
