@@ -10,6 +10,7 @@
 
 enum {
     FEW_BUFFERS = 16,
+    BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
     HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
     MOST_PUT_OFF_NS = 10000000,
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
@@ -171,7 +172,7 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
             return REFUSED;
         }
     }
-    return relay->by_loop ? row_of_loop(relay, data, size_bytes) : row;
+    return relay->loops > 0 ? row_of_loop(relay, data, size_bytes) : row;
 }
 
 /* Read the arrival time of the current datagram.
@@ -315,14 +316,20 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
         wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
     }
     struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
+    int fd = (int)relay->epoll;
+    if (relay->only_socket >= 0)
+        fd = relay->sockets[relay->only_socket].fd;
+    struct pollfd readable = {.fd = fd, .events = POLLIN};
     long found;
-    if (!own->sleeps) {
-        found = syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &limit, NULL, 0);
-    } else {
-        struct pollfd readable = {.fd = (int)relay->epoll, .events = POLLIN};
+    if (relay->only_socket < 0 && !own->sleeps)
+        found = syscall(EPOLL_PWAIT2, fd, own->ready, READY, &limit, NULL, 0);
+    else
         found = ppoll(&readable, 1, &limit, NULL);
-        if (found > 0)
-            found = epoll_wait((int)relay->epoll, own->ready, READY, 0);
+    if (found > 0 && relay->only_socket >= 0) {
+        own->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
+        own->ready[0].data.u64 = (uint64_t)relay->only_socket;
+    } else if (found > 0 && own->sleeps) {
+        found = epoll_wait(fd, own->ready, READY, 0);
     }
     own->ready_count = max_of(found, 0);
     own->ready_next = 0;
@@ -332,17 +339,25 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
 }
 
 /* Receive datagrams from a socket, as far as there are buffers; return 0, or errno if there are
-   none. */
+   none.
+
+   If the last datagrams came one at a time, it receives one: looking for another takes time. */
 static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *own = scratch_of(relay);
-    int64_t begin = own->batch_end;
-    int taken = recvmmsg(
-        relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags,
-        NULL);
+    int64_t begin = own->batch_end, before_ns = relay->read_ns;
+    int fd = relay->sockets[socket].fd, taken;
+    if (own->is_busy) {
+        taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags, NULL);
+    } else {
+        ssize_t size_bytes = recvmsg(fd, &own->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
+        own->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
+        taken = size_bytes < 0 ? -1 : 1;
+    }
     int error = taken > 0 ? 0 : errno;
     relay->read_ns = run_time_ns(&relay->clock);
     if (own->stamps)
         own->real_ns = clock_ns(CLOCK_REALTIME);
+    own->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
     if (taken > 0) {
         own->batch_socket = socket;
         own->batch_next = begin;
