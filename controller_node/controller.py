@@ -207,17 +207,11 @@ def law_of(resolved: Scenario) -> ControlLaw:
     return resolved.controller.law(ControlModel(loop.A_model, loop.B_model, loop.K, period_s))
 
 
-def controller_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the controller of a resolved scenario as a machine."""
-    return controllers_of((resolved,), start=start)
-
-
 def controllers_of(
     loops: Sequence[Scenario],
     phases_ns: Sequence[int] | None = None,
     *,
     start: Start = BEGINNING,
-    numbered: bool = False,
 ) -> LoopMachines:
     """Return the controllers of resolved loops as the machines of a process.
 
@@ -232,7 +226,7 @@ def controllers_of(
         )
         for one, phase_ns in zip(loops, phases, strict=True)
     ]  # fmt: skip
-    return LoopMachines(parts, phases, numbered=numbered)
+    return LoopMachines(parts, phases)
 
 
 def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Controller:

@@ -156,16 +156,17 @@ class Plant:
             reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measuring.noise(number)
 
 
-def plant_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the plant of a resolved scenario as a machine; a plant cannot be restarted."""
-    return plants_of((resolved,))
-
-
 def plants_of(
-    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, numbered: bool = False
+    loops: Sequence[Scenario],
+    phases_ns: Sequence[int] | None = None,
+    *,
+    start: Start = BEGINNING,
 ) -> LoopMachines:
-    """Return the plants of resolved loops as the machines of a process."""
-    return LoopMachines([_part(one) for one in loops], phases_ns, numbered=numbered)
+    """Return the plants of resolved loops as the machines of a process.
+
+    A plant cannot be restarted during the run: ``start`` has no effect.
+    """
+    return LoopMachines([_part(loop) for loop in loops], phases_ns)
 
 
 def _part(resolved: Scenario) -> Plant:

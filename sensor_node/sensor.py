@@ -222,17 +222,11 @@ def _or_zero(setpoint: Vector | None) -> Vector:
     return np.zeros(1) if setpoint is None else setpoint
 
 
-def sensor_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the sensor of a resolved scenario as a machine."""
-    return sensors_of((resolved,), start=start)
-
-
 def sensors_of(
     loops: Sequence[Scenario],
     phases_ns: Sequence[int] | None = None,
     *,
     start: Start = BEGINNING,
-    numbered: bool = False,
 ) -> LoopMachines:
     """Return the sensors of resolved loops as the machines of a process.
 
@@ -241,7 +235,7 @@ def sensors_of(
     """
     results: dict[str, Any] = {}
     parts = [_part(one, start, results.setdefault(settings_key(one), {})) for one in loops]
-    return LoopMachines(parts, phases_ns, numbered=numbered)
+    return LoopMachines(parts, phases_ns)
 
 
 def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Sensor:

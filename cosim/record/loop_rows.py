@@ -59,16 +59,26 @@ def without_loop(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
     return found
 
 
-def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[tuple[int, Rows]]:
+def rows_by_loop(
+    table: str,
+    rows: Rows,
+    phases_ns: Sequence[int],
+    types: Sequence[Mapping[str, np.dtype[np.void]]],
+) -> Iterator[tuple[int, Rows]]:
     """Yield the number and the rows of each loop, from a part of a table of a live run.
 
     The inputs of the emulator keep their numbers. The table of a clock is that of loop 0.
+
+    Args:
+        table: the table.
+        rows: its rows.
+        phases_ns: when each loop begins.
+        types: the row types of the tables of each loop.
     """
-    names = [name for name in rows.dtype.names or () if name != LOOP]
-    own = np.dtype([(name, rows.dtype[name]) for name in names])
     shared, numbers = is_of_network(table), np.zeros(len(rows), np.int64)
-    if shared:
-        numbers = rows["flow"] % len(phases_ns) if "flow" in names else numbers
+    has_flow = shared and "flow" in (rows.dtype.names or ())
+    if has_flow:
+        numbers = rows["flow"] % len(phases_ns)
     elif has_loop(table):
         numbers = rows[LOOP].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
@@ -79,9 +89,9 @@ def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[t
         chosen = rows[order[ends[number - 1] if number else 0 : ends[number]]]
         if shared:
             _shift(chosen, phases_ns[number])
-            if "flow" in names:
+            if has_flow:
                 chosen["flow"] //= len(phases_ns)
-        yield number, without_loop(chosen, own)
+        yield number, without_loop(chosen, types[number][table])
 
 
 class NetworkRows:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from controller_node.controller import controller_of
+from controller_node.controller import controllers_of
 from cosim.analysis.replay.input_replay import InputReplay, Numbers, table_and_row
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
 from cosim.analysis.summary_model import ReplayDifference
@@ -22,14 +22,14 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import SENDS
 from noack.protocol.wire_format import Flow
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
+from plant_server.plant import plants_of
+from sensor_node.sensor import sensors_of
 
 _MACHINES: Mapping[str, Callable[[Scenario, Start], LoopMachines | Channel]] = {
-    "plant": plant_of,
-    "sensor": sensor_of,
+    "plant": lambda loop, start: plants_of((loop,), start=start),
+    "sensor": lambda loop, start: sensors_of((loop,), start=start),
     "netem": lambda scenario, start: channel_of(scenario, start, loops=len(loops_of(scenario))),
-    "controller": controller_of,
+    "controller": lambda loop, start: controllers_of((loop,), start=start),
 }
 
 

@@ -34,8 +34,8 @@ class LoopSeeds(ScenarioSection):
 class LoopSection(ScenarioSection):
     """A loop, or ``count`` loops, on the run's network.
 
-    A loop is the scenario's top level with the keys of this entry in place of its own. A table that
-    names its kind (``trigger.policy``, ``observer.kind``, ``controller.kind``; ``model.name``,
+    A loop is the scenario's top level, or that of the entry's scenario file, with the keys of this
+    entry in place of its own. A table that names its kind (``trigger.policy``, ``observer.kind``, ``controller.kind``; ``model.name``,
     ``model.A`` or ``model.file``) replaces the whole table of the top level.
     """
 
@@ -47,6 +47,11 @@ class LoopSection(ScenarioSection):
     """Start of the loop after that of the run, as a share of the time between two transmissions of
     a periodic trigger, or else between two measurements. By default drawn by seed, and 0 for the
     first loop of the run."""
+    scenario: str | Table | None = None
+    """Another scenario file: the loop has its mode, model, plant, trigger, observer and controller
+    in place of those of the top level. A path relative to this file, or the name of a shipped
+    scenario. A network, certificate or changes in it must be those of this run; its other keys have
+    no effect. Loading the scenario replaces the name by the tables."""
     mode: Literal["model", "zoh"] | None = None
     """The loop's mode."""
     model: Table | None = None
