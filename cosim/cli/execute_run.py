@@ -59,17 +59,20 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import joint_watcher, later_watcher, launch
+        from cosim.live.launcher import Watcher, joint_watcher, later_watcher, launch
         from cosim.live.run_log import RunLog
+        from noack.config.link_load import require_capacity
         from noack.protocol.topology import ROLES
 
         scenario, ending = load(), None
-        warn_of_violations(scenario)
+        require_capacity(scenario)
         warn_of_other_runs()
+        # Those of the theory come at the start: nothing waits for the launcher then.
+        warnings = Watcher(started=lambda run_dir: warn_of_violations(scenario))
         try:
             with ExitStack() as stack:
                 line = later_watcher(lambda: stack.enter_context(_progress(scenario, session)))
-                watchers = [line, RunLog().watcher()]
+                watchers = [warnings, line, RunLog().watcher()]
                 if metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
                 ending = launch(
@@ -108,15 +111,13 @@ def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
 def warn_of_violations(scenario: "Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
 
-    Loops that share a network: also what may go wrong at their bottleneck. Raise CallerError if a
-    bottleneck cannot carry the datagrams that must pass.
+    Loops that share a network: also what may go wrong at their bottleneck.
     """
-    from noack.config.link_load import link_loads, load_warnings, require_capacity
+    from noack.config.link_load import link_loads, load_warnings
     from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
     from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 
-    require_capacity(scenario)
     shares = len(loop_names(scenario)) > 1
     for line in load_warnings(link_loads(scenario), scenario) if shares else ():
         print(f"noack: warning: {line}", file=sys.stderr)

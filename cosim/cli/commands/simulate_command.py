@@ -35,7 +35,10 @@ def simulate(
 
     The trigger, the losses and the controller are those of a live run.
     """
+    from noack.config.link_load import require_capacity
+
     loaded = cli.load_scenario(scenario, settings)
+    require_capacity(loaded)
     warn_of_violations(loaded)
     if trigger is cli.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)

@@ -19,7 +19,7 @@ from noack.settings.section import ScenarioSection
 class DirectionSection(ScenarioSection):
     """A direction of the network: what happens to its packets, and the guarantee."""
 
-    loss: Loss = NoLoss()
+    loss: Loss = NoLoss.model_construct()
     """Loss of packets, before the guarantee is applied."""
     mansd: Mansd | None = None
     """Largest number of consecutive lost packets; unlimited if not given."""
