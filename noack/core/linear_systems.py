@@ -66,6 +66,20 @@ class Propagator:
             return states
         return np.asarray(states @ self.transition(dt_ns).T)
 
+    def leaps(self, states: Matrix, counts: NDArray[np.int64], period_ns: int) -> Matrix:
+        """Return e^{G j dt} of each of k states, (k, n), after its own number j of periods, (k,).
+
+        A number of periods is followed bit by bit, so that a row does not depend on the others.
+        """
+        found = np.array(states)
+        if self._static:
+            return found
+        for bit in range(int(counts.max(initial=0)).bit_length()):
+            rows = np.flatnonzero(counts >> bit & 1)
+            leap, before = self.transition(period_ns << bit), found[rows]
+            found[rows] = sum(leap[:, i] * before[:, i, None] for i in range(found.shape[1]))
+        return found
+
 
 def norm(vector: Vector) -> float:
     """Return the Euclidean norm ‖v‖₂ of a vector of shape (n,) without overflow of squares."""

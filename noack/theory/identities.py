@@ -7,64 +7,83 @@ extends the paper's eq:LossEv2 to every loss pattern: x_s jumps by −e_s(t_k⁻
 misses the jumps of events r + 1 to q.
 """
 
-from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Propagator, Vector
 
+_PART_NUMBERS = 2**20
+"""Numbers in the jumps that are computed at once."""
 
-class ModelDifference:
-    """Evaluates the right-hand side of (I1) along a run; H is the matrix of both models.
 
-    The missed events are a queue: the oldest leave it. The sums over the older part, from each of
-    its events on, are kept at one time; the newer part has one sum. So an event costs a few
-    products, however many are missed, and nothing is subtracted: rounding errors do not stay.
-    """
+class MissedJumps(NamedTuple):
+    """Jumps that x_c misses: p pairs of a measurement and an event that is missing there."""
 
-    def __init__(self, H: Matrix) -> None:
-        self.propagate = Propagator(H)
-        self._t_ns = 0
-        self._older: deque[tuple[int, Vector]] = deque()
-        """Sequence number, and the sum of the jumps from this event on, at time ``_older_ns``."""
-        self._older_ns = 0
-        self._newer: list[tuple[int, int, Vector]] = []
-        """Sequence number, time, and jump."""
-        self._zero = self._newer_sum = np.zeros(H.shape[0])
+    at: NDArray[np.int64]
+    """(p,) place of the measurement."""
+    event_ns: NDArray[np.int64]
+    """(p,) t_k."""
+    periods: NDArray[np.int64]
+    """(p,) t − t_k, in periods."""
+    jumps: Matrix
+    """(p, n) e^{H(t−t_k)} e_s(t_k⁻)."""
 
-    def advance_to(self, t_ns: int) -> None:
-        """Propagate the sum of the missed jumps to time ``t_ns``."""
-        if self._newer and t_ns != self._t_ns:
-            self._newer_sum = self.propagate(self._newer_sum, t_ns - self._t_ns)
-        self._t_ns = t_ns
+    def sums(self, measurements: int) -> Matrix:
+        """Return the sum of the jumps at each measurement, (measurements, n)."""
+        columns = [np.bincount(self.at, jumps, measurements) for jumps in self.jumps.T]
+        return np.column_stack(columns)
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no event is missed, so that the sum is 0."""
-        return not self._older and not self._newer
 
-    def event(self, sequence: int, e_s: Vector) -> None:
-        """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""
-        self._newer_sum = self._newer_sum + e_s
-        self._newer.append((sequence, self._t_ns, e_s))
+class MissedEvents:
+    """Follows the missed events along a run; all measurements lie on a grid of ``period_ns``."""
 
-    def received(self, sequence: int) -> None:
-        """Remove the missed events up to ``sequence``: the controller received this update."""
-        while self._older and self._older[0][0] <= sequence:
-            self._older.popleft()
-        if self._older or not self._newer or self._newer[0][0] > sequence:
-            return
-        total, self._older_ns = self._zero, self._t_ns
-        for number, t_ns, e_s in reversed(self._newer):
-            if number <= sequence:
-                break
-            total = total + self.propagate(e_s, self._t_ns - t_ns)
-            self._older.appendleft((number, total))
-        self._newer, self._newer_sum = [], self._zero
+    def __init__(self, H: Matrix, period_ns: int) -> None:
+        self._propagate, self._period_ns = Propagator(H), period_ns
+        # One entry per event that is still missing:
+        self._sequences, self._times_ns = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._errors = np.zeros((0, len(H)))
 
-    def total(self) -> Vector:
-        """Return the sum of the missed jumps at the present time, shape (n,)."""
-        if not self._older:
-            return self._newer_sum
-        older = self.propagate(self._older[0][1], self._t_ns - self._older_ns)
-        return older + self._newer_sum
+    def take(
+        self,
+        t_ns: NDArray[np.int64],
+        e_s: Matrix,
+        events: NDArray[np.int64],
+        received: NDArray[np.int64],
+    ) -> Iterator[MissedJumps]:
+        """Add k measurements; yield the jumps that are missed at them, some at a time.
+
+        Args:
+            t_ns: their times, (k,).
+            e_s: e_s before any reset, (k, n).
+            events: the sequence number of the event at each measurement, negative for none, (k,).
+            received: that of the newest update that the controller has, negative for none, (k,).
+        """
+        new = np.flatnonzero(events >= 0)
+        sequences = np.append(self._sequences, events[new])
+        times_ns = np.append(self._times_ns, t_ns[new])
+        errors = np.concatenate([self._errors, e_s[new]])
+        begins = np.append(np.zeros(len(self._sequences), np.int64), new)
+        ends = np.maximum(np.searchsorted(np.maximum.accumulate(received), sequences), begins)
+        lasting = ends == len(t_ns)
+        self._sequences, self._times_ns = sequences[lasting], times_ns[lasting]
+        self._errors = errors[lasting]
+        lengths = ends - begins
+        totals = np.cumsum(lengths)
+        first, most = 0, max(_PART_NUMBERS // errors.shape[1], 1)
+        while first < len(lengths):
+            done = totals[first - 1] if first else 0
+            last = max(int(np.searchsorted(totals, done + most, "right")), first + 1)
+            which = np.repeat(np.arange(first, last), lengths[first:last])
+            at = np.arange(len(which)) - (totals - lengths)[which] + done + begins[which]
+            periods = (t_ns[at] - times_ns[which]) // self._period_ns
+            jumps = self._propagate.leaps(errors[which], periods, self._period_ns)
+            yield MissedJumps(at, times_ns[which], periods, jumps)
+            first = last
+
+
+def missed_sum(missed: Iterator[MissedJumps], measurements: int, n: int) -> Vector:
+    """Return the right-hand side of (I1) at each measurement, (measurements, n)."""
+    return sum((one.sums(measurements) for one in missed), np.zeros((measurements, n)))
