@@ -223,6 +223,11 @@ class RecordedRun:
         self.scenario, self.kind = network.scenario, network.kind
 
     @cached_property
+    def phases_ns(self) -> Sequence[int]:
+        """When each loop begins, in the time of the run."""
+        return phases_ns(self.scenario)
+
+    @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
         return loop_names(self.scenario)

@@ -1,7 +1,7 @@
 """Merges the spooled rows of a table in the order of the machine's inputs, in bounded memory.
 
-A spool is nearly sorted: batches follow each other, except those that were sent again. It is read in
-segments of consecutive batches, in the order of their first inputs.
+A spool is nearly sorted: batches follow each other, except those that were sent again. It is read
+in segments of consecutive batches, in the order of their first inputs.
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -6,7 +6,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -201,6 +201,20 @@ class ErrorGains:
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
-    """Return the gains of a resolved loop's models."""
+    """Return the gains of a resolved loop's models; loops with equal models share them."""
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
-    return ErrorGains(loop.H, loop.K, weight, alpha_per_s)
+    return _error_gains(*map(matrix_key, (loop.H, loop.K, weight)), alpha_per_s)
+
+
+MatrixKey = tuple[tuple[int, ...], bytes]
+
+
+def matrix_key(matrix: Matrix) -> MatrixKey:
+    """Return shape and bits of a matrix, by which equal matrices are known."""
+    return matrix.shape, matrix.tobytes()
+
+
+@lru_cache(maxsize=64)
+def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: float) -> ErrorGains:
+    matrices = (np.frombuffer(data).reshape(shape) for shape, data in (H, K, weight))
+    return ErrorGains(*matrices, alpha_per_s)

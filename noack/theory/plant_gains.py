@@ -9,10 +9,10 @@ and, by identity (I1), e_c is e_s plus the contributions of the missing events. 
 interest are the weighted norm W, the state itself, E x, and K H x (the error rate of a held input).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from noack.theory.enclosure import (
     response,
     response_until,
 )
-from noack.theory.error_gains import Columns, ErrorGains, Growth, Output
+from noack.theory.error_gains import Columns, ErrorGains, Growth, Output, matrix_key
 from noack.theory.forcing import Forcing
 from noack.theory.kernel_bounds import KernelBounds
 
@@ -58,6 +58,27 @@ class PlantGains:
 
     is_one_plant: ClassVar = True
     """Whether A and B are the plant's, and not the centre of a box."""
+
+    of_start: ClassVar = {"states", "results of PlantGains.start_up"}
+    """The kept results that depend on x(0)."""
+
+    def at_start(self, start: Matrix) -> Self:
+        """Return the same plant from another x(0); all other results are shared."""
+        if np.array_equal(start, self.start):
+            return self
+        other = replace(self, start=start)
+        known = {name: value for name, value in vars(self).items() if name not in vars(other)}
+        vars(other).update({k: v for k, v in known.items() if k not in self.of_start})
+        return other
+
+    @cached_property
+    def key(self) -> Hashable:
+        """What equal plants have in common, whatever their x(0)."""
+        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "start"}
+        matrices = [matrix_key(one) for one in own.values() if isinstance(one, np.ndarray)]
+        outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
+        others = type(self), id(self.error), self.alpha_per_s, id(self.forcing)
+        return *others, *matrices, *outputs
 
     @cached_property
     def input_matrix(self) -> Matrix:
