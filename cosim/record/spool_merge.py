@@ -4,6 +4,7 @@ A spool is nearly sorted: batches follow each other, except those that were sent
 in segments of consecutive batches, in the order of their first inputs.
 """
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from noack.protocol.record_tables import LOOP
-from noack.runtime.spool import chunks_in, spool_files
+from noack.runtime.spool import batch_bytes, batches_in, spool_files
 
 _SEGMENT_BYTES = 1024 * 1024
 
@@ -39,15 +40,22 @@ def _parts(
     path: Path, dtype: np.dtype[np.void], begin: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, Rows]]:
     """Yield begin, end and rows of consecutive batches of a file, about a segment at a time."""
-    whole, after = list[bytes](), begin
-    for chunk in chunks_in(path, begin, end):
-        after = chunk.end
-        if len(chunk.rows) % dtype.itemsize == 0:  # rows of a damaged batch cannot be located
-            whole.append(chunk.rows)
-        if after - begin >= _SEGMENT_BYTES:
-            yield begin, after, np.frombuffer(b"".join(whole), dtype)
-            whole, begin = [], after
-    yield begin, after, np.frombuffer(b"".join(whole), dtype)
+    with path.open("rb", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END) if end is None else end
+        while begin < end:
+            file.seek(begin)
+            data = memoryview(file.read(min(_SEGMENT_BYTES, end - begin)))
+            batches, complete = batches_in(data)
+            if not complete:  # a large batch, or the last one, which is incomplete or damaged
+                length = batch_bytes(data)
+                if length is None or begin + length > end:
+                    return
+                file.seek(begin)
+                batches, complete = batches_in(memoryview(file.read(length)))
+            # Rows of a damaged batch cannot be located.
+            whole = [rows for rows in batches if len(rows) % dtype.itemsize == 0]
+            yield begin, begin + complete, np.frombuffer(b"".join(whole), dtype)
+            begin += complete
 
 
 def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:

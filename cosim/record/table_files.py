@@ -302,14 +302,18 @@ def _arrays(rows: Rows) -> dict[str, Any]:
         column = rows[name]
         if column.ndim == 2:
             for entry, values in zip(entry_names(name, column.shape[1]), column.T, strict=True):
-                columns[entry] = pa.array(np.ascontiguousarray(values))
-        elif column.dtype.kind == "V":
-            width = column.dtype.itemsize
-            raw = pa.py_buffer(np.ascontiguousarray(column).tobytes())
-            columns[name] = pa.Array.from_buffers(pa.binary(width), len(rows), [None, raw])
+                columns[entry] = _array(values)
         else:
-            columns[name] = pa.array(np.ascontiguousarray(column))
+            columns[name] = _array(column)
     return columns
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """Return numbers or bytes as an Arrow array; ``pa.array`` would import pandas."""
+    kind, width = values.dtype, values.dtype.itemsize
+    type_ = pa.binary(width) if kind.kind == "V" else pa.from_numpy_dtype(kind)
+    data = pa.py_buffer(np.ascontiguousarray(values).view(np.uint8))
+    return pa.Array.from_buffers(type_, len(values), [None, data])
 
 
 def _rows(path: Path, batch: pa.RecordBatch, dtype: RowType) -> Rows:
@@ -321,13 +325,14 @@ def _rows(path: Path, batch: pa.RecordBatch, dtype: RowType) -> Rows:
             column = batch.column(entry)
             _require_whole(path, entry, column)
             if field.shape:
-                rows[name][:, i] = column.to_numpy()
+                rows[name][:, i] = _values(column, field.base)
             else:
-                rows[name] = _bytes(column, field) if field.kind == "V" else column.to_numpy()
+                rows[name] = _values(column, field)
     return rows
 
 
-def _bytes(column: Any, field: np.dtype[Any]) -> NDArray[Any]:
+def _values(column: Any, field: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values of an Arrow array; its ``to_numpy`` would import pandas."""
     if not len(column):
         return np.zeros(0, field)
     data: memoryview = memoryview(column.buffers()[1])

@@ -16,9 +16,23 @@ from noack.core.matrix_exponential import exponential
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
+MatrixKey = tuple[tuple[int, ...], bytes]
+"""Shape and bits of a matrix, by which equal matrices are known."""
+
 _CACHED_STEPS = 4096
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
+
+
+def matrix_key(matrix: Matrix) -> MatrixKey:
+    """Return the key of a matrix."""
+    return matrix.shape, matrix.tobytes()
+
+
+def matrix_of(key: MatrixKey) -> Matrix:
+    """Return the matrix of a key; it cannot be changed."""
+    shape, data = key
+    return np.frombuffer(data).reshape(shape)
 
 
 def transition(generator: Matrix, dt_ns: int) -> Matrix:

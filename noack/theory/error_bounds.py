@@ -6,12 +6,21 @@ By (I1), e_c = e_s + Σ e^{H(t−t_k)} e_s(t_k⁻) over the missing events. Two 
 * the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a continuous trigger.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, Propagator, Vector, row_norms
+from noack.core.linear_systems import (
+    Matrix,
+    MatrixKey,
+    Vector,
+    matrix_key,
+    matrix_of,
+    row_norms,
+    transition,
+)
 from noack.theory.identities import MissedEvents
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_policy import Policy
@@ -36,13 +45,10 @@ class ErrorMonitor:
     """
 
     def __init__(self, H: Matrix, trigger: Policy, period_ns: int) -> None:
-        self._trigger, self._period_ns = trigger, period_ns
+        self._trigger = trigger
         self._missed = MissedEvents(H, period_ns)
-        self._propagate = Propagator(H)
         self._weight = np.eye(len(H)) if trigger.weight is None else trigger.weight
-        self._inverse = np.linalg.inv(self._weight)
-        self._growths = np.ones(1)
-        """‖e^{Hτ}‖_W at the multiples of the period."""
+        self._growths = _growths(matrix_key(H), matrix_key(self._weight), period_ns)
 
     def take(
         self,
@@ -61,7 +67,7 @@ class ErrorMonitor:
             identity += np.bincount(pairs.at, row_norms(jumps), count)
             missed += pairs.sums(count)
             if isinstance(self._trigger, DecayingTrigger):
-                grown = self._grown(pairs.periods) * self._thresholds(pairs.event_ns)
+                grown = self._growths.at(pairs.periods) * self._thresholds(pairs.event_ns)
                 printed += np.bincount(pairs.at, grown, count)
         return ErrorBounds(identity, printed, missed)
 
@@ -70,14 +76,26 @@ class ErrorMonitor:
             return self._trigger.thresholds(t_ns)
         return np.full(len(t_ns), np.nan)
 
-    def _grown(self, periods: NDArray[np.int64]) -> Vector:
-        """Return ‖e^{Hτ}‖_W at multiples of the period."""
-        known, oldest = len(self._growths), int(periods.max(initial=0))
-        if oldest >= known:
-            more = [self._growth(i * self._period_ns) for i in range(known, oldest + 1)]
-            self._growths = np.append(self._growths, more)
-        return np.asarray(self._growths[periods])
 
-    def _growth(self, age_ns: int) -> float:
-        moved = self._weight @ self._propagate.transition(age_ns) @ self._inverse
-        return float(np.linalg.norm(moved, 2))
+class _Growths:
+    """‖e^{Hτ}‖_W at the multiples of a period."""
+
+    def __init__(self, H: Matrix, weight: Matrix, period_ns: int) -> None:
+        self._H, self._weight, self._period_ns = H, weight, period_ns
+        self._inverse = np.linalg.inv(weight)
+        self._known = np.ones(1)
+
+    def at(self, periods: NDArray[np.int64]) -> Vector:
+        """Return the values at k multiples, (k,)."""
+        known, oldest = len(self._known), int(periods.max(initial=0))
+        if oldest >= known:
+            ages_ns = (i * self._period_ns for i in range(known, oldest + 1))
+            moved = self._weight @ [transition(self._H, ns) for ns in ages_ns] @ self._inverse
+            self._known = np.append(self._known, np.linalg.norm(moved, 2, axis=(1, 2)))
+        return np.asarray(self._known[periods])
+
+
+@lru_cache(maxsize=16)
+def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
+    """Return the growths of some models; loops with equal models share them."""
+    return _Growths(matrix_of(H), matrix_of(weight), period_ns)

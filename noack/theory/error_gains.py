@@ -13,7 +13,14 @@ import numpy as np
 
 from noack.config.resolution import LoopMatrices
 from noack.core.cached_method import cached_method
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.core.linear_systems import (
+    Matrix,
+    MatrixKey,
+    Vector,
+    matrix_key,
+    matrix_of,
+    spectral_abscissa,
+)
 from noack.theory.enclosure import (
     Outputs,
     factors,
@@ -206,15 +213,6 @@ def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
     return _error_gains(*map(matrix_key, (loop.H, loop.K, weight)), alpha_per_s)
 
 
-MatrixKey = tuple[tuple[int, ...], bytes]
-
-
-def matrix_key(matrix: Matrix) -> MatrixKey:
-    """Return shape and bits of a matrix, by which equal matrices are known."""
-    return matrix.shape, matrix.tobytes()
-
-
 @lru_cache(maxsize=64)
 def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: float) -> ErrorGains:
-    matrices = (np.frombuffer(data).reshape(shape) for shape, data in (H, K, weight))
-    return ErrorGains(*matrices, alpha_per_s)
+    return ErrorGains(*map(matrix_of, (H, K, weight)), alpha_per_s)

@@ -18,7 +18,7 @@ import numpy as np
 
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.linear_systems import Matrix, Vector, discretise, matrix_key
 from noack.theory.enclosure import (
     Outputs,
     ResponseBounds,
@@ -26,7 +26,7 @@ from noack.theory.enclosure import (
     response,
     response_until,
 )
-from noack.theory.error_gains import Columns, ErrorGains, Growth, Output, matrix_key
+from noack.theory.error_gains import Columns, ErrorGains, Growth, Output
 from noack.theory.forcing import Forcing
 from noack.theory.kernel_bounds import KernelBounds
 
