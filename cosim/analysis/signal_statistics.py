@@ -7,6 +7,7 @@ import numpy as np
 from cosim.analysis.summary_model import DisturbancePart, EstimationPart, WatchdogPart
 from cosim.record.align import AlignedPart, IdentityResidual, aligned_parts
 from cosim.record.estimation_error import Reals, SizeStatistics, expected_rms
+from cosim.record.record_source import joined
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
@@ -126,7 +127,7 @@ def watchdog_actions(record: RunRecord) -> WatchdogPart:
     trips, steps_old, first_s, was_old = 0, 0, None, False
     for part in record.slices(PLANT_STEP, PLANT_ACTUATION):
         steps = part[PLANT_STEP]
-        received = np.concatenate([received, part[PLANT_ACTUATION]])
+        received = joined([received, part[PLANT_ACTUATION]], received.dtype)
         found = np.searchsorted(received["sequence"], steps["actuation"])
         there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
         newest_ns = np.where(

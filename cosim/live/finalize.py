@@ -42,7 +42,6 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
-from noack.config.loops import phases_ns
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.python_process import cores
@@ -183,7 +182,7 @@ _stored_run = cache(load_run)
 
 
 def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
-    phase_ns = phases_ns(run.scenario)[record.number or 0]
+    phase_ns = run.phases_ns[record.number or 0]
     return summarise(record, int(ending.status), ending.reason, phase_ns)
 
 

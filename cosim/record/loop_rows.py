@@ -17,6 +17,7 @@ from cosim.record.record_source import (
     RecordSource,
     Rows,
     RowsInMemory,
+    joined,
     with_columns,
 )
 from noack.config.resolution import has_loop, is_of_network, network_tables
@@ -86,7 +87,7 @@ def rows_by_loop(
     for number in np.unique(numbers).tolist():
         if number >= len(phases_ns):  # damaged
             continue
-        chosen = rows[order[ends[number - 1] if number else 0 : ends[number]]]
+        chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
         if shared:
             _shift(chosen, phases_ns[number])
             if has_flow:
@@ -126,7 +127,7 @@ class NetworkRows:
             if table in self._orders:
                 first, last = self._ends[table][number : number + 2]
                 chosen = self._orders[table][first:last]
-            own[table] = found[chosen].copy()
+            own[table] = found.take(chosen) if table in self._orders else found.copy()
         _renumber(own, self._inputs)
         for table, found in own.items():
             _shift(found, self._phases_ns[number])
@@ -174,8 +175,7 @@ class LoopTables(RecordSource):
         if is_of_network(table):
             return self._network.whole(table)
         if table not in self._whole:
-            empty = np.zeros(0, self.types[table])
-            self._whole[table] = np.concatenate([empty, *self._read(table, ())])
+            self._whole[table] = joined([*self._read(table, ())], self.types[table])
         return self._whole[table]
 
     def count(self, table: str) -> int:
@@ -185,6 +185,11 @@ class LoopTables(RecordSource):
         if table not in self._counts:
             self._counts[table] = self._stored.count_of_loop(table, self._number)
         return self._counts[table]
+
+    def highest_input(self, table: str) -> int:
+        """Return the highest number of an input of any loop in a table; −1 without rows."""
+        source = self._network if is_of_network(table) else self._stored
+        return source.highest_input(table)
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order; a short one is kept."""

@@ -48,6 +48,8 @@ def generations(source: RecordSource, tables: Sequence[str]) -> list[int]:
 
     If that row is missing, the rows of a later generation prove that there were earlier ones.
     """
+    if all(source.highest_input(table) < GENERATION for table in tables):
+        return [0]
     first, of = 0, np.zeros(0, np.int64)
     for table in tables:
         for rows in source.batches(table, ("input",)):
@@ -116,7 +118,7 @@ def lives_of(
             continue
         places = {table: numbers.places(rows) for table, rows in part.items()}
         for i, count in enumerate(counts):
-            count.add({table: rows[places[table] == i] for table, rows in part.items()})
+            count.add({table: rows.compress(places[table] == i) for table, rows in part.items()})
     return [
         Life(
             generation, one.rows, reports.get(generation),

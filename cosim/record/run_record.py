@@ -27,6 +27,8 @@ from cosim.record.record_source import (
     RecordSource,
     RowsInMemory,
     Slice,
+    joined,
+    packed,
     slices,
     with_columns,
 )
@@ -139,10 +141,9 @@ class RunRecord:
         For a long run, only tables of few rows and selections of few rows fit into memory.
         """
         batches = self.source.batches(table, names)
-        chosen = (rows if where is None else rows[where(rows)] for rows in batches)
-        empty = np.zeros(0, with_columns(self.tables[table], names))
-        found = [*(empty.dtype.names or ())]
-        return np.concatenate([empty, *(rows[found] for rows in chosen)])
+        chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
+        dtype = with_columns(self.tables[table], names)
+        return joined([packed(rows, dtype) for rows in chosen], dtype)
 
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
@@ -220,6 +221,11 @@ class RecordedRun:
     def __init__(self, network: RunRecord, loops: Sequence[RunRecord]) -> None:
         self.network, self.loops = network, loops
         self.scenario, self.kind = network.scenario, network.kind
+
+    @cached_property
+    def phases_ns(self) -> Sequence[int]:
+        """When each loop begins, in the time of the run."""
+        return phases_ns(self.scenario)
 
     @cached_property
     def names(self) -> list[str]:

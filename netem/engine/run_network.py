@@ -104,9 +104,7 @@ class RunNetwork:
         clients["name"][: self._loops] = name_array(self._sensor)
         core.noack_client_insert(relay, 0)
         sends = (core.NOACK_LINK_SOCKET, core.NOACK_DESTINATION_NAME)
-        for direction, destination, by in zip(
-            self._directions, destinations, sends, strict=False
-        ):
+        for direction, destination, by in zip(self._directions, destinations, sends, strict=False):
             direction.set_server(destination, by)
         self._directions[0].row.full = 1  # refuse other sources
 

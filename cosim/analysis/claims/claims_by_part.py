@@ -196,9 +196,9 @@ def _part_of(
         if table in SETTINGS:
             part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
-            part = part[part["t_ns"] >= origin_ns]
+            part = part.compress(part["t_ns"] >= origin_ns)
         elif table == NETEM_PACKET or table in CLOCK_TABLES:
-            part = part[part["now_ns"] >= origin_ns]
+            part = part.compress(part["now_ns"] >= origin_ns)
         elif table == CONTROLLER_DELIVERY and sequence is not None:
             part = part[part["sequence"] >= sequence]
         rows = _shifted(part, origin_ns, x_r, u_r)
@@ -309,7 +309,7 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
 
     def derive(table: str, rows: Rows) -> Rows:
         if table in CLOCK_TABLES:  # their rows have numbers of their own
-            return rows[rows["t_ns"] <= end_ns]
-        return rows[rows["input"] < before[OWNER[table]]]
+            return rows.compress(rows["t_ns"] <= end_ns)
+        return rows.compress(rows["input"] < before[OWNER[table]])
 
     return record.derived(record.scenario, derive)

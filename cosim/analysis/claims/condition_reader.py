@@ -110,7 +110,7 @@ class ConditionReader:
 
     def _measured(self, rows: Rows) -> None:
         self._measurements.add(rows)
-        events = rows[rows["event"] != NO_SEQUENCE]
+        events = rows.compress(rows["event"] != NO_SEQUENCE)
         self._updates.events(events["event"], events["t_ns"])
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:

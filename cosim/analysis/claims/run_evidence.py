@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from cosim.analysis.claims.observed_conditions import (
     guarantee_causes,
 )
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.record.align import AlignedRun, IdentityResidual, aligned_parts, in_common
+from cosim.record.align import AlignedRun, aligned_parts, identity_residual, in_common
 from cosim.record.run_record import RunRecord
 from cosim.record.since_event import UNKNOWN, EventFollower, SinceEvent
 from noack.config.resolution import policy_of
@@ -72,7 +72,7 @@ class Samples:
     joined: AlignedRun
     in_common: NDArray[np.bool_]
     """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
-    error_bounds: tuple[Reals, Reals]
+    error_bounds: Sequence[Reals]
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
     residual: Reals
     """Residual of (I1), (k,)."""
@@ -123,22 +123,21 @@ class RunEvidence:
         monitor = ErrorMonitor(
             self.record.loop.H, policy_of(scenario), scenario.timing.measurement_period_ns
         )
-        residual = IdentityResidual(scenario)
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
         for part in aligned_parts(self.record):
             rows, joined = part.rows, part.aligned
             common = _common(scenario, joined)
-            bounds = monitor.samples(
+            bounds = monitor.take(
                 rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], joined.received
             )
-            bounds[~common] = np.nan
+            both = (np.where(common, one, np.nan) for one in (bounds.identity, bounds.printed))
+            residual = identity_residual(scenario, joined, bounds.missed)
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
-            both = bounds[:, 0], bounds[:, 1]
             true_x = joined.x if part.true_x is None else part.true_x
             since = follower.take(rows, joined)
-            yield Samples(joined, common, both, residual.take(part), true_x, passed, since)
+            yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
 
     @cached_property
     def facts(self) -> SampleFacts:

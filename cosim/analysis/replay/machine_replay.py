@@ -61,7 +61,7 @@ class MachineReplay:
             return
         places = {table: self._numbers.places(rows) for table, rows in owned.items()}
         for i in range(len(self._lives)):
-            yield {table: rows[places[table] == i] for table, rows in owned.items()}
+            yield {table: rows.compress(places[table] == i) for table, rows in owned.items()}
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
