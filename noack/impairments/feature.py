@@ -1,7 +1,13 @@
 """Base classes of a link's features: settings, behaviour, words, description, prediction.
 
 A feature is a loss model, a kind of impairment, a queue discipline, or a constraint on losses: one
-class in its own file, derived from one of the classes at the end.
+class in its own file, derived from one of the classes here. Below them is what several features
+share: random events with a correlation (:class:`CorrelatedChance`), and where in a trace a feature
+begins.
+
+A correlated event: the latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian
+process. The event happens to packet i if z_i exceeds the normal quantile of 1 − p, hence with
+probability p exactly, for every ρ.
 """
 
 import math

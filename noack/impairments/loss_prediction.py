@@ -1,4 +1,4 @@
-"""The expected loss rate of a link under its guarantee.
+"""The losses of a link, computed: their rate under a guarantee, and the process without one.
 
 Each random feature is a Markov chain that advances with every packet. Together they are one chain
 with transition matrix P; in each state, a packet is not effectively delivered with probability ℓ.
@@ -8,9 +8,18 @@ delivered packet. Then
 * E D = v Σ_{k=1..m} A^k 1 is the expected number of losses before the next delivery, and
 * v is stationary under Σ_{k<m} A^k B + A^m P, since the packet after m losses must pass.
 
-The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}). With windows
-or recovery, the states of the guarantee are part of the chain; see
+The loss rate is E D/(E D + 1) (:func:`predict`). For independent losses it is p(1 − p^m)/(1 −
+p^{m+1}). With windows or recovery, the states of the guarantee are part of the chain; see
 :mod:`noack.impairments.markov_chain`.
+
+:class:`LossProcess` is the same chain where nothing limits the losses. All probabilities are those
+of the packets' numbers; when the packets are sent does not matter, even if that depends on earlier
+losses.
+
+``loss 30% keep`` asks for a loss rate under the guarantee and the other impairments (the target
+loss rate). :func:`with_kept_loss` finds the smallest probability for which the predicted rate of
+the whole direction is the target. That may take seconds; a process that must not wait receives what
+another one computed (:func:`remember`).
 """
 
 import json

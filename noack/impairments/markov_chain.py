@@ -1,4 +1,11 @@
-"""A feature as a Markov chain that advances with every packet, to predict loss rates."""
+"""A feature as a Markov chain that advances with every packet, and its loss rate under a guarantee.
+
+A guarantee with windows or recovery makes a larger chain. Its state is the joint state s of the
+impairments and the state a of the guarantee's automaton. In s a packet is lost with probability
+ℓ(s), provided that the automaton allows a loss in a; else it is delivered. The loss rate is Σ π(s,
+a) ℓ(s⁺) over the states that allow a loss, with the stationary distribution π, and s⁺ the state of
+the impairments after their step.
+"""
 
 import math
 from collections.abc import Iterable

@@ -1,7 +1,8 @@
-"""Quantities in the syntax of ``tc``: percentages, times, rates.
+"""The words of the command line: quantities in the syntax of ``tc``, and a reader of words.
 
-A number is read as a decimal and rounded to a float once, so that a written number is read as the
-same float again.
+Quantities are percentages, times and rates. A number is read as a decimal and rounded to a float
+once, so that a written number is read as the same float again. :class:`WordReader` reads words one
+after the other; its error messages name the wrong word.
 """
 
 import difflib

@@ -1,7 +1,8 @@
-"""The discrete-time model that an observer uses.
+"""The settings that every kind of observer has, and the discrete-time model that observers use.
 
-Over a step h of the plant the model is x⁺ = Âd x + B̂d u + q, y = C x + v. The time between two
-measurements is T = steps · h.
+native/loop/observer.c is what an observer does. Over a step h of the plant the model is x⁺ = Âd x +
+B̂d u + q, y = C x + v. The time between two measurements is T = steps · h. At the end:
+observability of a pair (A, C), and pole placement for an observer.
 """
 
 from abc import abstractmethod

@@ -1,4 +1,10 @@
-"""Settings of a Functional Mock-up Unit; :mod:`noack.plants.fmu` runs it."""
+"""A Functional Mock-up Unit: another tool's model, run by FMPy (FMI 2 and 3, co-simulation).
+
+As the standard requires, its start values are set and it is initialised at t = 0. At each step of
+the plant, its inputs are set, one ``doStep`` is made, and its variables are read. The FMU is native
+code and runs in this process, unpacked in a folder of this user only. Its printed output is
+discarded; the last error in its log is kept.
+"""
 
 import contextlib
 import ctypes

@@ -1,4 +1,4 @@
-"""The settings that every kind of plant has.
+"""The interface of a system that a plant advances, and the settings that every kind of plant has.
 
 The loop uses x and u, the deviations from an operating point. The plant's own state z may have
 other coordinates, and more of them.

@@ -4,6 +4,12 @@ The library's equations and parameters are used unchanged. The lane is the libra
 lateral axis of the lane models (:mod:`noack.config.named_models`) has the opposite direction: V and
 Y_g are minus the library's lateral velocity and y. Yaw, yaw rate and steering angle have the same
 sign.
+
+Equations with tyre models are compiled, and integrated by compiled code, which also locates their
+jumps: a tyre's lateral force jumps where the wheel's camber changes its sign. The small models run
+as Python code, with scipy's integrator. For them a call of compiled code costs more time than it
+saves, because it needs more of the processor's caches, which other code overwrites between two
+steps.
 """
 
 import inspect

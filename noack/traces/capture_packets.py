@@ -1,6 +1,7 @@
-"""Reads capture files, pcap and pcapng, packet by packet.
+"""Reads capture files, pcap and pcapng, packet by packet, and finds the UDP datagram in a packet.
 
-Sources: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng.
+Link types: Ethernet, VLAN, loopback, Linux cooked, raw IP. Sources: draft-ietf-opsawg-pcap,
+draft-ietf-opsawg-pcapng, the link types of tcpdump.org, RFC 791, RFC 8200, RFC 768, IEEE 802.1Q.
 """
 
 import struct

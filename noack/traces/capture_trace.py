@@ -1,4 +1,13 @@
-"""The UDP flows of a capture, and their datagrams as arrays."""
+"""Packet traces from captures.
+
+* Two captures, of the sender's and of the receiver's end: the datagrams are matched by payload. The
+  clocks differ, unless the user says otherwise.
+* One capture with both ends, such as the emulator writes: the same, with one clock.
+* One capture of the receiver's end: numbers and sending times from the datagrams of ``noack
+  measure``; or numbers at a known place of the payload, for a sender with a fixed period.
+
+A flow is a pair of addresses at an interface. The largest is taken, unless the user names another.
+"""
 
 import hashlib
 import os

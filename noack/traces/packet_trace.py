@@ -2,6 +2,12 @@
 
 Times are whole nanoseconds since the first sending. All packets are in the trace: a number that no
 record has is a lost packet, for whose sending time the neighbours' are interpolated.
+
+Between two clocks, delays are known up to a constant, and to the drift of one against the other
+(:func:`relative_delays`). The lower envelope of the measured delays is the line below all of them
+with the smallest mean distance to them. Its slope is the drift; without it, the smallest delay is
+0. Source: Moon, Skelly, Towsley, *Estimation and removal of clock skew from network delay
+measurements*, INFOCOM 1999.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,7 @@
-"""Formats of packet traces, one module of this folder each; :func:`read_trace` finds the format."""
+"""Formats of packet traces, one module of this folder each, and the traces that come with noack.
+
+:func:`read_trace` finds the format of a file.
+"""
 
 import gzip
 import zlib

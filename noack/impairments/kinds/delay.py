@@ -1,7 +1,8 @@
 """Delay: a constant, and a random part, drawn as the quantile of a uniform number.
 
 Random parts have mean 0: uniform within ± jitter; normal, Pareto (shape 3) and their mixture with
-the jitter as standard deviation. Empirical ones are interpolated between the observed values.
+the jitter as standard deviation. Empirical ones are interpolated between the observed values, which
+a file may hold: delays, or a distribution table of ``tc``.
 """
 
 import math
