@@ -765,6 +765,10 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
 
+/* Let woken processes run before the calling thread, whose time slice becomes 100 ms, where Linux has
+   time slices of threads (since 6.12). */
+void noack_prefer_others(void);
+
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
 enum {

@@ -5,9 +5,11 @@
 #include <errno.h>
 #include <netinet/in.h>
 #include <poll.h>
+#include <sched.h>
 #include <stddef.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
 #include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
@@ -18,8 +20,12 @@ enum {
     TICKS = 32,         /* that are done before it receives again */
     BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
     QUIET_NS = 500000,  /* housekeeping in Python nearly always takes less time */
-    EARLY_NS = 1000,    /* a timer may expire so much before its time */
-    MOST_PUT_OFF_NS = 50000000
+    /* Housekeeping waits for a step, and for so long after it: the receivers of its messages come
+       first, and the next step is usually a period away. But it does not wait longer than: */
+    SETTLE_NS = 200000,
+    MOST_SETTLE_NS = 10000000,
+    MOST_PUT_OFF_NS = 50000000, /* if a tick is always near */
+    EARLY_NS = 1000             /* a timer may expire so much before its time */
 };
 
 typedef struct {
@@ -37,6 +43,7 @@ typedef struct {
     int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
     int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
     int64_t worked;            /* 1: something was done since it last slept */
+    int64_t has_followed;      /* 1: something was done since housekeeping has been due */
     int64_t has_more;          /* 1: a socket may have more datagrams than were received */
     int64_t has_asked;         /* 1: the present step has asked Python */
     noack_message message;
@@ -359,9 +366,22 @@ static void receive(noack_driver *driver, int64_t ready) {
     }
 }
 
-/* Whether housekeeping, which is overdue, makes no tick late, or has been put off long enough. */
-static int is_housekeeping_time(const noack_driver *driver, int64_t overdue_ns, int64_t tick_ns) {
-    return tick_ns > QUIET_NS || noack_clock_wait_ns(&driver->clock, overdue_ns) >= MOST_PUT_OFF_NS;
+/* How long to wait for, at most, or 0 if the time for housekeeping has come. */
+static int64_t wait_for_ns(
+    noack_driver *driver, int64_t until_ns, int64_t now_ns, int64_t tick_ns) {
+    driver_scratch *own = scratch_of(driver);
+    if (now_ns < until_ns) {
+        own->has_followed = 0;
+        return max_of(noack_clock_wait_ns(&driver->clock, until_ns - now_ns), 1);
+    }
+    if (until_ns == INT64_MIN) /* what has been received is still to be handled */
+        return SETTLE_NS;
+    int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
+    own->has_followed |= own->worked;
+    int settled = overdue_ns >= MOST_SETTLE_NS || (own->has_followed && !own->worked);
+    if ((settled && tick_ns > QUIET_NS) || overdue_ns >= MOST_PUT_OFF_NS)
+        return 0;
+    return own->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
 }
 
 int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
@@ -382,10 +402,8 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         int64_t wall_ns = clock_ns(CLOCK_MONOTONIC);
         int64_t now_ns = noack_clock_at_ns(&driver->clock, wall_ns);
         int64_t tick_ns = next_tick_ns(driver, now_ns);
-        int64_t wait_ns = QUIET_NS;
-        if (now_ns < until_ns)
-            wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
-        else if (until_ns != INT64_MIN && is_housekeeping_time(driver, now_ns - until_ns, tick_ns))
+        int64_t wait_ns = wait_for_ns(driver, until_ns, now_ns, tick_ns);
+        if (wait_ns == 0)
             return NOACK_DRIVEN;
         if (own->in_next < own->in_end)
             continue;
@@ -395,4 +413,15 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         if (ready > 0)
             receive(driver, ready);
     }
+}
+
+void noack_prefer_others(void) {
+    struct { /* sched_attr of Linux */
+        uint32_t size, policy;
+        uint64_t flags;
+        int32_t nice;
+        uint32_t priority;
+        uint64_t runtime_ns, deadline_ns, period_ns;
+    } attributes = {.size = 48, .policy = SCHED_OTHER, .runtime_ns = 100000000};
+    syscall(SYS_sched_setattr, 0, &attributes, 0);
 }

@@ -12,6 +12,7 @@ enum {
     FEW_BUFFERS = 16,
     BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
     HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
+    SETTLE_NS = 200000,       /* between sending and housekeeping */
     MOST_PUT_OFF_NS = 10000000,
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
     LOOP_HEADER_BYTES = 32,
@@ -42,7 +43,6 @@ void noack_relay_open(noack_relay *relay) {
         own->hints[k] = -1;
         renew_header(relay, k);
     }
-    own->most_segments = MOST_SEGMENTS;
     struct timespec at_once = {0, 0};
     own->sleeps =
         syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;
@@ -298,12 +298,22 @@ static int64_t decide_batch(noack_relay *relay) {
     return NOACK_CARRY_ON;
 }
 
-/* Whether to postpone housekeeping because it would make the next delayed datagram late. */
-static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
-    return relay->heap_length > 0
-           && (double)(relay->heap[0].release_ns - relay->read_ns)
-                  < (double)HOUSEKEEPING_NS * relay->clock.speed
-           && (double)(relay->read_ns - until_ns) < (double)MOST_PUT_OFF_NS * relay->clock.speed;
+/* How long to postpone housekeeping, which is due; 0: not at all. It must not make the next delayed
+   datagram late. It waits for a datagram, and for a moment after it: its receiver comes first, and
+   the next one is usually a period away. */
+static int64_t postponed_ns(noack_relay *relay, int64_t until_ns) {
+    relay_scratch *own = scratch_of(relay);
+    double speed = relay->clock.speed;
+    double left_ns = (double)MOST_PUT_OFF_NS * speed - (double)(relay->read_ns - until_ns);
+    own->has_followed |= own->worked;
+    if (left_ns <= 0)
+        return 0;
+    if (relay->heap_length > 0
+        && (double)(relay->heap[0].release_ns - relay->read_ns) < (double)HOUSEKEEPING_NS * speed)
+        return (int64_t)((double)HOUSEKEEPING_NS * speed);
+    if (own->is_busy || (own->has_followed && !own->worked))
+        return 0;
+    return (int64_t)(own->has_followed ? (double)SETTLE_NS * speed : left_ns) + 1;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
@@ -404,6 +414,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
             if (own->leaving_count > 0)
                 sent_ns = send_all(relay);
+            own->worked |= sent_ns >= 0;
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
@@ -414,13 +425,14 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = until_ns;
             if (relay->read_ns >= until_ns) {
-                if (!is_soon_due(relay, until_ns)) {
-                    own->ready_count = own->ready_next = 0;
+                int64_t more_ns = postponed_ns(relay, until_ns);
+                if (more_ns == 0) {
+                    own->ready_count = own->ready_next = own->has_followed = 0;
                     return NOACK_HOUSEKEEPING;
                 }
-                wait_until_ns =
-                    relay->read_ns + (int64_t)((double)HOUSEKEEPING_NS * relay->clock.speed);
+                wait_until_ns = relay->read_ns + more_ns;
             }
+            own->worked = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_HOUSEKEEPING;
