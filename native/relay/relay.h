@@ -62,6 +62,9 @@ typedef struct {
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
     int64_t sleeps;        /* 1: there is no epoll_pwait2, so by ppoll and epoll_wait */
+    int64_t worked;        /* 1: it has sent datagrams since it last waited */
+    int64_t has_followed;  /* 1: it has sent datagrams since housekeeping has been due */
+    int64_t is_busy;       /* 1: the next datagrams may come together */
     int64_t most_segments; /* that the kernel accepts in one message */
     uint64_t loaded;       /* a sum of what was loaded into the caches, so that it is loaded */
     uint8_t buffers[BUFFERS][BUFFER_STRIDE];
