@@ -22,7 +22,7 @@ from cosim.record.record_source import (
 )
 from noack.config.resolution import has_loop, is_of_network, network_tables
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import LOOP, NETEM_SETTING
+from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
@@ -68,7 +68,7 @@ def rows_by_loop(
 ) -> Iterator[tuple[int, Rows]]:
     """Yield the number and the rows of each loop, from a part of a table of a live run.
 
-    The inputs of the emulator keep their numbers. The table of a clock is that of loop 0.
+    The inputs of the emulator keep their numbers. The table of a process's clock is of every loop.
 
     Args:
         table: the table.
@@ -76,6 +76,9 @@ def rows_by_loop(
         phases_ns: when each loop begins.
         types: the row types of the tables of each loop.
     """
+    if table in CLOCK_TABLES:
+        yield from enumerate(_shifted(rows, phase_ns) for phase_ns in phases_ns)
+        return
     shared, numbers = is_of_network(table), np.zeros(len(rows), np.int64)
     has_flow = shared and "flow" in (rows.dtype.names or ())
     if has_flow:
@@ -156,6 +159,7 @@ class LoopTables(RecordSource):
         types: the types of its rows.
         stored: the tables of the run.
         network: the loop's rows of the network.
+        phase_ns: when the loop begins.
     """
 
     def __init__(
@@ -164,9 +168,11 @@ class LoopTables(RecordSource):
         types: Mapping[str, np.dtype[np.void]],
         stored: "StoredTables",
         network: RecordSource,
+        phase_ns: int = 0,
     ) -> None:
         super().__init__(types)
         self._number, self._stored, self._network = number, stored, network
+        self._phase_ns = phase_ns
         self._whole: dict[str, Rows] = {}
         self._counts: dict[str, int] = {}
 
@@ -204,7 +210,8 @@ class LoopTables(RecordSource):
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         dtype = with_columns(self.types[table], columns)
         for rows in self._stored.of_loop(table, self._number, columns):
-            yield without_loop(rows, dtype)
+            own = without_loop(rows, dtype)
+            yield _shifted(own, self._phase_ns) if table in CLOCK_TABLES else own
 
 
 def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
@@ -220,6 +227,15 @@ def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
         for counted, sign in ((inputs, -1), (mine, 1)):
             before = np.searchsorted(counted, numbers) - np.searchsorted(counted, begin)
             found["input"] += sign * before
+
+
+def _shifted(rows: Rows, phase_ns: int) -> Rows:
+    """Return rows with times of a loop in place of those of the run."""
+    if not phase_ns:
+        return rows
+    rows = rows.copy()
+    _shift(rows, phase_ns)
+    return rows
 
 
 def _shift(rows: Rows, phase_ns: int) -> None:

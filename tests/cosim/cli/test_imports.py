@@ -31,7 +31,7 @@ def test_help_imports_no_large_library(words: list[str]) -> None:
 def test_a_command_with_a_module_of_its_own_imports_only_this_one() -> None:
     modules = imported("scenarios", "--json")
     assert {one for one in modules if one.startswith("cosim.cli.commands.")} == {
-        "cosim.cli.commands.scenarios_command"
+        "cosim.cli.commands.scenario_commands"
     }
 
 
