@@ -16,7 +16,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from plant_server.watchdog import too_old
+from plant_server.plant import too_old
 
 
 def _larger(before: float | None, values: Reals) -> float | None:

@@ -20,8 +20,7 @@ from noack.config.parameter_changes import change_notice, scheduled
 from noack.config.resolution import has_loop, network_tables, resolve, shape_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
-from noack.machines.loop_machines import LoopMachines, row_types
-from noack.machines.machine_parts import NEVER_NS
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER

@@ -1,4 +1,4 @@
-"""Scenario files that entries of ``[[loops]]`` name: loading a scenario replaces the name by tables.
+"""Scenario files that entries of ``[[loops]]`` name; loading a scenario replaces names by tables.
 
 A loop takes the file's mode, model, plant, trigger, observer and controller. What the loops of a
 run share is the run's: a file that sets it to something else is refused. Seeds, horizon, speed,
@@ -7,6 +7,7 @@ ports, real-time settings and recovery of the file have no effect.
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from noack.config.loops import PARTS
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.validation_messages import show_value
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, did_you_mean, printable
 from noack.core.file_access import shipped_folder
 from noack.settings.named_file import file_tables, located, with_tables
 from noack.settings.section import ScenarioSection
@@ -37,19 +38,18 @@ def with_named_scenarios(
     """
     if not isinstance(loops := content.get("loops"), list):
         return content
-    read = [
-        entry
-        | {"scenario": _tables(entry["scenario"], content, folder, f"{source}: loops.{place}")}
-        if isinstance(entry, dict) and isinstance(entry.get("scenario"), str)
-        else entry
-        for place, entry in enumerate(loops)
-    ]
+    read = []
+    for place, entry in enumerate(loops):
+        tables = {}
+        if isinstance(entry, dict) and isinstance(name := entry.get("scenario"), str):
+            named = printable(f'{source}: loops.{place}.scenario = "{name}"')
+            tables = {"scenario": _tables(_path(name, folder, named), content, named)}
+        read.append(entry | tables if tables else entry)
     return {**content, "loops": read}
 
 
-def _tables(name: str, run: Mapping[str, Any], folder: Path, place: str) -> dict[str, Any]:
-    """Return the tables of a loop's file."""
-    named, path = f'{place}.scenario = "{name}"', _path(name, folder)
+def _tables(path: Path, run: Mapping[str, Any], named: str) -> dict[str, Any]:
+    """Return the tables of a loop's file, which the setting ``named`` names."""
     content = toml_file.read(path, Scenario)
     if content.get("loops"):
         raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
@@ -64,11 +64,17 @@ def _tables(name: str, run: Mapping[str, Any], folder: Path, place: str) -> dict
     return with_tables(file, tables).model_dump(mode="json", exclude_none=True, include=parts)
 
 
-def _path(name: str, folder: Path) -> Path:
+def _path(name: str, folder: Path, named: str) -> Path:
     """Return the path of a file, or of the shipped scenario of that name."""
-    path, shipped = folder / name, shipped_folder("scenarios") / f"{name}.toml"
-    is_name = Path(name).name == name and not name.endswith(".toml")
-    return shipped if is_name and shipped.is_file() and not path.is_file() else path
+    shipped = {file.stem: file for file in shipped_folder("scenarios").glob("*.toml")}
+    with suppress(OSError, ValueError):  # too long, or with a zero byte
+        if (path := folder / name).exists():
+            return path
+    if name in shipped:
+        return shipped[name]
+    names = [*sorted(shipped), *sorted(file.name for file in folder.glob("*.toml"))]
+    hint = did_you_mean(name, names) or "`noack scenarios` lists the shipped ones"
+    raise CallerError(f"{named}: no such file, nor a shipped scenario; {hint}")
 
 
 def _require_equal(key: str, file: ScenarioSection, run: Mapping[str, Any], named: str) -> None:
@@ -97,8 +103,12 @@ def _pairs(key: str, own: Any, shared: Any) -> Iterator[tuple[str, Any, Any]]:
         yield key, theirs, ours
         return
     for inner in type(own).model_fields:
-        if inner in own.model_fields_set:
-            yield f"{key}.{inner}", theirs[inner], ours[inner]
+        if inner not in own.model_fields_set:
+            continue
+        value, other = theirs[inner], ours[inner]
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from ((f"{key}.{inner}.{k}", value[k], other.get(k)) for k in value)
+        yield f"{key}.{inner}", value, other
 
 
 @cache

@@ -22,9 +22,7 @@ from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.theory.certificates.conditions import network_delay_ns
-from plant_server.disturbance_signal import disturbance_of
-from plant_server.measurement import measurement_model_of
-from plant_server.plant import plants_of
+from plant_server.plant import disturbance_of, measurement_model_of, plants_of
 from sensor_node.sensor import sensors_of
 
 Stack = NDArray[np.float64]

@@ -35,8 +35,8 @@ class LoopSection(ScenarioSection):
     """A loop, or ``count`` loops, on the run's network.
 
     A loop is the scenario's top level, or that of the entry's scenario file, with the keys of this
-    entry in place of its own. A table that names its kind (``trigger.policy``, ``observer.kind``, ``controller.kind``; ``model.name``,
-    ``model.A`` or ``model.file``) replaces the whole table of the top level.
+    entry in place of its own. A table that names its kind (``trigger.policy``, ``observer.kind``,
+    ``controller.kind``; ``model.name``, ``model.A`` or ``model.file``) replaces the whole table.
     """
 
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -72,6 +72,8 @@ class LoopSection(ScenarioSection):
         for key in SHARED:
             if isinstance(content, dict) and key in content:
                 raise ValueError(f"{key}: all loops share it; set it at the top level")
+        if isinstance(content, dict) and not isinstance(content.get("scenario", ""), str | dict):
+            raise ValueError("scenario: should be the name of a scenario file, in quotes")
         return content
 
     @model_validator(mode="after")

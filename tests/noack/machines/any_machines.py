@@ -40,12 +40,8 @@ from noack.trigger.self_triggered import SelfTrigger
 from noack.trigger.send_on_area import SendOnAreaTrigger
 from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
 from noack.trigger.trigger_rule import Forecast
-from plant_server.disturbance_signal import Disturbance
-from plant_server.measurement import MeasurementModel
-from plant_server.plant import Plant
-from plant_server.watchdog import NEVER_NS, Watchdog
-from sensor_node.observer import Observer
-from sensor_node.sensor import Sensor
+from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
+from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import OneLoop
 from tests.wire_decoder import NO_VECTOR
 
