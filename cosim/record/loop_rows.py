@@ -192,9 +192,9 @@ class LoopTables(RecordSource):
             yield from self._read(table, columns)
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        dtype = with_columns(self.types[table], columns)
-        for rows in self._stored.of_loop(table, self._number, columns):
-            yield without_loop(rows, dtype)
+        yield from self._stored.of_loop(
+            table, self._number, with_columns(self.types[table], columns)
+        )
 
 
 def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
