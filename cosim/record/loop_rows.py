@@ -208,10 +208,9 @@ class LoopTables(RecordSource):
             yield from self._read(table, columns)
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        dtype = with_columns(self.types[table], columns)
-        for rows in self._stored.of_loop(table, self._number, columns):
-            own = without_loop(rows, dtype)
-            yield _shifted(own, self._phase_ns) if table in CLOCK_TABLES else own
+        of_loop = self._stored.of_loop
+        for rows in of_loop(table, self._number, with_columns(self.types[table], columns)):
+            yield _shifted(rows, self._phase_ns) if table in CLOCK_TABLES else rows
 
 
 def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:

@@ -12,13 +12,19 @@ from noack.protocol.machine_interface import GENERATION
 _COLUMNS = ("input", "now_ns")
 
 
-class Life(NamedTuple):
-    """One generation of a process."""
+class RowCounts(NamedTuple):
+    """The recorded rows of one generation of a process."""
 
     generation: int
     rows: Mapping[str, int]
     """Number of recorded rows by table."""
     report: Mapping[str, Any] | None
+
+
+class Life(NamedTuple):
+    """One generation of a process."""
+
+    counts: RowCounts
     first_ns: int | None
     """Time of the first row; None without rows."""
     last_ns: int | None
@@ -27,6 +33,21 @@ class Life(NamedTuple):
     missing at the end of a process without a report are unknown."""
     missing_inputs: int
     """Number of inputs without a row, before the last recorded input."""
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+        return self.counts.generation
+
+    @property
+    def rows(self) -> Mapping[str, int]:
+        """Number of recorded rows by table."""
+        return self.counts.rows
+
+    @property
+    def report(self) -> Mapping[str, Any] | None:
+        """The final report; None if it wrote none."""
+        return self.counts.report
 
 
 class LifeNumbers(NamedTuple):
@@ -121,7 +142,7 @@ def lives_of(
             count.add({table: rows.compress(places[table] == i) for table, rows in part.items()})
     return [
         Life(
-            generation, one.rows, reports.get(generation),
+            RowCounts(generation, one.rows, reports.get(generation)),
             one.first_ns, one.last_ns, one.hole_ns, one.missing_inputs,
         )
         for generation, one in zip(numbers.begun, counts, strict=True)

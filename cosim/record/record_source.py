@@ -77,7 +77,8 @@ class RowsInMemory(RecordSource):
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order."""
         rows = self._rows[table]
-        rows = rows[[*columns]] if columns else rows
+        if columns:
+            rows = rows[[name for name in rows.dtype.names or () if name in columns]]
         for first in range(0, len(rows), BATCH_ROWS):
             yield rows[first : first + BATCH_ROWS]
 

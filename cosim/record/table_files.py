@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.record.loop_rows import without_loop
 from cosim.record.record_source import (
     BATCH_ROWS,
     RecordSource,
@@ -83,19 +84,17 @@ class StoredTables(RecordSource):
         else:
             yield from read_batches(self.path(table), with_columns(self.types[table], columns))
 
-    def of_loop(self, table: str, number: int, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Read the rows of a loop in order; of a table without loops, all rows."""
-        path, dtype = self.path(table), self.types[table]
-        if LOOP not in (dtype.names or ()):
-            yield from self.batches(table, columns)
+    def of_loop(self, table: str, number: int, dtype: RowType) -> Iterator[Rows]:
+        """Read the rows of a loop in order, as rows of a type; of a table without loops, all."""
+        if LOOP not in (self.types[table].names or ()):
+            yield from self.batches(table, dtype.names or ())
             return
         for place, group in enumerate(self._groups[table]):
             if group.first == number == group.last:
-                yield from _read_batches(path, [place], with_columns(dtype, columns))
+                yield from _read_batches(self.path(table), [place], dtype)
             elif group.first <= number <= group.last:
                 rows = self._mixed(table, place)
-                chosen = rows.compress(rows[LOOP] == number)
-                yield chosen[[*columns]] if columns else chosen
+                yield without_loop(rows.compress(rows[LOOP] == number), dtype)
 
     def count_of_loop(self, table: str, number: int) -> int:
         """Return the number of rows of a loop; of a table without loops, of all rows."""
@@ -205,7 +204,9 @@ def _read_batches(path: Path, groups: Sequence[int] | None, dtype: RowType) -> I
         _require_columns(path, file.schema_arrow, dtype)
         for group in range(file.num_row_groups) if groups is None else groups:
             # A reader of several groups would keep the memory of all of them to the end.
-            for batch in file.iter_batches(BATCH_ROWS, row_groups=[group], columns=names):
+            for batch in file.iter_batches(
+                BATCH_ROWS, row_groups=[group], columns=names, use_threads=False
+            ):
                 batch.validate(full=True)
                 yield _rows(path, batch, dtype)
 

@@ -15,7 +15,7 @@ the last time that all of them reached, because the loop is incomplete after it.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -55,6 +55,12 @@ _PACES = {
     "controller": (CONTROLLER_STEP, "t_ns"),
 }
 """By process: the table and column with the times of its steps."""
+
+
+@lru_cache(maxsize=1)
+def claims_of(record: RunRecord) -> "RunClaims":
+    """Return the claims about a run; the summary and the report use the same ones."""
+    return RunClaims(record)
 
 
 @dataclass(frozen=True)

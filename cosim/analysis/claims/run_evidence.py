@@ -23,7 +23,13 @@ from cosim.analysis.claims.observed_conditions import (
     guarantee_causes,
 )
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.record.align import AlignedRun, aligned_parts, identity_residual, in_common
+from cosim.analysis.signal_statistics import (
+    SampleFacts,
+    SampleFactsReader,
+    shares_update,
+    signal_statistics,
+)
+from cosim.record.align import AlignedRun, aligned_parts, identity_residual
 from cosim.record.run_record import RunRecord
 from cosim.record.since_event import UNKNOWN, EventFollower, SinceEvent
 from noack.config.resolution import policy_of
@@ -95,18 +101,6 @@ class Samples:
         return np.asarray(np.isfinite(self.true_x).all(axis=1))
 
 
-class SampleFacts(NamedTuple):
-    """What claims need to know about all samples of a run before they are checked."""
-
-    any_in_common: bool = False
-    gap_s: float | None = None
-    """First time at which the controller's error is not known, although it was before."""
-    largest_state: float = 0.0
-    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
-    longest_update_ns: int = 0
-    """Longest time between two updates of the controller, or to the end of the run."""
-
-
 @dataclass(frozen=True)
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
@@ -126,7 +120,7 @@ class RunEvidence:
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
         for part in aligned_parts(self.record):
             rows, joined = part.rows, part.aligned
-            common = _common(scenario, joined)
+            common = shares_update(scenario, joined)
             bounds = monitor.take(
                 rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], joined.received
             )
@@ -142,33 +136,12 @@ class RunEvidence:
     @cached_property
     def facts(self) -> SampleFacts:
         """What must be known about all samples before the claims are checked."""
-        found, fresh_ns, newest, last_ns = SampleFacts(), None, -1, 0
+        if math.isinf(self.part.until_s):
+            return signal_statistics(self.record).facts
+        reader = SampleFactsReader(self.record.scenario, self.part.until_s)
         for part in aligned_parts(self.record):
-            joined = part.aligned
-            if not len(joined.t_ns):
-                continue
-            common, t_s = _common(self.record.scenario, joined), joined.t_ns * 1e-9
-            started = np.logical_or.accumulate(common) | found.any_in_common
-            gaps = np.flatnonzero(started & ~common)
-            if found.gap_s is None and len(gaps):
-                found = found._replace(gap_s=float(t_s[gaps[0]]))
-            until = t_s < self.part.until_s
-            both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
-            changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=newest))]
-            ends_ns = changes if fresh_ns is None else np.append(fresh_ns, changes)
-            longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
-            fresh_ns = ends_ns[-1] if len(ends_ns) else None
-            newest, last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
-            largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
-            found = found._replace(
-                any_in_common=bool(started[-1]),
-                largest_state=largest,
-                longest_update_ns=longest_ns,
-            )
-        if fresh_ns is not None:
-            longest_ns = max(found.longest_update_ns, int(last_ns - fresh_ns))
-            found = found._replace(longest_update_ns=longest_ns)
-        return found
+            reader.take(part.aligned)
+        return reader.facts
 
     @cached_property
     def trajectory_delta(self) -> float | None:
@@ -308,12 +281,6 @@ class RunEvidence:
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
-
-
-def _common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
-    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
-    return np.asarray(finite & in_common(scenario, joined))
 
 
 def scheduled_certificates(

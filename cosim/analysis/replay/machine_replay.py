@@ -8,7 +8,7 @@ from controller_node.controller import controllers_of
 from cosim.analysis.replay.input_replay import InputReplay, Numbers, table_and_row
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.process_lives import Life
+from cosim.record.process_lives import RowCounts
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
@@ -42,7 +42,7 @@ class MachineReplay:
     def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
         self._numbers = record.life_numbers(role)
-        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.lives(role)]
+        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -77,7 +77,7 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: RowCounts) -> None:
         self._role, self._scenario, self._life = role, scenario, life
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
