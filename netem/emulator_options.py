@@ -30,9 +30,9 @@ from netem.tc_words import (
     text_of,
 )
 from noack.core.errors import CallerError, shortened
-from noack.impairments.kept_loss import expected_loss, with_kept_loss
-from noack.impairments.link_settings import LinkSettings, read_files
-from noack.impairments.quantities import OWN_TIME_S
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import expected_loss, read_files, with_kept_loss
+from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.address import text_of as address_text
 from noack.runtime.command_line import Parser

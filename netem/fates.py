@@ -39,8 +39,7 @@ from netem.relay_links import DIRECTIONS, EVENT, Direction, LinkSpec, say
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import Constraints, Mansd
+from noack.impairments.link_settings import Constraints, Mansd, RecordedDecision
 from noack.impairments.loss_guarantee import LossHistory
 from noack.protocol.record_tables import Fate
 

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from noack.core.core_library import core, dtype_of
 from noack.core.errors import CallerError
-from noack.impairments.link_records import Counters, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings, RecordedDecision
 from noack.runtime.address import SocketName as SocketName
 from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of

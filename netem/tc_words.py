@@ -27,9 +27,9 @@ from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
 from noack.impairments.feature import Constraint, Feature, Impairment, Table
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
 from noack.impairments.kinds.reorder import Reorder
-from noack.impairments.link_settings import LinkSettings, read_files
-from noack.impairments.quantities import COUNT, percent_text
-from noack.impairments.word_reader import WordReader
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
+from noack.impairments.words import COUNT, WordReader, percent_text
 from noack.runtime.address import parse_address, parse_destination
 from noack.settings.section import ScenarioSection, Seed
 

@@ -24,8 +24,8 @@ from netem.relay_links import DIRECTIONS, Direction
 from netem.tc_words import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
-from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.runtime import lock_file
 from noack.runtime.private_folder import require_name
 from noack.runtime.zenoh_session import cause_of, open_session

@@ -23,7 +23,8 @@ from netem.control.statistics_view import History, Screen, render
 from netem.relay_links import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.signals import Signals
 from noack.runtime.zenoh_session import answer_to, cause_of, open_session

@@ -35,9 +35,8 @@ from netem.relay_links import (
 from netem.tc_words import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
-from noack.impairments.kept_loss import expected_loss
-from noack.impairments.link_records import Counters
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
+from noack.impairments.loss_prediction import expected_loss
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import text_of as address_text
 
@@ -222,7 +221,7 @@ class FlowStatistics(TypedDict):
 class DirectionStatistics(TypedDict):
     """One direction of a link; see :class:`netem.relay_links.DirectionReport`.
 
-    The counts are those of :class:`noack.impairments.link_records.Counters`.
+    The counts are those of :class:`noack.impairments.link_settings.Counters`.
     """
 
     words: str

@@ -9,6 +9,7 @@ import os
 import socket
 import weakref
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, TypedDict
 
 import numpy as np
@@ -31,6 +32,7 @@ from noack.runtime.process_life import RunProcess
 from noack.runtime.real_time_loop import RecordSink
 from noack.runtime.udp_sockets import CountingSocket, errors_by_text
 
+_UDP_GRO = 104
 _AT_ONCE_NS = -(2**63)
 """Do what is due, and do not wait."""
 
@@ -132,6 +134,9 @@ class LiveDriver:
         self.core.receiver_count = len(receivers)
         for place, receiver in enumerate(receivers):
             self.core.receivers[place] = receiver.fileno()
+            if self.core.process.loops > 1:  # several datagrams then come as one message
+                with suppress(OSError):
+                    receiver.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
         for peer, address in zip(self.core.sources, sources, strict=False):
             peer.name, peer.name_bytes = packed_name(address)
         self._check()

@@ -22,8 +22,7 @@ from netem.relay_links import (
 )
 from netem.tc_words import settings_of
 from noack.core.core_library import core
-from noack.impairments.link_records import Counters
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

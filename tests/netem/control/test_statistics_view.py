@@ -11,7 +11,7 @@ from netem.control.statistics_view import History, plain_lines, render
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
-from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 

@@ -20,7 +20,7 @@ from netem import relay_memory
 from netem.relay_links import DirectionReport, raise_file_limit
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_records import RecordedDecision
+from noack.impairments.link_settings import RecordedDecision
 from noack.protocol.record_tables import Fate
 from noack.runtime import peer_sockets
 from tests.netem.engine.relays import (
