@@ -9,22 +9,23 @@
 
 static const double CERTAINTY = 1e-10; /* the supremum exceeds the returned one by at most this */
 
-/* Gauss-Legendre quadrature on [0, 1]. It is exact for polynomials up to degree 2 NODES - 1. Of t^k,
-   k >= 2 NODES, its error is below 2^(3 - 4 NODES): Chebyshev's polynomials are as close to it. */
+/* Gauss-Legendre quadrature on [0, 1]. It is exact for polynomials up to degree 2 NODES - 1. Of
+   t^k, k >= 2 NODES, its error is below 2^(3 - 4 NODES): Chebyshev's polynomials are as close to
+   it. */
 enum { NODES = 12, AT_ONCE = 6 };
 static const double AT[NODES] = {
     0.009219682876640375, 0.04794137181476257, 0.11504866290284765, 0.2063410228566913,
-    0.3160842505009099, 0.43738329574426554, 0.5626167042557345, 0.6839157494990901,
-    0.7936589771433087, 0.8849513370971523, 0.9520586281852375, 0.9907803171233597,
+    0.3160842505009099,   0.43738329574426554, 0.5626167042557345,  0.6839157494990901,
+    0.7936589771433087,   0.8849513370971523,  0.9520586281852375,  0.9907803171233597,
 };
 static const double SHARE[NODES] = {
     0.023587668193255914, 0.05346966299765921, 0.08003916427167311, 0.10158371336153296,
-    0.1167462682691774, 0.12457352290670139, 0.12457352290670139, 0.1167462682691774,
-    0.10158371336153296, 0.08003916427167311, 0.05346966299765921, 0.023587668193255914,
+    0.1167462682691774,   0.12457352290670139, 0.12457352290670139, 0.1167462682691774,
+    0.10158371336153296,  0.08003916427167311, 0.05346966299765921, 0.023587668193255914,
 };
 
-/* The sum of SHARE v'Wv over the nodes from the first on, as many as registers hold. v is a curve of
-   degree p. */
+/* The sum of SHARE v'Wv over the nodes from the first on, as many as registers hold. v is a curve
+   of degree p. */
 static inline lanes weighted_squares(
     const double *curve, int p, const double *weight, double s, int first) {
     lanes v[AT_ONCE], total = filled(0.0);
