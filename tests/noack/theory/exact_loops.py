@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, Samples
-from cosim.simulation.continuous.continuous_run import (
+from cosim.simulation.continuous import (
+    ContinuousLoop,
     ContinuousRun,
+    Samples,
     TooManyEventsError,
     simulate_continuous,
 )

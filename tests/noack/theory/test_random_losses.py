@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from noack.impairments.loss_process import LossProcess
 from noack.theory.certificate_terms import NetworkConditions, VoidError
 from noack.theory.error_gains import ErrorGains
