@@ -112,8 +112,8 @@ def warn_of_violations(scenario: "Scenario") -> None:
     bottleneck cannot carry the datagrams that must pass.
     """
     from noack.config.link_load import link_loads, load_warnings, require_capacity
-    from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
+    from noack.config.scenario import loop_names, loop_scenario, loop_sections
     from noack.theory.assumptions import AssumptionStatus, assumptions
 
     require_capacity(scenario)

@@ -42,7 +42,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
-from noack.config.loops import phases_ns
+from noack.config.scenario import phases_ns
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.python_process import cores

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 MAX_SAMPLES = 1_000_000
 TABLE_SUFFIX = ".dist"

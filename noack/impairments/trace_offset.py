@@ -9,7 +9,7 @@ from noack.core.random_streams import uniform_pair
 from noack.impairments.feature import StageTables
 from noack.impairments.quantities import OWN_TIME_S, time_text
 from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
 """In seconds after the trace's first packet."""

@@ -18,7 +18,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.observers.estimation_model import EstimationModel, NoiseVariances
 from noack.observers.observability import observer_gain
 from noack.observers.observer_settings import ObserverSettings
-from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import Rows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 

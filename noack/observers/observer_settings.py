@@ -9,8 +9,7 @@ import numpy as np
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.estimation_model import EstimationModel, NoiseVariances
-from noack.settings.matrices import Row, require_length
-from noack.settings.section import ScenarioSection
+from noack.settings.section import Row, ScenarioSection, require_length
 
 
 class ObserverSettings(ScenarioSection):

@@ -6,8 +6,8 @@ from pydantic import Field, FiniteFloat
 
 from noack.plants.plant_settings import Names, PlantSettings, PlantStart
 from noack.plants.systems.plant_system import PlantSystem
-from noack.settings.matrices import Row, require_length
-from noack.settings.named_file import FileSettings
+from noack.settings.section import Row, require_length
+from noack.settings.user_files import FileSettings
 
 
 class FmuSettings(FileSettings, PlantSettings):

@@ -13,7 +13,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, PlantStart
 from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
-from noack.settings.user_class import (
+from noack.settings.user_files import (
     ClassSettings,
     new_instance,
     read_only,

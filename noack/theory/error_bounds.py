@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Propagator, Vector, norm, row_norms
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 
 class ErrorBounds(NamedTuple):

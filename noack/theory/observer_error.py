@@ -18,9 +18,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
+from noack.config.resolution import assumed_model, loop_of
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import assumed_model
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
 from noack.theory.certificate_terms import EstimationBound

@@ -11,7 +11,7 @@ import numpy as np
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.settings.matrices import Rows
+from noack.settings.section import Rows
 from noack.theory.assumptions import below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import solve

@@ -24,7 +24,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
 """Below it, the threshold's square or its significant bits would underflow."""

@@ -15,7 +15,7 @@ from noack.impairments.feature import Impairment, Stage, StageTables, Table, Wor
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
 from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
 MOST_INTERVALS = 1_000_000

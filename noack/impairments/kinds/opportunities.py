@@ -24,7 +24,7 @@ from noack.impairments.trace_offset import (
     require_inside,
 )
 from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000

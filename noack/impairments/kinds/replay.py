@@ -32,8 +32,8 @@ from noack.impairments.trace_offset import (
     require_inside,
 )
 from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
+from noack.settings.user_files import NamedFile
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 from noack.traces.shipped_traces import find_trace
 from noack.traces.trace_formats import read_trace

@@ -22,7 +22,7 @@ from noack.core.linear_systems import Vector
 from noack.plants.fmu import FmuSettings
 from noack.plants.systems.native_code import quiet, temporary_folder
 from noack.plants.systems.plant_system import SystemFailedError
-from noack.settings.named_file import unchanged
+from noack.settings.user_files import unchanged
 
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
 """Status codes of FMI."""

@@ -9,9 +9,8 @@ from cosim.analysis.replay import replay
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.loops import loop_names, loops_of, phases_ns
 from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, loops_of, phases_ns
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import OWNER
 

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.loops import loop_names, loops_of
 from noack.config.resolution import resolve, resolve_run, resolved_loops
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, loops_of
 from noack.config.scenario_file import dumps, load, toml_text
 from noack.core.errors import CallerError
 

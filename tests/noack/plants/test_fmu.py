@@ -20,7 +20,7 @@ from noack.plants.systems.fmu_system import FmuSystem
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.systems.plant_system import SystemFailedError
-from noack.settings.named_file import located
+from noack.settings.user_files import located
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 
