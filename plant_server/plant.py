@@ -37,8 +37,7 @@ from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, set_machine
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import PlantStart
-from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
+from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
 from noack.protocol.wire_format import Flow

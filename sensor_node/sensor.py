@@ -29,8 +29,7 @@ from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines, Role, set_machine, take_changes
-from noack.observers.estimation_model import EstimationModel
-from noack.observers.observer_settings import ObserverSettings
+from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,

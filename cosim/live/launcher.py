@@ -165,8 +165,6 @@ def launch(
                 watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        # While the processes get ready: the versions of all packages take 0.02 s.
-        write_environment(run_dir, "live", run_name(ticket.run_id))
         run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
@@ -207,7 +205,7 @@ class _Run:
         notices: SimpleQueue[str],
     ) -> None:
         self._notices = notices
-        self._scenario = ticket.scenario
+        self._scenario, self._run_id = ticket.scenario, ticket.run_id
         self._run_dir = run_dir
         self._coordinator = coordinator
         self._children = children
@@ -242,6 +240,8 @@ class _Run:
                     self._notify_missing()
             elif not started:
                 started = True
+                # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
+                write_environment(self._run_dir, "live", run_name(self._run_id))
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
                 self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))

@@ -18,8 +18,7 @@ from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
-from noack.observers.estimation_model import EstimationModel
-from noack.observers.observability import unobservable_mode
+from noack.observers.observer_settings import EstimationModel, unobservable_mode
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,

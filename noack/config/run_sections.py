@@ -185,7 +185,7 @@ class LoopSection(ScenarioSection):
     """Keys of the loop's observer."""
     controller: Table | None = None
     """Keys of the loop's controller."""
-    seeds: LoopSeeds = LoopSeeds()
+    seeds: LoopSeeds = LoopSeeds.model_construct()
 
     @model_validator(mode="before")
     @classmethod

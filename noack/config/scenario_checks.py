@@ -5,7 +5,7 @@ A change of settings during a run gives another scenario, to which the same chec
 A set point is an equilibrium of the model, Âx_r + B̂u_r = 0. With u = K(x_c − x_r) + u_r both models
 follow dx/dt = H(x − x_r). All statements about x, x_s and x_c then hold for x − x_r, x_s − x_r and
 x_c − x_r, with a constant disturbance if the plant does not rest at x_r
-(:mod:`noack.theory.setpoint_shift`).
+(:mod:`noack.theory.certificates.conditions`).
 """
 
 import json
@@ -29,10 +29,10 @@ from noack.config.toml_file import brief
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.constraints import require_consistent
-from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import Constraints, Mansd, require_scores
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import require_length, require_shape
 
@@ -56,8 +56,6 @@ def check_sections(scenario: ScenarioTables) -> None:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
         )
-    if scenario.clocks is not None and scenario.loops:
-        raise ValueError("clocks: not in a run of several loops")
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")

@@ -14,15 +14,14 @@ from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
 from noack.controllers.controller_settings import ControllerSettings
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
-from noack.impairments.constraints import guarantee_of, require_consistent
+from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
 from noack.impairments.loss_guarantee import LossGuarantee
 from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.lossless import NoLoss
-from noack.observers.estimation_model import NoiseVariances
-from noack.observers.observer_settings import ObserverSettings
+from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
@@ -261,7 +260,7 @@ class WatchdogSection(ScenarioSection):
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
-    system: AnyPlant = LinearSettings()
+    system: AnyPlant = LinearSettings.model_construct()
     """The kind of plant: a table with ``kind``; by default a linear system."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
@@ -286,10 +285,10 @@ class PlantSection(ScenarioSection):
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """Number of plant steps per measurement."""
-    measurement: MeasurementSection = MeasurementSection()
+    measurement: MeasurementSection = MeasurementSection.model_construct()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """Disturbances of the plant; they add up."""
-    watchdog: WatchdogSection = WatchdogSection()
+    watchdog: WatchdogSection = WatchdogSection.model_construct()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -329,7 +328,7 @@ class PlantSection(ScenarioSection):
 class DirectionSection(ScenarioSection):
     """A direction of the network: what happens to its packets, and the guarantee."""
 
-    loss: Loss = NoLoss()
+    loss: Loss = NoLoss.model_construct()
     """Loss of packets, before the guarantee is applied."""
     mansd: Mansd | None = None
     """Largest number of consecutive lost packets; unlimited if not given."""
@@ -449,4 +448,4 @@ class NetworkSection(DirectionSection):
     @property
     def guarantee(self) -> LossGuarantee:
         """What mansd and the constraints say, also if the network does not enforce it."""
-        return guarantee_of(self.mansd, self.constraints)
+        return join_guarantee(self.mansd, self.constraints)

@@ -31,7 +31,7 @@ from noack.plants.quadrotor import QuadrotorSettings
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHARED = ("different_loops", "shared_bottleneck", "shared_channel")  # several loops on one network

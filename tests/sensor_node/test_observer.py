@@ -15,11 +15,14 @@ from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.machines.loop_machines import LoopMachines
-from noack.observers.estimation_model import EstimationModel
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
-from noack.observers.observability import observer_gain, unobservable_mode
-from noack.observers.observer_settings import ObserverSettings
+from noack.observers.observer_settings import (
+    EstimationModel,
+    ObserverSettings,
+    observer_gain,
+    unobservable_mode,
+)
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire

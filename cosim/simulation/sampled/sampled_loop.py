@@ -20,7 +20,7 @@ from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.theory.run_conditions import network_delay_ns
+from noack.theory.certificates.conditions import network_delay_ns
 from plant_server.plant import disturbance_of, measurement_model_of, plants_of
 from sensor_node.sensor import sensors_of
 

@@ -20,11 +20,11 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
 )
 from noack.machines.loop_machines import LoopMachines
-from noack.observers.estimation_model import EstimationModel
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
+from noack.observers.observer_settings import EstimationModel
 from noack.plants.linear import LinearSystem
-from noack.plants.systems.plant_system import SystemFailedError
+from noack.plants.plant_settings import SystemFailedError
 from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger

@@ -30,7 +30,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 from noack.trigger.absolute import AbsoluteSettings
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
