@@ -193,7 +193,8 @@ class LoopSection(ScenarioSection):
         for key in SHARED:
             if isinstance(content, dict) and key in content:
                 raise ValueError(f"{key}: all loops share it; set it at the top level")
-        if isinstance(content, dict) and not isinstance(content.get("scenario", ""), str | dict):
+        named = content.get("scenario") if isinstance(content, dict) else None
+        if named is not None and not isinstance(named, str | dict):
             raise ValueError("scenario: should be the name of a scenario file, in quotes")
         return content
 

@@ -8,7 +8,7 @@ import pytest
 
 from noack.config.resolution import resolve, resolve_run, resolved_loops
 from noack.config.scenario import Scenario, loop_names, loops_of
-from noack.config.scenario_file import dumps, load, toml_text
+from noack.config.scenario_file import dumps, load, toml_text, validate
 from noack.core.errors import CallerError
 
 PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
@@ -168,3 +168,9 @@ def test_a_mistake_in_a_loops_file_is_named(
     with pytest.raises(CallerError) as refused:
         load(run)
     assert message in str(refused.value)
+
+
+def test_a_ticket_carries_the_tables(content: dict[str, Any], tmp_path: Path) -> None:
+    """A ticket has all keys, also those without a value."""
+    scenario = loaded(tmp_path, content, OTHER)
+    assert validate(scenario.model_dump(mode="json"), "ticket") == scenario
