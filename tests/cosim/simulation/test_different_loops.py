@@ -15,14 +15,14 @@ from noack.config.scenario_file import load
 from noack.protocol.record_tables import OWNER
 
 NETWORKS: dict[str, Sequence[str]] = {
-    "no losses": ('network.loss={ model = "none" }',),
+    "no losses": ('network.loss={ model = "lossless" }',),
     "numbered losses": ('network.loss={ model = "periodic", period = 3, burst = 2 }',),
     "most losses and a delay": (
         'network.loss={ model = "worst_case" }',
         'network.impairments=[{ kind = "delay", delay_s = 0.011 }]',
     ),
     "lost actuations": (
-        'network.loss={ model = "none" }',
+        'network.loss={ model = "lossless" }',
         'network.actuation={ mansd = 2, loss = { model = "periodic", period = 4, burst = 1 } }',
     ),
 }  # fmt: skip
