@@ -15,7 +15,7 @@ from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_policy import Policy
-from tests.noack.theory.loops import System
+from tests.oracles.lossy_loops import System
 
 _MOST_EVENTS = 3000
 

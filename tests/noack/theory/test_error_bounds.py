@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.paper.error_bounds import ErrorBounds, ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
-from tests.noack.theory.loops import seeds
+from tests.oracles.lossy_loops import seeds
 
 PERIOD_NS = 10_000_000
 NS = 1e-9

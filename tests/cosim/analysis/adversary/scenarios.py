@@ -15,7 +15,7 @@ from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_c
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from tests.noack.theory.loops import System, systems
+from tests.oracles.lossy_loops import System, systems
 
 ALL_LOST = (False,) * 1000
 
