@@ -1,6 +1,7 @@
-"""The steps of many runs of a lossy loop, compiled; independent of the project's code.
+"""Random lossy loops, simulated exactly and many at a time; independent of the project's code.
 
-Signals are rows, so all matrices are transposed. :mod:`tests.oracles.lossy_loops` has the loops.
+Every signal is propagated by matrix exponentials on a grid finer than every period of the loop. The
+steps are compiled. In the compiled part signals are rows, so all matrices are transposed.
 """
 
 from collections.abc import Callable, Sequence

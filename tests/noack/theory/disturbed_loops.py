@@ -1,4 +1,4 @@
-"""Random loops with bounded disturbances and noise: their certificates, and their worst signals."""
+"""Random loops with bounded disturbances and noise, and with an observer; their worst signals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The network's delays in the conditions that certificates assume."""
+"""The conditions of a scenario's schedule, and the largest times for which a certificate exists."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""v ≤ F v + g against exact rational arithmetic."""
+"""Linear inequalities, and the effect of all lost updates, against random admissible losses.
+
+Every lost update is lost for ever here, and its error has the worst direction.
+"""
 
 from dataclasses import replace
 from fractions import Fraction

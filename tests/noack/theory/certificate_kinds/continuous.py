@@ -1,4 +1,8 @@
-"""Mistakes in the bounds from the flow between two deliveries, each as a context."""
+"""The paper's conditions: continuous time, an instant network, and the bounds from its flow.
+
+The search for bad losses is that of :mod:`tests.noack.theory.certificate_kinds.decaying`. The
+broken copies are mistakes in the bounds from the flow between two deliveries, each as a context.
+"""
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager

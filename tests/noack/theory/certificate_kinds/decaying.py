@@ -1,4 +1,10 @@
-"""Broken copies of the certificates, each with the loops in which its mistake matters."""
+"""The threshold βe^{−αt}: sampling, delay, held inputs, and losses in bursts and windows.
+
+The loops and their simulation are those of ``tests/oracles/lossy_loops.py``. The losses are all
+patterns of six updates that the guarantee allows, repeated; random ones; and those found by
+changing single outcomes of the worst run, as long as that makes it worse. The broken copies leave
+out one effect each, in loops in which it matters.
+"""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,4 +1,11 @@
-"""Random loops against the bounds from their newest events; what is known is read independently."""
+"""Bounds that depend on time and on the losses: what is compared is the largest share of them.
+
+``DISTURBED`` adds the bounds of what decays and of what persists; its disturbances switch at
+random, or have the sign for which a random output is largest at a random time. ``OBSERVED`` has
+Luenberger's observers, and Kalman filters from their start, with disturbances and noise; filter and
+loop are simulated without noack. ``KNOWN_STATE`` has the bounds from the newest event; what is
+known at it is read independently.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
