@@ -17,7 +17,7 @@ from cosim.analysis.loss_statistics import (
     reported_violations,
     unintended_losses,
 )
-from cosim.analysis.signal_statistics import SignalStatistics, disturbances, watchdog_actions
+from cosim.analysis.signal_statistics import disturbances, signal_statistics, watchdog_actions
 from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
@@ -84,7 +84,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
-    signals = SignalStatistics(record)
+    signals = signal_statistics(record)
     return LoopSummary(
         name=scenario.name,
         number=record.number or 0,

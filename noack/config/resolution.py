@@ -226,18 +226,6 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     }
 
 
-def require_equal_sizes(scenario: Scenario) -> None:
-    """Raise CallerError if the vectors of a live run's loops have different sizes."""
-    first, *others = (shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario))
-    for place, one in enumerate(others, 1):
-        if one != first:
-            raise CallerError(
-                f"loops.{place}: its vectors have other sizes than those of loops.0; the loops of "
-                "a live run have the same numbers of states, inputs and outputs (`noack simulate` "
-                "allows different ones)"
-            )
-
-
 def has_loop(table: str) -> bool:
     """Whether each row of a table in the record of a run has the number of its loop."""
     return OWNER[table] != "netem" and table not in CLOCK_TABLES

@@ -22,8 +22,6 @@ def check_sections(scenario: "Scenario") -> None:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
         )
-    if scenario.clocks is not None and scenario.loops:
-        raise ValueError("clocks: not in a run of several loops")
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")

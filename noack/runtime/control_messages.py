@@ -29,7 +29,7 @@ Ranges = tuple[tuple[Count, Count], ...]  # half-open ranges of numbers
 class ControlMessage(BaseModel):
     """A message; further fields are allowed."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="allow")
+    model_config = ConfigDict(frozen=True, strict=True, extra="allow", defer_build=True)
 
 
 def _require_number(host: str) -> str:

@@ -28,9 +28,8 @@ from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.trigger.absolute import AbsoluteTrigger
-from sensor_node.observer import Observer
-from sensor_node.sensor import Sensor, sensor_of
-from tests.machine_parts import machine
+from sensor_node.sensor import Observer, Sensor
+from tests.machine_parts import machine, sensor_of
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])

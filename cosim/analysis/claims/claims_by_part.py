@@ -15,7 +15,7 @@ the last time that all of them reached, because the loop is incomplete after it.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -55,6 +55,12 @@ _PACES = {
     "controller": (CONTROLLER_STEP, "t_ns"),
 }
 """By process: the table and column with the times of its steps."""
+
+
+@lru_cache(maxsize=1)
+def claims_of(record: RunRecord) -> "RunClaims":
+    """Return the claims about a run; the summary and the report use the same ones."""
+    return RunClaims(record)
 
 
 @dataclass(frozen=True)
@@ -196,9 +202,9 @@ def _part_of(
         if table in SETTINGS:
             part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
-            part = part[part["t_ns"] >= origin_ns]
+            part = part.compress(part["t_ns"] >= origin_ns)
         elif table == NETEM_PACKET or table in CLOCK_TABLES:
-            part = part[part["now_ns"] >= origin_ns]
+            part = part.compress(part["now_ns"] >= origin_ns)
         elif table == CONTROLLER_DELIVERY and sequence is not None:
             part = part[part["sequence"] >= sequence]
         rows = _shifted(part, origin_ns, x_r, u_r)
@@ -309,7 +315,7 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
 
     def derive(table: str, rows: Rows) -> Rows:
         if table in CLOCK_TABLES:  # their rows have numbers of their own
-            return rows[rows["t_ns"] <= end_ns]
-        return rows[rows["input"] < before[OWNER[table]]]
+            return rows.compress(rows["t_ns"] <= end_ns)
+        return rows.compress(rows["input"] < before[OWNER[table]])
 
     return record.derived(record.scenario, derive)

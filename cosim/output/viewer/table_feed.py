@@ -253,7 +253,7 @@ class ViewFeed:
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
         e_s = rows["x_s"] - rows["x"]
-        return self._monitor.samples(rows["t_ns"], e_s, rows["event"], joined.received)[:, 0]
+        return self._monitor.take(rows["t_ns"], e_s, rows["event"], joined.received).identity
 
     def _kept(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
         """Return the rows to show of curves, (k,) or (k, n)."""

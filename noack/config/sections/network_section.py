@@ -19,7 +19,7 @@ from noack.settings.section import ScenarioSection
 class DirectionSection(ScenarioSection):
     """A direction of the network: what happens to its packets, and the guarantee."""
 
-    loss: Loss = NoLoss()
+    loss: Loss = NoLoss.model_construct()
     """Loss of packets, before the guarantee is applied."""
     mansd: Mansd | None = None
     """Largest number of consecutive lost packets; unlimited if not given."""
@@ -78,8 +78,7 @@ class NetworkSection(DirectionSection):
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
     controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     encrypted: bool = False
-    """Live, the processes encrypt the vectors of their datagrams (ChaCha20-Poly1305). Machines of
-    many loops are then not compiled."""
+    """Live, the processes encrypt the vectors of their datagrams (ChaCha20-Poly1305)."""
     acknowledgements: AcknowledgementSection | None = None
     """The direction from controller to sensor, for protocol = "ack"; by default without loss.
     It has no effect if protocol = "none"."""

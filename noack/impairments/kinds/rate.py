@@ -54,7 +54,7 @@ class Rate(Impairment):
     """Payload of a link-layer cell, e.g. 48; 0: no cells."""
     cell_overhead_bytes: Annotated[int, Field(ge=0, le=1000)] = 0
     """Header of a cell, e.g. 5."""
-    discipline: Discipline = TailDrop()
+    discipline: Discipline = TailDrop.model_construct()
     """Which packets the queue drops."""
 
     words: ClassVar = (

@@ -22,7 +22,7 @@ import numpy as np
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.bounds.contraction import logarithmic_norm
-from noack.theory.bounds.enclosure import NotDecayingError, ResponseBounds, response
+from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
 from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
 
 
@@ -34,6 +34,12 @@ class BoxGains(PlantGains):
     halfwidth_B: Matrix
 
     is_one_plant: ClassVar = False
+    of_start: ClassVar = {
+        "states",
+        "results of BoxGains.start_up",
+        "_from_start",
+        "_free_model_error",
+    }
 
     @cached_property
     def states(self) -> Mapping[str, Coefficients]:
@@ -42,10 +48,11 @@ class BoxGains(PlantGains):
         Raises:
             NotDecayingError: the model decays too slowly, or the box is too large.
         """
-        free, gain = self._model_error
+        free, gain = self._free_model_error, self._forced_model_error
         states = {
             output: Coefficients(
-                peaks.start + float(peaks.from_w @ free), peaks.forced + float(peaks.from_w @ gain)
+                self._from_start[output] + float(peaks.from_w @ free),
+                peaks.forced + float(peaks.from_w @ gain),
             )
             for output, peaks in self._peaks.items()
         }
@@ -110,19 +117,30 @@ class BoxGains(PlantGains):
         return np.asarray(np.linalg.norm(self.error.weight @ self._directions, axis=0))
 
     @cached_property
-    def _responses(self) -> tuple[ResponseBounds, list[ResponseBounds]]:
-        """Responses of the model's closed loop to x(0), and to each w_i."""
-        to_w = [response(self.closed_loop, column[:, None]) for column in self._directions.T]
-        return response(self.closed_loop, self.start), to_w
+    def _from_start(self) -> Mapping[str, float]:
+        """sup‖C x‖ from x(0) and the disturbances, of every output and every coordinate."""
+        started = response(self.closed_loop, self.start).through_each(self._stacked_signals)
+        return {name: started[name].sup() + self.disturbed(C) for name, C in self._signals.items()}
+
+    @cached_property
+    def _signals(self) -> Mapping[str, Matrix]:
+        """The outputs, and the coordinates of x and of K x."""
+        rows = np.concatenate([np.eye(len(self.A)), self.error.K])
+        names = (f"coordinate {place}" for place in range(len(rows)))
+        return {**self.outputs, **dict(zip(names, rows[:, None], strict=True))}
+
+    @cached_property
+    def _stacked_signals(self) -> Outputs[str]:
+        return Outputs(self._signals)
+
+    @cached_property
+    def _pushed(self) -> list[ResponseBounds]:
+        """Responses of the model's closed loop to each w_i."""
+        return [response(self.closed_loop, column[:, None]) for column in self._directions.T]
 
     def _peaks_at(self, C: Matrix) -> "_PeakGains":
-        (start, to_w), forced = self._responses, self._forced.through(C)
-        return _PeakGains(
-            start.through(C).sup() + self.disturbed(C),
-            forced.integral(),
-            forced.sup(),
-            np.array([w.through(C).integral() for w in to_w]),
-        )
+        forced, from_w = self._forced.through(C), [w.through(C).integral() for w in self._pushed]
+        return _PeakGains(forced.integral(), forced.sup(), np.array(from_w))
 
     @cached_property
     def _peaks(self) -> Mapping[str, "_PeakGains"]:
@@ -131,8 +149,7 @@ class BoxGains(PlantGains):
     @cached_property
     def _coordinates(self) -> list["_PeakGains"]:
         """Peak gains of each coordinate of x and of K x."""
-        rows = np.concatenate([np.eye(len(self.A)), self.error.K])
-        return [self._peaks_at(row[None]) for row in rows]
+        return [self._peaks_at(C) for name, C in self._signals.items() if name not in self.outputs]
 
     @cached_property
     def _halfwidths(self) -> Matrix:
@@ -149,19 +166,23 @@ class BoxGains(PlantGains):
         return solved
 
     @cached_property
-    def _model_error(self) -> tuple[Vector, Vector]:
-        """sup|w_i| ≤ free_i + gain_i sup‖p‖."""
+    def _free_model_error(self) -> Vector:
+        """sup|w_i| without an input error; with one, sup‖p‖ times the forced error is added."""
+        from_start = self._from_start.items()
+        start = np.array([bound for name, bound in from_start if name not in self.outputs])
+        start[len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
+        return self._bound_of_w(start)
+
+    @cached_property
+    def _forced_model_error(self) -> Vector:
         forced = np.array([peaks.forced for peaks in self._coordinates])
         forced[len(self.A) :] += np.linalg.norm(self.error.split_K[0], axis=1)  # u = K x + p
-        start = np.array([peaks.start for peaks in self._coordinates])
-        start[len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
-        return self._bound_of_w(start), self._bound_of_w(forced)
+        return self._bound_of_w(forced)
 
 
 class _PeakGains(NamedTuple):
-    """sup‖C x‖ ≤ start (with disturbances) + forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w|."""
+    """sup‖C x‖ ≤ forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w| + what x(0) gives."""
 
-    start: float
     forced: float
     impulse: float
     from_w: Vector

@@ -12,18 +12,26 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 depend on the models alone; :class:`PlantGains` those of one known plant.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from functools import cached_property
-from typing import ClassVar, NamedTuple
+from functools import cached_property, lru_cache
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from noack.config.resolution import LoopMatrices
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Vector, discretise, spectral_abscissa
+from noack.core.linear_systems import (
+    Matrix,
+    MatrixKey,
+    Vector,
+    discretise,
+    matrix_key,
+    matrix_of,
+    spectral_abscissa,
+)
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     Outputs,
@@ -248,9 +256,14 @@ class ErrorGains:
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
-    """Return the gains of a resolved loop's models."""
+    """Return the gains of a resolved loop's models; loops with equal models share them."""
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
-    return ErrorGains(loop.H, loop.K, weight, alpha_per_s)
+    return _error_gains(*map(matrix_key, (loop.H, loop.K, weight)), alpha_per_s)
+
+
+@lru_cache(maxsize=64)
+def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: float) -> ErrorGains:
+    return ErrorGains(*map(matrix_of, (H, K, weight)), alpha_per_s)
 
 
 class Coefficients(NamedTuple):
@@ -280,6 +293,27 @@ class PlantGains:
 
     is_one_plant: ClassVar = True
     """Whether A and B are the plant's, and not the centre of a box."""
+
+    of_start: ClassVar = {"states", "results of PlantGains.start_up"}
+    """The kept results that depend on x(0)."""
+
+    def at_start(self, start: Matrix) -> Self:
+        """Return the same plant from another x(0); all other results are shared."""
+        if np.array_equal(start, self.start):
+            return self
+        other = replace(self, start=start)
+        known = {name: value for name, value in vars(self).items() if name not in vars(other)}
+        vars(other).update({k: v for k, v in known.items() if k not in self.of_start})
+        return other
+
+    @cached_property
+    def key(self) -> Hashable:
+        """What equal plants have in common, whatever their x(0)."""
+        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "start"}
+        matrices = [matrix_key(one) for one in own.values() if isinstance(one, np.ndarray)]
+        outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
+        others = type(self), id(self.error), self.alpha_per_s, id(self.forcing)
+        return *others, *matrices, *outputs
 
     @cached_property
     def input_matrix(self) -> Matrix:

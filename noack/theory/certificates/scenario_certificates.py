@@ -8,7 +8,7 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -315,10 +315,9 @@ class CertificateScope:
     ) -> Constants:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
-            self._plants[alpha_per_s] = replace(
-                self._plant_at(error, self._loop.x0[:, None], alpha_per_s),
-                further_outputs=self._trigger.outputs,
-            )
+            plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
+            plant = replace(plant, further_outputs=self._trigger.outputs)
+            self._plants[alpha_per_s] = _first_equal(_EqualPlant(plant)).at_start(plant.start)
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
@@ -327,6 +326,25 @@ class CertificateScope:
             plant.error, plant, conditions, bound, earlier,
             structured=earlier == 0.0, longest=longest,
         )  # fmt: skip
+
+
+class _EqualPlant:
+    """A plant that equals others from another x(0)."""
+
+    def __init__(self, plant: PlantGains) -> None:
+        self.plant = plant
+
+    def __hash__(self) -> int:
+        return hash(self.plant.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _EqualPlant) and self.plant.key == other.plant.key
+
+
+@lru_cache(maxsize=16)
+def _first_equal(one: _EqualPlant) -> PlantGains:
+    """Return the first of several equal plants, whose gains the others use."""
+    return one.plant
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

@@ -4,7 +4,7 @@
 
 q is the last event and r the last event whose update the controller received. It extends the
 paper's eq:LossEv2 to every loss pattern: x_s jumps by −e_s(t_k⁻) at each event, and x_c misses the
-jumps of events r + 1 to q. :class:`ModelDifference` evaluates the right-hand side. Two bounds of
+jumps of events r + 1 to q. :class:`MissedEvents` evaluates the right-hand side. Two bounds of
 ‖e_c‖ follow, which :class:`ErrorMonitor` computes from the sensor's errors and the controller's
 updates:
 
@@ -12,201 +12,170 @@ updates:
 * the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a continuous trigger.
 """
 
-import math
-from collections import deque
+from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, Propagator, Vector, norm, row_norms
+from noack.core.linear_systems import (
+    Matrix,
+    MatrixKey,
+    Propagator,
+    Vector,
+    matrix_key,
+    matrix_of,
+    row_norms,
+    transition,
+)
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_policy import Policy
 
-
-class ModelDifference:
-    """Evaluates the right-hand side of (I1) along a run; H is the matrix of both models.
-
-    The missed events are a queue: the oldest leave it. The sums over the older part, from each of
-    its events on, are kept at one time; the newer part has one sum. So an event costs a few
-    products, however many are missed, and nothing is subtracted: rounding errors do not stay.
-    """
-
-    def __init__(self, H: Matrix) -> None:
-        self.propagate = Propagator(H)
-        self._t_ns = 0
-        self._older: deque[tuple[int, Vector]] = deque()
-        """Sequence number, and the sum of the jumps from this event on, at time ``_older_ns``."""
-        self._older_ns = 0
-        self._newer: list[tuple[int, int, Vector]] = []
-        """Sequence number, time, and jump."""
-        self._zero = self._newer_sum = np.zeros(H.shape[0])
-
-    def advance_to(self, t_ns: int) -> None:
-        """Propagate the sum of the missed jumps to time ``t_ns``."""
-        if self._newer and t_ns != self._t_ns:
-            self._newer_sum = self.propagate(self._newer_sum, t_ns - self._t_ns)
-        self._t_ns = t_ns
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no event is missed, so that the sum is 0."""
-        return not self._older and not self._newer
-
-    def event(self, sequence: int, e_s: Vector) -> None:
-        """Add event ``sequence`` at the present time with sensor error e_s(t_k⁻), shape (n,)."""
-        self._newer_sum = self._newer_sum + e_s
-        self._newer.append((sequence, self._t_ns, e_s))
-
-    def received(self, sequence: int) -> None:
-        """Remove the missed events up to ``sequence``: the controller received this update."""
-        while self._older and self._older[0][0] <= sequence:
-            self._older.popleft()
-        if self._older or not self._newer or self._newer[0][0] > sequence:
-            return
-        total, self._older_ns = self._zero, self._t_ns
-        for number, t_ns, e_s in reversed(self._newer):
-            if number <= sequence:
-                break
-            total = total + self.propagate(e_s, self._t_ns - t_ns)
-            self._older.appendleft((number, total))
-        self._newer, self._newer_sum = [], self._zero
-
-    def total(self) -> Vector:
-        """Return the sum of the missed jumps at the present time, shape (n,)."""
-        if not self._older:
-            return self._newer_sum
-        older = self.propagate(self._older[0][1], self._t_ns - self._older_ns)
-        return older + self._newer_sum
+_PART_NUMBERS = 2**20
+"""Numbers in the jumps that are computed at once."""
 
 
-class ErrorBounds(NamedTuple):
-    """Bounds of ‖e_c‖_W at one time."""
+class MissedJumps(NamedTuple):
+    """Jumps that x_c misses: p pairs of a measurement and an event that is missing there."""
 
-    identity: float
-    printed: float
-    """The paper's formula; NaN for other triggers than the paper's."""
+    at: NDArray[np.int64]
+    """(p,) place of the measurement."""
+    event_ns: NDArray[np.int64]
+    """(p,) t_k."""
+    periods: NDArray[np.int64]
+    """(p,) t − t_k, in periods."""
+    jumps: Matrix
+    """(p, n) e^{H(t−t_k)} e_s(t_k⁻)."""
+
+    def sums(self, measurements: int) -> Matrix:
+        """Return the sum of the jumps at each measurement, (measurements, n)."""
+        columns = [np.bincount(self.at, jumps, measurements) for jumps in self.jumps.T]
+        return np.column_stack(columns)
 
 
-class ErrorMonitor:
-    """Computes the bounds along a run, measurement by measurement.
+class MissedEvents:
+    """Follows the missed events along a run; all measurements lie on a grid of ``period_ns``."""
 
-    A measurement needs a few array operations over the missing events: a network without a bound
-    may lose thousands of consecutive updates. H is the matrix of both models between updates; times
-    of measurements differ by multiples of ``period_ns``.
-    """
+    def __init__(self, H: Matrix, period_ns: int) -> None:
+        self._propagate, self._period_ns = Propagator(H), period_ns
+        # One entry per event that is still missing:
+        self._sequences, self._times_ns = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._errors = np.zeros((0, len(H)))
 
-    def __init__(self, H: Matrix, trigger: Policy, period_ns: int) -> None:
-        n = len(H)
-        self._trigger = trigger
-        self._propagate = Propagator(H)
-        self._weight = np.eye(n) if trigger.weight is None else trigger.weight
-        self._is_unweighted = trigger.weight is None
-        self._inverse = np.linalg.inv(self._weight)
-        self._t_ns = 0
-        # One entry per missing event, in order of the events:
-        self._sequences = np.zeros(0, dtype=np.int64)
-        self._thens_ns = np.zeros(0, dtype=np.int64)
-        self._thresholds = np.zeros(0)
-        self._jumps = np.zeros((0, n))  # e^{H(t−t_k)} e_s(t_k⁻)
-        self._period_ns = period_ns
-        self._growths = np.ones(0)
-        """‖e^{Hτ}‖_W at the multiples of the period."""
-
-    def sample(self, t_ns: int, e_s: Vector, event: int, received: int) -> ErrorBounds:
-        """Add a measurement with e_s before any reset, (n,); return the bounds at its time.
-
-        ``event`` is the sequence number of the event at this measurement, ``received`` that of the
-        newest update that the controller has; both are negative for none.
-        """
-        self._jumps = self._propagate.rows(self._jumps, t_ns - self._t_ns)
-        self._t_ns = t_ns
-        if event >= 0:
-            self._append(event, e_s)
-        self._keep(self._sequences > received)
-        identity = 0.0 if event >= 0 else norm(self._weight @ e_s)
-        return ErrorBounds(
-            identity + float(row_norms(self._jumps @ self._weight.T).sum()),
-            self._threshold(t_ns) + self._grown_thresholds(t_ns),
-        )
-
-    def samples(
+    def take(
         self,
         t_ns: NDArray[np.int64],
         e_s: Matrix,
         events: NDArray[np.int64],
         received: NDArray[np.int64],
-    ) -> Matrix:
-        """Add k measurements as :meth:`sample` does; return both bounds, (k, 2)."""
-        bounds = np.zeros((len(t_ns), 2))
-        changes = [*np.flatnonzero(events >= 0).tolist(), len(t_ns)]
-        index = 0
-        for event in changes:
-            while index < event:
-                arrived = np.flatnonzero(received[index:event] >= self._oldest)
-                end = index + int(arrived[0]) if len(arrived) else event
-                if index < end:
-                    bounds[index:end] = self._stretch(t_ns[index:end], e_s[index:end])
-                if end < event:
-                    bounds[end] = self.sample(int(t_ns[end]), e_s[end], -1, int(received[end]))
-                index = end + 1
-            if event < len(t_ns):
-                number, newest = int(events[event]), int(received[event])
-                bounds[event] = self.sample(int(t_ns[event]), e_s[event], number, newest)
-            index = event + 1
-        return bounds
+    ) -> Iterator[MissedJumps]:
+        """Add k measurements; yield the jumps that are missed at them, some at a time.
 
-    @property
-    def _oldest(self) -> int:
-        """The oldest missing event; without one, a number that no update has."""
-        return int(self._sequences[0]) if len(self._sequences) else 2**63 - 1
+        Args:
+            t_ns: their times, (k,).
+            e_s: e_s before any reset, (k, n).
+            events: the sequence number of the event at each measurement, negative for none, (k,).
+            received: that of the newest update that the controller has, negative for none, (k,).
+        """
+        new = np.flatnonzero(events >= 0)
+        sequences = np.append(self._sequences, events[new])
+        times_ns = np.append(self._times_ns, t_ns[new])
+        errors = np.concatenate([self._errors, e_s[new]])
+        begins = np.append(np.zeros(len(self._sequences), np.int64), new)
+        ends = np.maximum(np.searchsorted(np.maximum.accumulate(received), sequences), begins)
+        lasting = ends == len(t_ns)
+        self._sequences, self._times_ns = sequences[lasting], times_ns[lasting]
+        self._errors = errors[lasting]
+        lengths = ends - begins
+        totals = np.cumsum(lengths)
+        first, most = 0, max(_PART_NUMBERS // errors.shape[1], 1)
+        while first < len(lengths):
+            done = totals[first - 1] if first else 0
+            last = max(int(np.searchsorted(totals, done + most, "right")), first + 1)
+            which = np.repeat(np.arange(first, last), lengths[first:last])
+            at = np.arange(len(which)) - (totals - lengths)[which] + done + begins[which]
+            periods = (t_ns[at] - times_ns[which]) // self._period_ns
+            jumps = self._propagate.leaps(errors[which], periods, self._period_ns)
+            yield MissedJumps(at, times_ns[which], periods, jumps)
+            first = last
 
-    def _stretch(self, t_ns: NDArray[np.int64], e_s: Matrix) -> Matrix:
-        """Return the bounds at k measurements between which the missing events are the same."""
-        times_ns = t_ns.tolist()
-        weighted = e_s if self._is_unweighted else np.array([self._weight @ e for e in e_s])
-        identity = np.array([math.hypot(*e) for e in weighted.tolist()])
-        printed = np.array([self._threshold(one_ns) for one_ns in times_ns])
-        if missing := len(self._sequences):
-            jumps = []
-            for one_ns in times_ns:
-                self._jumps = self._propagate.rows(self._jumps, one_ns - self._t_ns)
-                self._t_ns = one_ns
-                jumps.append(self._jumps)
-            norms = row_norms(np.concatenate(jumps) @ self._weight.T)
-            identity += norms.reshape(-1, missing).sum(axis=1)
+
+def missed_sum(missed: Iterator[MissedJumps], measurements: int, n: int) -> Vector:
+    """Return the right-hand side of (I1) at each measurement, (measurements, n)."""
+    return sum((one.sums(measurements) for one in missed), np.zeros((measurements, n)))
+
+
+class ErrorBounds(NamedTuple):
+    """Bounds of ‖e_c‖_W at k measurements, and the right-hand side of (I1) there."""
+
+    identity: Vector
+    """(k,)"""
+    printed: Vector
+    """(k,) the paper's formula; NaN for other triggers than the paper's."""
+    missed: Matrix
+    """(k, n) x_c − x_s by (I1): the sum of the missed jumps."""
+
+
+class ErrorMonitor:
+    """Computes the bounds along a run; its measurements lie on a grid of ``period_ns``.
+
+    H is the matrix of both models between updates. The cost is that of a few array operations for
+    each pair of a measurement and an event that is missing there.
+    """
+
+    def __init__(self, H: Matrix, trigger: Policy, period_ns: int) -> None:
+        self._trigger = trigger
+        self._missed = MissedEvents(H, period_ns)
+        self._weight = np.eye(len(H)) if trigger.weight is None else trigger.weight
+        self._growths = _growths(matrix_key(H), matrix_key(self._weight), period_ns)
+
+    def take(
+        self,
+        t_ns: NDArray[np.int64],
+        e_s: Matrix,
+        events: NDArray[np.int64],
+        received: NDArray[np.int64],
+    ) -> ErrorBounds:
+        """Add k measurements, as :meth:`MissedEvents.take` does."""
+        count = len(t_ns)
+        weighted = e_s if self._trigger.weight is None else e_s @ self._weight.T
+        identity = np.where(events >= 0, 0.0, row_norms(weighted))
+        printed, missed = self._thresholds(t_ns), np.zeros_like(e_s)
+        for pairs in self._missed.take(t_ns, e_s, events, received):
+            jumps = pairs.jumps if self._trigger.weight is None else pairs.jumps @ self._weight.T
+            identity += np.bincount(pairs.at, row_norms(jumps), count)
+            missed += pairs.sums(count)
             if isinstance(self._trigger, DecayingTrigger):
-                printed += [self._grown_thresholds(one_ns) for one_ns in times_ns]
-        self._t_ns = times_ns[-1]
-        return np.column_stack([identity, printed])
+                grown = self._growths.at(pairs.periods) * self._thresholds(pairs.event_ns)
+                printed += np.bincount(pairs.at, grown, count)
+        return ErrorBounds(identity, printed, missed)
 
-    def _append(self, event: int, e_s: Vector) -> None:
-        self._sequences = np.append(self._sequences, event)
-        self._thens_ns = np.append(self._thens_ns, self._t_ns)
-        self._thresholds = np.append(self._thresholds, self._threshold(self._t_ns))
-        self._jumps = np.vstack([self._jumps, e_s])
+    def _thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
+        if isinstance(self._trigger, DecayingTrigger):
+            return self._trigger.thresholds(t_ns)
+        return np.full(len(t_ns), np.nan)
 
-    def _threshold(self, t_ns: int) -> float:
-        trigger = self._trigger
-        return trigger.threshold(t_ns) if isinstance(trigger, DecayingTrigger) else math.nan
 
-    def _keep(self, kept: NDArray[np.bool_]) -> None:
-        if not kept.all():
-            self._sequences, self._thens_ns = self._sequences[kept], self._thens_ns[kept]
-            self._thresholds, self._jumps = self._thresholds[kept], self._jumps[kept]
+class _Growths:
+    """‖e^{Hτ}‖_W at the multiples of a period."""
 
-    def _grown_thresholds(self, t_ns: int) -> float:
-        """Return the sum of the missing events' thresholds, each times ‖e^{Hτ}‖_W of its age."""
-        if not len(self._thens_ns) or not isinstance(self._trigger, DecayingTrigger):
-            return 0.0
-        periods = (t_ns - self._thens_ns) // self._period_ns
-        known, oldest = len(self._growths), int(periods[0])
+    def __init__(self, H: Matrix, weight: Matrix, period_ns: int) -> None:
+        self._H, self._weight, self._period_ns = H, weight, period_ns
+        self._inverse = np.linalg.inv(weight)
+        self._known = np.ones(1)
+
+    def at(self, periods: NDArray[np.int64]) -> Vector:
+        """Return the values at k multiples, (k,)."""
+        known, oldest = len(self._known), int(periods.max(initial=0))
         if oldest >= known:
-            more = [self._growth(i * self._period_ns) for i in range(known, oldest + 1)]
-            self._growths = np.append(self._growths, more)
-        return float(self._growths[periods] @ self._thresholds)
+            ages_ns = (i * self._period_ns for i in range(known, oldest + 1))
+            moved = self._weight @ [transition(self._H, ns) for ns in ages_ns] @ self._inverse
+            self._known = np.append(self._known, np.linalg.norm(moved, 2, axis=(1, 2)))
+        return np.asarray(self._known[periods])
 
-    def _growth(self, age_ns: int) -> float:
-        """Return ‖e^{Hτ}‖_W."""
-        moved = self._weight @ self._propagate.transition(age_ns) @ self._inverse
-        return float(np.linalg.norm(moved, 2))
+
+@lru_cache(maxsize=16)
+def _growths(H: MatrixKey, weight: MatrixKey, period_ns: int) -> _Growths:
+    """Return the growths of some models; loops with equal models share them."""
+    return _Growths(matrix_of(H), matrix_of(weight), period_ns)

@@ -1,4 +1,4 @@
-"""``noack design``: choose a trigger."""
+"""``noack campaign``, ``paper``, ``design``: many runs over a grid, and the choice of a trigger."""
 
 import json as json_module
 import math
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli import command as cli
+from cosim.cli import completion
+from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
 
@@ -16,6 +18,18 @@ if TYPE_CHECKING:
     from noack.config.scenario import Scenario
     from noack.core.linear_systems import Matrix
 
+Draws = Annotated[
+    int | None,
+    typer.Option(help="Runs at each grid point; the campaign file's number by default.", min=1),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Run on the Dask cluster of this scheduler."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", help="Folder of the campaign; runs/campaigns/NAME by default."),
+]
 Settling = Annotated[float, typer.Option(metavar="SECONDS", help="Largest settling time allowed.")]
 Quantile = Annotated[float, typer.Option(help="Share of the draws that must settle in time.")]
 Settle = Annotated[
@@ -45,20 +59,103 @@ StateCost = Annotated[
     str | None, typer.Option("--Q", help="LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.")
 ]
 InputCost = Annotated[str | None, typer.Option("--R", help="LQR input cost: rows, or a diagonal.")]
-Draws = Annotated[
+DesignDraws = Annotated[
     int,
     typer.Option(
         help="Draws that choose the trigger; the same number of new draws confirm it.", min=20
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
-Out = Annotated[
+DesignOut = Annotated[
     Path | None, typer.Option("--out", help="Write the chosen scenario to this file (TOML).")
 ]
 Page = Annotated[
     Path | None,
     typer.Option("--page", help="File of the page (HTML); runs/design/NAME.html by default."),
 ]
+
+
+@cli.command(cli.CAMPAIGNS, 10, [
+    ("noack campaign mb_vs_zoh", "compare a model with a hold"),
+    ("noack campaign mansd_sweep --draws 200 --json", "fewer draws at each grid point"),
+    ("noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786", "on a Dask cluster"),
+])  # fmt: skip
+def campaign(
+    file: Annotated[
+        str,
+        typer.Argument(
+            help="Campaign file (TOML), or the name of a shipped campaign.",
+            autocompletion=completion.campaigns,
+        ),
+    ],
+    *,
+    draws: Draws = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    out: Out = None,
+    figure_format: cli.FormatOption = None,
+    width: cli.WidthOption = None,
+    tables: cli.TablesOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Run a scenario over a grid of settings, with many random draws at each point.
+
+    An interrupted campaign is continued if it is started again with the same folder.
+
+    Exit status 1: a run exceeded a certified bound.
+    """
+    from cosim.live.progress import PatientConsole
+    from cosim.output.figure_format import figure_files
+    from cosim.shipped_files import find_shipped
+    from cosim.studies.campaign.campaign_file import load
+    from cosim.studies.campaign.campaign_report import campaign_tables, print_summary
+
+    start = worker_pool(workers, scheduler)
+    files_of_figures = figure_files(figure_format, width)
+    console = PatientConsole(stderr=True)
+    path = find_shipped(file, "campaigns")
+    plan = load(path)
+    folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
+    summary, _, _, made, files = execute_campaign(
+        console, plan, path, start, folder=folder, draws=draws, figure_files=files_of_figures
+    )
+    if json:
+        cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
+    else:
+        print_summary(cli.console(), summary)
+        for written in files:
+            print(written)
+    cli.write_tables(campaign_tables(summary), tables, json=json)
+    return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
+
+
+@cli.command(cli.THEORY, 30, [
+    ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
+    ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
+])  # fmt: skip
+def paper(
+    *,
+    draws: Annotated[
+        int, typer.Option(help="Number of random plants, losses and initial states.")
+    ] = 1000,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for paper.md and its figures.")
+    ] = cli.DEFAULT_RUNS / "paper",
+    json: cli.JsonOption = False,
+) -> int:
+    """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
+    from cosim.live.progress import PatientConsole, draws_bar
+    from cosim.studies.paper import paper_run
+
+    paper_run.make_folder(out)
+    with draws_bar(PatientConsole(stderr=True)) as progress:
+        results = paper_run.reproduce(draws, cli.cores(), progress)
+    found = paper_run.document(results, paper_run.write_page(results, out))
+    if json:
+        cli.print_json(found)
+    else:
+        paper_run.print_claims(cli.console(), found)
+    return ExitStatus.OK
 
 
 @cli.command(cli.CAMPAIGNS, 20, [
@@ -78,10 +175,10 @@ def design(
     gain: Gain = "given",
     Q: StateCost = None,
     R: InputCost = None,
-    draws: Draws = 2000,
+    draws: DesignDraws = 2000,
     seed: Seed = 0,
     settings: cli.SetOption = None,
-    out: Out = None,
+    out: DesignOut = None,
     page: Page = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,

@@ -1,10 +1,14 @@
-"""``noack check``: a scenario with everything made explicit, and the assumptions it meets."""
+"""``noack scenarios``, ``check``, ``schema``: scenario files."""
 
 import math
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from cosim.cli import command as cli
+from cosim.cli import completion
+from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 
@@ -14,6 +18,55 @@ if TYPE_CHECKING:
     from noack.config.scenario import Scenario
 
 _COMMENT = "# "
+
+
+@cli.command(cli.FILES, 20, [
+    ("noack scenarios", "list them all"),
+    ("noack scenarios unstable_pendulum > mine.toml", "copy one, to make it your own"),
+    ("noack scenarios --json", "list them as JSON"),
+])  # fmt: skip
+def scenarios(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Print this scenario or campaign.", autocompletion=completion.shipped),
+    ] = None,
+    *,
+    json: cli.JsonOption = False,
+) -> int:
+    """List the shipped scenarios and campaigns, or print one of them."""
+    if name is not None:
+        text = text_of(name)
+        cli.print_json({"name": name, "toml": text}) if json else print(text, end="")
+        return ExitStatus.OK
+    shipped = {kind: all_shipped(kind) for kind in KINDS}
+    if json:
+        cli.print_json({
+            kind: [one._asdict() | {"path": str(one.path)} for one in some]
+            for kind, some in shipped.items()
+        })  # fmt: skip
+        return ExitStatus.OK
+    console = cli.console()
+    for kind, some in shipped.items():
+        console.print(kind, style="bold", highlight=False)
+        _print_shipped(console, some)
+    return ExitStatus.OK
+
+
+def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
+    """Print one line per file to a pipe, or a wrapped table to a terminal."""
+    width = max(len(one.name) for one in some)
+    if not console.is_terminal:
+        for one in some:
+            print(f"{one.name:{width}}  {one.description}")
+        return
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    table.add_column(min_width=width, no_wrap=True, style="cyan")
+    table.add_column()
+    for one in some:
+        table.add_row(one.name, one.description)
+    console.print(table)
 
 
 @cli.command(cli.FILES, 30, [
@@ -149,3 +202,35 @@ def _dependent_defaults(resolved: "Scenario") -> Iterator[str]:
             f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record`: "
             "unlimited"
         )
+
+
+@cli.command(cli.FILES, 40, [
+    ("noack schema > scenario.schema.json", "for an editor that completes keys"),
+    ("noack schema --campaign", "the schema of campaign files"),
+    ("noack schema --netem", "the schema of the emulator's links files"),
+])  # fmt: skip
+def schema(
+    *,
+    netem: Annotated[
+        bool, typer.Option("--netem", help="Print the schema of the emulator's links files.")
+    ] = False,
+    campaign: Annotated[
+        bool, typer.Option("--campaign", help="Print the schema of campaign files.")
+    ] = False,
+    json: cli.JsonOption = False,
+) -> int:
+    """Print the JSON Schema of scenario files, for editors."""
+    if campaign:
+        from cosim.studies.campaign.campaign_file import json_schema as campaign_schema
+
+        cli.print_json(campaign_schema())
+    elif netem:
+        from netem.words.links_file import json_schema as links_schema
+
+        cli.print_json(links_schema())
+    else:
+        from noack.config.scenario import Scenario
+        from noack.config.toml_file import json_schema
+
+        cli.print_json(json_schema(Scenario))
+    return ExitStatus.OK
