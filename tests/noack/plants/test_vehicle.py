@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from noack.config.named_models import single_track_lane
 from noack.core.errors import CallerError
-from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.plant_settings import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.plants.vehicle import CompiledVehicle, VehicleSettings, compiled_vehicle
 from tests.noack.plants.motion import H_NS, motion
