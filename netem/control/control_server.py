@@ -22,7 +22,7 @@ from zenoh.handlers import RingChannel
 from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
 from netem.relay_links import DIRECTIONS, Direction
 from netem.tc_words import settings_of, text_of
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_kept_loss
