@@ -220,6 +220,18 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
         assert (report["sent"], report["send_errors"]) == (0, {text: 1})
 
 
+def test_an_icmp_error_costs_no_datagram(content: dict[str, Any]) -> None:
+    """Nothing listens at the destination: each datagram makes the next call fail once."""
+    with closing(Live("sensor", [scenario(content)])) as live:
+        source = live.peer.getsockname()
+        live.peer.close()
+        for number in range(5):
+            data = live.encoder.encode(measurement(number, [100.0 * number, 0.0]))
+            live.driver.take(data, source, live.rows)
+        report = live.channel.report()
+        assert (report["sent"], report["send_errors"]) == (5, {})
+
+
 def test_messages_from_before_the_admission_are_stale(content: dict[str, Any]) -> None:
     phases_ns = [0, 4_000_000]
     loops = [scenario(content)] * 2
