@@ -20,7 +20,7 @@ from noack.plants.plant_settings import (
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.user_class import (
+from noack.settings.user_files import (
     ClassSettings,
     new_instance,
     read_only,

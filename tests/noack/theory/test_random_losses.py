@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
