@@ -258,12 +258,13 @@ class ErrorGains:
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
     """Return the gains of a resolved loop's models; loops with equal models share them."""
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
-    return _error_gains(*map(matrix_key, (loop.H, loop.K, weight)), alpha_per_s)
+    keys = matrix_key(loop.H), matrix_key(loop.K), matrix_key(weight)
+    return _error_gains(*keys, alpha_per_s)
 
 
 @lru_cache(maxsize=64)
 def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: float) -> ErrorGains:
-    return ErrorGains(*map(matrix_of, (H, K, weight)), alpha_per_s)
+    return ErrorGains(matrix_of(H), matrix_of(K), matrix_of(weight), alpha_per_s)
 
 
 class Coefficients(NamedTuple):
