@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
-from cosim.simulation.batch.batch_interface import ROW
+from cosim.simulation.batch import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.config import toml_file
 from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed

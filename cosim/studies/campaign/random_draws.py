@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch.batch_interface import Population
+from cosim.simulation.batch import Population
 from noack.config.resolution import loop_of, resolve
 from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario

@@ -6,8 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_report import run_continuous
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from noack.config.resolution import loop_of, resolve
 from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario

@@ -14,8 +14,8 @@ from cosim.analysis.step_schedule import live_run
 from cosim.record.align import align_tables
 from cosim.record.estimation_error import expected_rms, true_states
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch.batch_interface import setting_of
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.batch import setting_of
+from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.candidate_measures import DesignLimits
 from cosim.studies.design.design_search import design

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import Population, Setting, run_batch, run_events
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.batch import Population, Setting, run_batch, run_events
+from cosim.simulation.continuous import TooManyEventsError
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings

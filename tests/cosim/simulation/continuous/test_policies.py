@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import (
+from cosim.simulation.continuous import (
+    ContinuousLoop,
     ContinuousRun,
     TooManyEventsError,
     simulate_continuous,

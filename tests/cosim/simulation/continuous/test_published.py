@@ -13,8 +13,12 @@ from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.optimize import brentq
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import (
+    ContinuousLoop,
+    ContinuousRun,
+    continuous_loop_of,
+    simulate_continuous,
+)
 from noack.config.resolution import LoopMatrices, resolve
 from noack.config.scenario_file import load
 from noack.trigger.absolute import AbsoluteTrigger
