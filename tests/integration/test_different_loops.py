@@ -26,7 +26,7 @@ def noack(*arguments: str, folder: Path) -> str:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
     """With the live recording, and a change of settings on the way."""
-    change = 'changes=[{ at_s = 1.5, set = { mansd = 2 } }]'
+    change = "changes=[{ at_s = 1.5, set = { mansd = 2 } }]"
     settings = (*live.settings(horizon_s=3.0), "--set", change)
     with live.begun(tmp_path_factory.mktemp("different")) as start:
         return start(*settings, "--report", command=("run", "different_loops")).finish()
