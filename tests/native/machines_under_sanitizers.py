@@ -78,14 +78,16 @@ def test_this_is_another_core_than_noacks() -> None:
     assert core.noack_sources != load_core(LIBRARY).noack_sources
 
 
-def machines_of(role: str, of: Sizes, seeds: list[int], scale: float, **more: Any) -> LoopMachines:
-    """Machines whose vectors and matrices have this scale."""
+def machines_of(
+    role: str, loops: list[tuple[Sizes, int]], scale: float, **more: Any
+) -> LoopMachines:
+    """Machines of these sizes and seeds, whose vectors and matrices have this scale."""
     with np.errstate(all="ignore"):
         parts: list[Any] = [
             sensor(seed, of, form=seed, scale=scale) if role == "sensor"
             else controller(seed, of, scale) if role == "controller"
             else plant(seed, of, min(scale, 1e3))  # others are refused before
-            for seed in seeds
+            for of, seed in loops
         ]  # fmt: skip
         own = LoopMachines(parts, **more)
         for one in own.machines:
@@ -119,14 +121,14 @@ def drive(own: LoopMachines, given_inputs: list[Any]) -> None:
 
 @settings(max_examples=150)
 @given(
-    roles, sizes(), st.lists(st.integers(0, 2**16), min_size=1, max_size=3), scales,
+    roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
 )  # fmt: skip
 def test_random_machines(
-    role: str, of: Sizes, seeds: list[int], scale: float, rows: int, given_inputs: list[Any]
+    role: str, loops: list[tuple[Sizes, int]], scale: float, rows: int, given_inputs: list[Any]
 ) -> None:
     with np.errstate(all="ignore"):
-        drive(machines_of(role, of, seeds, scale, rows=rows), given_inputs)
+        drive(machines_of(role, loops, scale, rows=rows), given_inputs)
 
 
 @settings(max_examples=15)
@@ -135,7 +137,7 @@ def test_large_machines(
     role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]
 ) -> None:
     with np.errstate(all="ignore"):
-        drive(machines_of(role, of, [seed], scale), given_inputs)
+        drive(machines_of(role, [(of, seed)], scale), given_inputs)
 
 
 @settings(max_examples=300)
@@ -143,7 +145,7 @@ def test_large_machines(
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject
 ) -> None:
-    own = machines_of(role, of, [seed], 1.0)
+    own = machines_of(role, [(of, seed)], 1.0)
     changed = st.tuples(st.sampled_from(NUMBERS_OF[role]), st.sampled_from(WHOLE))
     for name, value in data.draw(st.lists(changed, max_size=3)):
         set_number(own, name, value)
