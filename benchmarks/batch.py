@@ -30,11 +30,11 @@ from cosim.simulation.batch import (
     setting_of,
 )
 from cosim.simulation.continuous import network_fates
-from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.config.sections.run_sections import SeedsSection
+from noack.config.sections import POLICIES
 from noack.core.linear_systems import Vector
 
 Mode = Literal["model", "zoh"]

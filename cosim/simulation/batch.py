@@ -20,7 +20,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
 from noack.impairments.link_settings import LinkSettings
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 
 class Population(NamedTuple):

@@ -44,7 +44,7 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
 """Below it, the threshold's square or its significant bits would underflow."""

@@ -26,8 +26,7 @@ from cosim.simulation.continuous import ContinuousLoop
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.trigger.core_rule import fill_rule, rule_rows
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy, fill_rule, rule_rows
 
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""

@@ -27,7 +27,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import Rows, require_shape
 
 SCENARIOS = "scenarios"
 

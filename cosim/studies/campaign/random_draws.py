@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from cosim.simulation.batch import Population
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms, words
 

@@ -22,8 +22,8 @@ from cosim.simulation.batch import ROW
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import drawn_scenario
+from noack.config.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import (

@@ -19,10 +19,9 @@ from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.candidate_measures import DesignLimits
 from cosim.studies.design.design_search import design
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, steady_state
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, validate
-from noack.config.state_estimation import steady_state
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start

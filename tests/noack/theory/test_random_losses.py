@@ -10,7 +10,7 @@ from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.random_losses.moments import moment_at_events, moments
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import loop_of
-from tests.noack.theory.loops import System, random_system
+from tests.oracles.lossy_loops import System, random_system
 
 EVENTS = 12
 

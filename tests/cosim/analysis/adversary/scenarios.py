@@ -14,7 +14,7 @@ from cosim.simulation.continuous import ContinuousRun, continuous_loop_of, simul
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from tests.noack.theory.loops import System, systems
+from tests.oracles.lossy_loops import System, systems
 
 ALL_LOST = (False,) * 1000
 

@@ -26,7 +26,7 @@ from noack.trigger.dynamic import DynamicTrigger
 from noack.trigger.lyapunov import LyapunovTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 Matrix = NDArray[np.float64]
 MS = 1_000_000
