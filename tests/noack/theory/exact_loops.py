@@ -16,8 +16,6 @@ from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_rule import Policy
-from tests.noack.theory.loops import System
-from noack.trigger.trigger_policy import Policy
 from tests.oracles.lossy_loops import System
 
 _MOST_EVENTS = 3000
