@@ -116,7 +116,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
-    int64_t count = (4 * (TERMS + 1) + 10) * square + 10 * curve
+    int64_t count = (4 * (TERMS + 1) + 10) * square + 8 * curve
                     + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
@@ -145,11 +145,9 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->H_k = take(&next, (TERMS + 1) * square);
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
-    double **curves[] = {
-        &memory->r,        &memory->e,       &memory->d,         &memory->q,
-        &memory->x,        &memory->u,       &memory->own_error, &memory->own_weighted,
-        &memory->x_scaled, &memory->u_scaled};
-    for (int i = 0; i < 10; i++)
+    double **curves[] = {&memory->r, &memory->e, &memory->d,         &memory->q,
+                         &memory->x, &memory->u, &memory->own_error, &memory->own_weighted};
+    for (int i = 0; i < 8; i++)
         *curves[i] = take(&next, curve);
     memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;
     memory->one_input = exact->m == 1;
@@ -166,8 +164,6 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
             rule->gain_down, &memory->gain_signs);
         memory->w = take(&next, blocks * curve);
     }
-    for (int k = 1; k <= 2 * TERMS; k++)
-        memory->inverse[k] = 1.0 / k;
     code->share(memory);
     return count;
 }

@@ -57,7 +57,6 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     double *H, *K, *H_k;
     double *weight, *forecast_weight, *Q, *R; /* NULL: the identity */
     double *form, *form_signs, *gain, *gain_signs;
-    double inverse[2 * TERMS + 1]; /* 1/k */
     /* of a plant */
     double *A, *B, *E, *A_k, *X_k;
     double *minus_BK, *D_k;
@@ -65,7 +64,7 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     double reach_s[DEGREES];    /* time over which a polynomial of each degree is accurate */
     double measured_s[DEGREES]; /* the same, at the accuracy of the measures */
     /* coefficients of curves */
-    double *r, *e, *d, *q, *x, *u, *x_scaled, *u_scaled, *y, *w;
+    double *r, *e, *d, *q, *x, *u, *y, *w;
     double *error, *weighted; /* W e_s and W e_c; of equal curves one may be the other */
     double *own_error, *own_weighted;
     double squares[2 * TERMS], g[MOST_TERMS], eta[MOST_TERMS];

@@ -40,13 +40,14 @@ static inline void look(
         *dy = subtract(filled(0.0), *dy);
 }
 
-static inline search_point look_at_norm(const void *curve, const level_search *search, double s) {
+/* |y|^2 - (c e^(-rs))^2 and its derivative: for Newton's method, in place of h, which has a square
+   root and the same sign. */
+static inline search_point look_at_square(const void *curve, const level_search *search, double s) {
     const vector_curve *own = curve;
     lanes y, dy;
     look(own->c, own->p, search, s, &y, &dy);
-    double level = level_at(search, s), size = sqrt(dot(y, y));
-    double slope = search->rate * level + (size > 0.0 ? dot(y, dy) / size : 0.0);
-    return (search_point){s, size - level, slope};
+    double level = level_at(search, s), square = level * level;
+    return (search_point){s, dot(y, y) - square, 2.0 * (dot(y, dy) + search->rate * square)};
 }
 
 /* The length of a step that skips no crossing, at most length; length if there is none within it.
@@ -98,7 +99,7 @@ static double first_exit(
             if (ends_below && ahead_s == end_s)
                 return NONE;
             search_point at = {s, size - level, slope};
-            s = ascend(look_at_norm, &own, search, at, ahead_s);
+            s = ascend(look_at_square, &own, search, at, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;

@@ -1,7 +1,7 @@
 /* Measures of a piece of a run (an interval without resets), from its Taylor polynomials.
 
-   The cost integrates the polynomials' products exactly. The supremum and the settling time are
-   found from crossings with a level, without sampling. */
+   The cost is computed by a quadrature whose error is below rounding. The supremum and the settling
+   time are found from crossings with a level, without sampling. */
 #ifndef NOACK_EXACT_PIECE_MEASURES_H
 #define NOACK_EXACT_PIECE_MEASURES_H
 
@@ -9,9 +9,10 @@
 
 static const double CERTAINTY = 1e-10; /* the supremum exceeds the returned one by at most this */
 
-/* Gauss-Legendre quadrature on [0, 1]. It is exact for polynomials up to degree 2 NODES - 1. Of
-   t^k, k >= 2 NODES, its error is below 2^(3 - 4 NODES): Chebyshev's polynomials are as close to
-   it. */
+/* Gauss-Legendre quadrature on [0, 1]. It is exact up to degree 23. Of a higher power t^k its error
+   is at most twice the distance to the polynomials of degree 23, which is 2^-47 for k = 24 and
+   1e-10 for k = 30. The terms of a piece's squares decrease like (2 z s)^k/k! with z s < 3.5
+   (taylor.h), so that the error is below 1e-16 of |(x, u)|^2 s at the start. */
 enum { NODES = 12, AT_ONCE = 6 };
 static const double AT[NODES] = {
     0.009219682876640375, 0.04794137181476257, 0.11504866290284765, 0.2063410228566913,

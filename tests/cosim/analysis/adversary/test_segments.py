@@ -41,8 +41,8 @@ def test_events_are_those_of_the_reference(resolved: Scenario) -> None:
         else:
             assert found.end_s[i] == resolved.horizon_s
             expected = system.sample(start, np.array([resolved.horizon_s]))
-        z = np.concatenate(expected[1:], axis=None)
-        np.testing.assert_allclose(found.z[i], z, atol=1e-8 * np.abs(z).max())
+        ended = np.concatenate(expected[1:], axis=None)
+        np.testing.assert_allclose(found.z[i], ended, atol=1e-8 * np.abs(ended).max())
 
 
 @given(resolved=scenarios(12))
