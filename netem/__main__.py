@@ -8,7 +8,7 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import stoppable_imports
+from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from netem.engine.run_network import RunNetwork
@@ -16,8 +16,7 @@ with stoppable_imports():
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.topology import ENDS
     from noack.runtime.command_line import Parser, failed
-    from noack.runtime.process_entry import add_options, join_run
-    from noack.runtime.process_life import RunProcess
+    from noack.runtime.run_process import RunProcess, add_options, join_run
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

@@ -18,7 +18,6 @@ from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_records import NEVER_NS
 from noack.impairments.link_settings import LinkSettings
-from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -27,7 +26,7 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
-from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 
 Rows = NDArray[np.void]
 

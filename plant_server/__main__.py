@@ -3,19 +3,19 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import stoppable_imports
+from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from noack.core.errors import ExitStatus
-    from noack.runtime import process_entry
+    from noack.runtime import run_process
     from noack.runtime.live_driver import run_machines
-    from noack.runtime.process_life import RunProcess
+    from noack.runtime.run_process import RunProcess
     from plant_server.plant import plants_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
-    return process_entry.main("plant", run_plants, arguments)
+    return run_process.main("plant", run_plants, arguments)
 
 
 def run_plants(process: RunProcess) -> None:

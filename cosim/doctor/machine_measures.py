@@ -34,12 +34,11 @@ from cosim.record.environment import environment
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 from noack.runtime.address import LOOPBACK
-from noack.runtime.control_plane import RUNS
+from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
-from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 T = TypeVar("T")
 

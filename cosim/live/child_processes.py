@@ -16,7 +16,7 @@ from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from cosim.live.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
 from noack.core.errors import ExitStatus, MachineError
 from noack.core.file_access import open_append
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 from noack.protocol.topology import RECORDER
 from noack.runtime.join_ticket import Ticket
 

@@ -15,7 +15,7 @@ from zenoh.handlers import FifoChannel, RingChannel
 from cosim.live.change_requests import ChangeRequests
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
-from noack.core.python_process import cores
+from noack.core.process_limits import cores
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
     AdmissionRequest,
@@ -23,10 +23,9 @@ from noack.runtime.control_messages import (
     RunProgress,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane
+from noack.runtime.control_plane import ControlPlane, header_of, next_payload
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
-from noack.runtime.zenoh_session import header_of, next_payload
 
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The

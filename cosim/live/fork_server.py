@@ -25,12 +25,11 @@ from pathlib import Path
 from typing import IO
 
 from noack.core.errors import MachineError
-from noack.core.process_limits import require_limits
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command, require_limits
 from noack.runtime.command_line import TICKET_ON_STDIN
 
 _COMMON = (
-    "noack.runtime.control_plane", "noack.runtime.invitation", "noack.config.scenario_file",
+    "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
     "noack.config.resolution", "noack.core.random_streams", "cosim.record.environment",
 )  # fmt: skip
 """What the processes and the launcher import."""

@@ -40,11 +40,10 @@ from noack.core.file_access import write_whole
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
+from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.control_plane import run_name
-from noack.runtime.invitation import invitation_file
-from noack.runtime.join_ticket import Ticket, new_ticket, published
+from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
-from noack.runtime.signals import Signals, stop_reason
 
 if TYPE_CHECKING:
     from cosim.live.remote_access import Listening

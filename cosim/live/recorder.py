@@ -16,8 +16,7 @@ from noack.protocol.machine_interface import RESTART, Notice
 from noack.protocol.topology import RECORDER
 from noack.runtime.command_line import print_to_stderr
 from noack.runtime.life_cycle import LAUNCHER_GONE
-from noack.runtime.process_entry import run_process
-from noack.runtime.process_life import RunProcess
+from noack.runtime.run_process import RunProcess, run_process
 
 if TYPE_CHECKING:
     from cosim.output.viewer.live_viewer import LiveView

@@ -18,15 +18,12 @@ from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
-from noack.protocol.invitation_proof import InvitationProof
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connection_forwarder import Protection, forwarding
-from noack.runtime.control_plane import RUNS, run_name
-from noack.runtime.invitation import own_host
-from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
+from noack.runtime.control_plane import RUNS, run_name, socket_path
+from noack.runtime.coordinator_link import InvitationProof, Protection, forwarding
+from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
 from noack.runtime.time_exchange import TimeReference, answering
-from noack.runtime.zenoh_session import socket_path
 
 _BACKLOG = 4096
 _FLOOD_PER_S = 100

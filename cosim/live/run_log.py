@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.live.launcher import Watcher
-from noack.runtime.json_log import log_event
+from noack.runtime.command_line import log_event
 
 _SOURCE = "noack"
 _EVERY_S = 1.0

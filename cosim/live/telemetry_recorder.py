@@ -23,10 +23,9 @@ from noack.core.errors import MachineError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_plane import ControlPlane
-from noack.runtime.log_lines import NOTICES
+from noack.runtime.control_plane import ControlPlane, header_of
+from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
-from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding

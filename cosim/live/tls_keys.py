@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from noack.runtime.tls_context import tls_context
+from noack.runtime.coordinator_link import tls_context
 
 _VALID = datetime.timedelta(days=3650)
 """A run may be long, and the hosts' dates may differ; an invitation ends by its pass."""

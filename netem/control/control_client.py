@@ -11,7 +11,7 @@ from zenoh.handlers import RingChannel
 from netem.control.emulator_session import EMULATORS, running
 from netem.control.emulator_statistics import Statistics
 from noack.core.errors import PeerError
-from noack.runtime.zenoh_session import answer_to, cause_of, open_session
+from noack.runtime.control_plane import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
 _SILENCE_S = 3.0

@@ -27,7 +27,7 @@ from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError
 from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.zenoh_session import cause_of, open_session
+from noack.runtime.control_plane import cause_of, open_session
 
 _PUBLISH_S = 1.0
 _QUERIES = 64

@@ -19,8 +19,7 @@ from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.impairments.link_settings import LinkSettings, read_files
-from noack.runtime.command_line import Parser, failed
-from noack.runtime.signals import Signals
+from noack.runtime.command_line import Parser, Signals, failed
 
 _NAME_HELP = "the emulator's --control NAME; optional if only one runs"
 

@@ -1,7 +1,7 @@
 """Session files: the running emulators of this user.
 
-While an emulator runs, its file is in the user's runtime directory (:mod:`noack.runtime.lock_file`)
-beside its socket.
+While an emulator runs, its file is in the user's runtime directory
+(:mod:`noack.runtime.private_folder`), beside its socket.
 """
 
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
 from noack.core.errors import CallerError, PeerError
-from noack.runtime import lock_file
+from noack.runtime import private_folder
 from noack.runtime.private_folder import require_name
 
 EMULATORS = "netem"
@@ -26,7 +26,7 @@ def _locked(kind: str, name: str) -> Iterator[Path]:
     require_name(name, "emulator")
     with ExitStack() as stack:
         try:
-            path = stack.enter_context(lock_file.lock_file(kind, name, {}))
+            path = stack.enter_context(private_folder.lock_file(kind, name, {}))
         except FileExistsError:
             raise _in_use(name) from None
         yield path
@@ -74,7 +74,7 @@ def find(name: str | None) -> str:
         PeerError: it is still starting.
     """
     files = _files()
-    begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
+    begun = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
     if name not in files and (name in begun or (name is None and begun and not files)):
         raise PeerError(
             f"emulator {name or begun[0]!r} is starting; "
@@ -93,5 +93,5 @@ def find(name: str | None) -> str:
     return name
 
 
-def _files() -> dict[str, lock_file.LockFile]:
-    return {file.path.stem: file for file in lock_file.live_lock_files(EMULATORS)}
+def _files() -> dict[str, private_folder.LockFile]:
+    return {file.path.stem: file for file in private_folder.live_lock_files(EMULATORS)}

@@ -20,7 +20,7 @@ from netem.standard_error import say
 from noack.core.errors import CallerError, why
 from noack.core.file_access import open_growing
 from noack.runtime.address import text_of
-from noack.runtime.json_log import LogFormat
+from noack.runtime.command_line import LogFormat
 from noack.runtime.metrics_server import OPTION, metrics_server, require_package
 
 _VIEW_S = 1.0

@@ -15,7 +15,7 @@ from noack.core.errors import CallerError
 from noack.runtime.address import SocketName as SocketName
 from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of
-from noack.runtime.peer_sockets import enlarge_buffer
+from noack.runtime.udp_sockets import enlarge_buffer
 
 _BUFFER_BYTES = 4 * 1024 * 1024
 RECEIVE_WAIT_NS = 8_000_000

@@ -30,8 +30,8 @@ from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.errors import CallerError
-from noack.core.row_display import as_html, as_text
-from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
+from noack.core.number_format import as_html, as_text
+from noack.protocol.topology import PROTOCOLS, LoopProtocol
 from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
 

@@ -12,8 +12,7 @@ e_c = (0, I) e^{Fr} z' after r. The weights are improved step by step; all weigh
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector
-from noack.core.matrix_exponential import exponential
+from noack.core.linear_systems import Matrix, Vector, exponential
 from noack.theory.contraction import Stack, logarithmic_norm
 from noack.theory.delivery_flow import ROUNDING, DeliveryFlow, Reach
 from noack.theory.kernel_bounds import KernelBounds

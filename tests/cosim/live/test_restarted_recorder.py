@@ -22,8 +22,7 @@ from noack.core.errors import MachineError
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.log_lines import NOTICES, batch_of
-from noack.runtime.spool import SPOOL, read_chunks
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 

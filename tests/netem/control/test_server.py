@@ -17,8 +17,8 @@ from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_records import Counters
 from noack.impairments.link_settings import LinkSettings
+from noack.runtime.control_plane import open_session
 from noack.runtime.private_folder import private_folder
-from noack.runtime.zenoh_session import open_session
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 

@@ -17,10 +17,8 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
-from noack.core.clock import SlewedRunClock
-from noack.core.clock_offset import ClockOffset, Exchange
+from noack.core.clock import ClockOffset, Exchange, SlewedClock, SlewedRunClock
 from noack.core.core_library import core
-from noack.core.slewed_clock import SlewedClock
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
