@@ -15,7 +15,7 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import cached_property
 from itertools import chain, repeat
@@ -397,56 +397,6 @@ def lifeline_cut() -> bool:
     return bool(readable) and os.read(sys.stdin.fileno(), 1) == b""
 
 
-def run_process(
-    role: str,
-    body: Callable[[RunProcess], None],
-    session: str = DEFAULT_SESSION,
-    *,
-    invitation: Path | None = None,
-    runs: Path = _RUNS,
-    as_json: bool = False,
-) -> ExitStatus:
-    """Join a run as ``role``, run ``body``, and return the exit status.
-
-    The run is that of an invitation, or else of a session on this host. A process that was invited
-    keeps below ``runs`` what it cannot send to the recorder. A caller's or a peer's error becomes
-    one line on standard error, without a traceback; with ``as_json`` also a document on standard
-    output.
-    """
-    with Signals().handled() as signals:
-        try:
-            require_limits()
-            if invitation is None:
-                ticket = _ticket(role, session, signals)
-            else:
-                ticket = _invited(role, invitation, runs, signals)
-            if ticket.launched:
-                setproctitle(f"noack {role}")  # in lists of processes
-            process = _admitted(role, ticket, signals)
-            with process.plane:
-                try:
-                    body(process)
-                except Exception as error:
-                    process.fail(error)
-                    raise
-                finally:
-                    process.life.apply(Event.END)
-                    process.plane.report_end(process.ended)
-        except NoackError as error:
-            if signals.received is None:
-                return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
-        except Exception as error:
-            if (line := exhausted_limit(error)) is not None:
-                return failed(line, ExitStatus.FAILED, who=f"noack {role}", as_json=as_json)
-            traceback.print_exc()
-            print(f"noack {role}: internal error, see above", file=sys.stderr)
-            return ExitStatus.FAILED
-        if signals.received is None and not ticket.launched:
-            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
-            return ExitStatus.OK if process.ended == HORIZON else ExitStatus.FAILED
-        return signals.status
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that all processes have."""
     where = parser.add_mutually_exclusive_group()
@@ -461,37 +411,74 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
 
-def main(
-    role: str, body: Callable[[RunProcess], None], arguments: Sequence[str] | None
-) -> ExitStatus:
-    """Command line of a process that only joins runs."""
+@contextmanager
+def join_run(role: str, arguments: Sequence[str] | None = None) -> Iterator[RunProcess]:
+    """Be a process of a run within the context: from its admission to the report of its end.
+
+    The run is that of an invitation, or else of a session on this host. A process that was invited
+    keeps below ``--runs`` what it cannot send to the recorder.
+
+    Args:
+        role: of the process.
+        arguments: the options of :func:`add_options`; None: those of the command line.
+
+    Raises:
+        SystemExit: the process ends with another status than 0. A caller's or a peer's error, also
+            one from within the context, has then become one line on standard error, without a
+            traceback; with ``--json`` also a document on standard output.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = Parser(
         prog=f"noack {role}",
         description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
     )
     add_options(parser)
-    try:
+    signals = Signals()
+    with _exit_status(role, signals, as_json="--json" in given):
         options = parser.parse_args(given)
-    except NoackError as error:
-        return failed(str(error), error.exit_status, who=f"noack {role}", as_json="--json" in given)
-    return join_run(role, body, options)
-
-
-def join_run(
-    role: str, body: Callable[[RunProcess], None], options: argparse.Namespace
-) -> ExitStatus:
-    """Join a run with the options of :func:`add_options`."""
-
-    def body_and_report(process: RunProcess) -> None:
-        body(process)
+        with signals.handled():
+            require_limits()
+            if options.invitation is None:
+                ticket = _ticket(role, options.session, signals)
+            else:
+                ticket = _invited(role, options.invitation, options.runs, signals)
+            if ticket.launched:
+                setproctitle(f"noack {role}")  # in lists of processes
+            process = _admitted(role, ticket, signals)
+            with process.plane:
+                try:
+                    yield process
+                except Exception as error:
+                    process.fail(error)
+                    raise
+                finally:
+                    process.life.apply(Event.END)
+                    process.plane.report_end(process.ended)
         if options.json:
             print(json.dumps(process.report, indent=2))
+        if signals.received is None and not ticket.launched:
+            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
+            if process.ended != HORIZON:
+                sys.exit(ExitStatus.FAILED)
 
-    return run_process(
-        role, body_and_report, options.session,
-        invitation=options.invitation, runs=options.runs, as_json=options.json,
-    )  # fmt: skip
+
+@contextmanager
+def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None]:
+    """Turn errors and signals within the context into a line and an exit status."""
+    who = f"noack {role}"
+    try:
+        yield
+    except NoackError as error:
+        if signals.received is None:
+            sys.exit(failed(str(error), error.exit_status, who=who, as_json=as_json))
+    except Exception as error:
+        if (line := exhausted_limit(error)) is not None:
+            sys.exit(failed(line, ExitStatus.FAILED, who=who, as_json=as_json))
+        traceback.print_exc()
+        print(f"{who}: internal error, see above", file=sys.stderr)
+        sys.exit(ExitStatus.FAILED)
+    if signals.received is not None:
+        sys.exit(signals.status)
 
 
 def _ticket(role: str, session: str, signals: Signals) -> Ticket:

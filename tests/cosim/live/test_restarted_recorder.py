@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from cosim.live import process_tokens
-from cosim.live.telemetry_recorder import Recorder
+from cosim.live import recorder
+from cosim.live.recorder import Recorder
 from cosim.output.viewer.recording_file import ViewError
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve
@@ -133,7 +133,7 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
     assert run.recorder.finished
     run.follow(Start(2, 0), "b", present=["plant"])
     assert not run.recorder.finished
-    monkeypatch.setattr(process_tokens, "_DISCOVERY_S", -1.0)
+    monkeypatch.setattr(recorder, "_DISCOVERY_S", -1.0)
     assert not run.recorder.finished
     assert run.report("plant") == {}
     assert run.recorder.finished

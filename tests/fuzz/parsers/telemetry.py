@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.live.telemetry_recorder import Recorder
+from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.spool_conversion import finish_record
 from noack.config.resolution import resolve, run_tables

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import pytest
 
-from cosim.live.tls_keys import TlsKeys, coordinator_context, new_tls_keys
+from cosim.live.remote_access import TlsKeys, coordinator_context, new_tls_keys
 from noack.core.errors import NoAnswerError, PeerError
 from noack.runtime import coordinator_link as link_module
 from noack.runtime.coordinator_link import (
