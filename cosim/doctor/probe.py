@@ -16,8 +16,7 @@ from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.address import LOOPBACK
 from noack.runtime.live_driver import LiveDriver
-from noack.runtime.real_time_loop import RecordSink, run_loop
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import RecordSink, realtime, run_loop
 from plant_server.plant import plants_of
 
 _WARM_UP = 20

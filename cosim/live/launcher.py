@@ -18,13 +18,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from cosim.live.child_processes import ChildProcesses, Failure, RestartPolicy
+from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
-from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.remote_hosts import RemoteStart
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
+    LEAST_FREE_BYTES,
     PROCESSES_FILE,
     active_run,
     new_run_dir,
@@ -32,10 +31,16 @@ from cosim.record.run_directory import (
     write_scenario,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import require_equal_sizes, resolve_run, resolved_loops
+from noack.config.resolution import require_equal_sizes, resolve_run, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
+from noack.protocol.record_tables import (
+    CONTROLLER_STEP,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
@@ -54,6 +59,8 @@ _OVERLOADED = 1.5
 """From this slow-down on, the message names the load as the likely cause."""
 _SOURCE = "noack"
 _EVERY_S = 1.0
+_UNTIL_THE_END = 3
+"""At the end of a run, spool, record and view exist together, each of about the same size."""
 
 
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
@@ -437,3 +444,51 @@ def log_end(status: int, reason: str, run_dir: Path) -> None:
         "info" if status == 0 else "error", _SOURCE, f"ended: {reason}",
         event="end", status=status, reason=reason, directory=str(run_dir),
     )  # fmt: skip
+
+
+def spool_bytes(resolved: Scenario) -> int:
+    """Bytes of the rows on fixed time grids; the number of event rows is not known in advance."""
+    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
+    ticks = resolved.timing.horizon_ns // resolved.timing.controller_period_ns
+    counts = {
+        PLANT_STEP: steps,
+        SENSOR_MEASUREMENT: steps // resolved.plant.measure_every,
+        CONTROLLER_STEP: ticks,
+        PLANT_ACTUATION: ticks,
+    }
+    types = tables_of(resolved)
+    return sum(rows * types[table].itemsize for table, rows in counts.items())
+
+
+def needed_bytes(resolved: Scenario) -> int:
+    """Bytes on the disk until the run has ended."""
+    return _UNTIL_THE_END * spool_bytes(resolved)
+
+
+def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
+    """Check that a run's record fits on the disk; warn if it may not.
+
+    Raises:
+        MachineError: the record needs more than the free space.
+    """
+    folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
+    if folder is None:
+        return
+    free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
+    if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
+        return
+    text = (
+        f"{runs}: this run records {_size(spool)} and needs {_size(_UNTIL_THE_END * spool)} until "
+        f"its end; {_size(free)} are free on the disk"
+    )
+    if free < spool:
+        raise MachineError(f"{text}; reduce horizon_s, or choose another disk with --runs")
+    print(f"noack: warning: {text}", file=sys.stderr)
+
+
+def _size(count: int) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB"):
+        if count < 1024 or unit == "PiB":
+            break
+        count //= 1024
+    return f"{count} {unit}"

@@ -23,8 +23,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
-from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why

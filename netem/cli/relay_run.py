@@ -27,7 +27,7 @@ from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
 from noack.runtime.command_line import Signals, failed, log_event, log_format
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 50_000

@@ -5,6 +5,9 @@ matrix, bit for bit, whether it was cached or not, and on every processor. A lib
 exponential depends on the processor, by the BLAS below it: two hosts of one run, or a run and its
 replay on another machine, would then differ in the last bits of every state. So the core's is used
 (native/loop/exponential.c).
+
+Lyapunov equations are solved in numpy, since importing scipy.linalg takes 0.2 s. They are for
+bounds, which are enlarged by more than the rounding.
 """
 
 from bisect import bisect_right
@@ -23,6 +26,8 @@ Matrix = NDArray[np.float64]
 _CACHED_STEPS = 4096
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
+_MOST_STATES = 12
+"""The linear equations of a Lyapunov equation grow with the fourth power of the states."""
 
 
 def exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -162,3 +167,19 @@ def _same(one: Vector | None, other: Vector | None) -> bool:
     if one is None or other is None:
         return one is other
     return bool(np.array_equal(one, other))
+
+
+def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
+    """Return X with M X + X Mᵀ = Q, (n, n).
+
+    Raises:
+        numpy.linalg.LinAlgError: there is no unique solution.
+    """
+    n = len(M)
+    if n > _MOST_STATES:
+        from scipy.linalg import solve_continuous_lyapunov
+
+        return np.asarray(solve_continuous_lyapunov(M, Q))
+    one = np.eye(n)
+    equations = np.kron(M, one) + np.kron(one, M)
+    return np.asarray(np.linalg.solve(equations, Q.ravel()).reshape(n, n))

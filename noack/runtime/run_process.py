@@ -56,8 +56,7 @@ from noack.runtime.join_ticket import (
     wait_for_ticket,
 )
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
-from noack.runtime.real_time_loop import Channel, Driver, run_loop
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
 from noack.runtime.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.telemetry import (
     OwnSpool,
@@ -73,8 +72,8 @@ _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_REST_SHARE = 20
-_LONGEST_REST_NS = 1_000_000
+_REST_SHARE = 30
+_LONGEST_REST_NS = 700_000
 """Ticks of more than a few loops that are nearer to others than this part of a period are done
 together: waking up for each takes CPU time."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
