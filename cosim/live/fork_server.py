@@ -57,7 +57,6 @@ ENVIRONMENT = {
 _MALLOPT = {-8: 2, -3: 131_072, -1: 131_072}
 """The last three of them, as glibc's mallopt takes them: it reads the environment only once."""
 _PYTHONS_GC_THRESHOLDS = (700, 10, 10)
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MOST_BYTES = 65_536
 _START_TIMEOUT_S = 120.0
 _PR_SET_CHILD_SUBREAPER = 36
@@ -117,8 +116,8 @@ class ForkServer:
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
             on_error.callback(self._socket.close)
-            self._process = self._forked(its) if of_itself else None
-            self._process = self._process or subprocess.Popen(
+            forked = self._forked(its) if of_itself else None
+            self._process = forked or subprocess.Popen(
                 python_command("-m", "cosim.live.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
                 stdin=subprocess.DEVNULL,
@@ -142,10 +141,12 @@ class ForkServer:
         self._socket.close()
         os.setsid()  # the launcher handles Ctrl-C
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        usual = (signal.default_int_handler, signal.SIG_DFL, signal.SIG_DFL)
-        for number, handler in zip(_ENDING, usual, strict=True):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, handler)
+                is_interrupt = number is signal.SIGINT
+                signal.signal(
+                    number, signal.default_int_handler if is_interrupt else signal.SIG_DFL
+                )
         os.environ.update(ENVIRONMENT)
         with suppress(AttributeError):  # another C library
             for parameter, value in _MALLOPT.items():

@@ -142,7 +142,7 @@ def test_every_zenoh_session_is_opened_in_one_place() -> None:
     root = Path(noack.__file__).parents[1]
     rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["zenoh_session.py"]
+    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["control_plane.py"]
 
 
 @pytest.mark.parametrize(
