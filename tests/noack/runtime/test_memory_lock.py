@@ -37,7 +37,7 @@ from noack.runtime.real_time_loop import lock_memory
 
 def private_bytes():
     text = Path("/proc/self/smaps_rollup").read_text()
-    return sum(int(kib) * 1024 for kib in re.findall("Private_.*: *([0-9]+) kB", text))
+    return sum(int(kib) * 1024 for kib in re.findall("Private_Dirty: *([0-9]+) kB", text))
 
 inherited = mmap.mmap(-1, 2**23, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 inherited.write(b"x" * 2**23)
