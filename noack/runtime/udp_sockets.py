@@ -75,7 +75,8 @@ def drops_of(endpoint: socket.socket) -> int | None:
     """Datagrams that the kernel dropped at a socket; None if the system has no such counter.
 
     This counter is always exact and costs nothing per datagram. The one that arrives with
-    datagrams (SO_RXQ_OVFL) is exact only after the next datagram.
+    datagrams (SO_RXQ_OVFL) is exact only after the next datagram. Datagrams that the kernel passes
+    together, as it does between processes of several loops, count as one.
     """
     try:
         found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
