@@ -133,6 +133,7 @@ class ForkServer:
         That is one thread, and UTF-8 for files and streams.
         """
         _import(_COMMON)
+        _build_scenario()
         threads = len([*Path("/proc/self/task").iterdir()])
         if threads > 1 or sys.getfilesystemencoding() != "utf-8":
             return None
@@ -143,10 +144,9 @@ class ForkServer:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:
-                is_interrupt = number is signal.SIGINT
-                signal.signal(
-                    number, signal.default_int_handler if is_interrupt else signal.SIG_DFL
-                )
+                signal.signal(number, signal.SIG_DFL)
+                if number is signal.SIGINT:
+                    signal.signal(number, signal.default_int_handler)
         os.environ.update(ENVIRONMENT)
         with suppress(AttributeError):  # another C library
             for parameter, value in _MALLOPT.items():
@@ -259,15 +259,24 @@ def _fork_twice() -> int:
     return pid
 
 
+def _build_scenario() -> None:
+    """Build the validators of a scenario, which the launcher needs, too."""
+    from noack.config.scenario import Scenario
+
+    Scenario.model_rebuild()
+
+
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     from noack.config.scenario_changes import prepare_changes
     from noack.impairments.kinds.loss import LossOf
     from noack.impairments.link_settings import LinkSettings
+    from noack.runtime.control_messages import ControlMessage
     from noack.runtime.join_ticket import Ticket
 
-    for section in (Ticket, LinkSettings, LossOf):
-        section.model_rebuild()
+    _build_scenario()
+    for one in (Ticket, LinkSettings, LossOf, *ControlMessage.__subclasses__()):
+        one.model_rebuild()
     prepare_changes()
 
 
