@@ -300,6 +300,12 @@ void noack_product(
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 
+/* e^x, e^x - 1, ln x, and the cube root of x >= 0. See native/elementary.h. */
+double noack_exp(double x);
+double noack_expm1(double x);
+double noack_log(double x);
+double noack_cube_root(double x);
+
 /* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 
@@ -547,10 +553,19 @@ enum noack_table_number { /* sensor: no ticks */
     NOACK_TABLES
 };
 
+enum { NOACK_LOOP_BYTES = 2 }; /* of the number of its loop, with which a row begins */
+
+enum noack_missing_word { /* in a row of a loop whose vectors are shorter than the table's */
+    NOACK_MISSING_NAN = -1,
+    NOACK_MISSING_ZERO = -2
+};
+
 typedef struct { /* rows of a table of the record, packed as numpy has them */
-    int64_t prefix_bytes; /* 2: a row begins with the number of its loop */
     int64_t row_bytes, places, count;
-    uint8_t *rows; /* (places, row_bytes) */
+    uint8_t *rows;     /* (places, row_bytes) */
+    int64_t **layouts; /* (loops,) for each word of a row: which word of the loop's own row it is, or
+                          a noack_missing_word; NULL: the rows of this loop, or of all loops, are
+                          those of the table */
 } noack_table;
 
 typedef struct { /* the machines of one role, of all loops */
@@ -1025,15 +1040,6 @@ void noack_channel_latest(const noack_channel *channel, int64_t direction, int64
 
 /* ---- Simulation in virtual time ----------------------------------------------------------------- */
 
-typedef struct { /* loops whose rows have the same columns */
-    noack_process *processes[3]; /* by enum noack_role */
-    int64_t *numbers;            /* (loops,) of these loops in the run, ascending */
-} noack_loop_group;
-
-typedef struct {
-    int64_t group, place; /* place: its number in the group */
-} noack_loop_place;
-
 enum noack_destination { /* beyond enum noack_role */
     NOACK_NETWORK = 3
 };
@@ -1049,17 +1055,15 @@ enum noack_simulation_reason { /* besides NOACK_DONE and the questions of who as
 };
 
 typedef struct {
-    int64_t groups, loops;
-    noack_loop_group *of_group; /* (groups,) */
-    noack_loop_place *of_loop;  /* (loops,) */
+    int64_t loops;
+    noack_process *processes[3]; /* by enum noack_role: the machines of all loops */
     noack_channel *channel;
     noack_wire wire;
     int64_t directions[5]; /* in which direction each flow crosses the network; -1: it does not */
     int64_t now_ns;
     int64_t steps_left;   /* inputs of machines until it returns */
-    int64_t asking;       /* enum noack_role or NOACK_NETWORK: who asks */
-    int64_t asking_group; /* of which group */
-    int64_t sent_places;  /* a power of 2 */
+    int64_t asking;      /* enum noack_role or NOACK_NETWORK: who asks */
+    int64_t sent_places; /* a power of 2 */
     int64_t sent_first, sent_count;
     noack_sent_datagram *sent; /* (sent_places,) a ring, in the order of sending */
 } noack_simulation;

@@ -131,7 +131,7 @@ def warn_of_violations(scenario: "Scenario") -> None:
     from noack.config.link_load import link_loads, load_warnings
     from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
-    from noack.theory.assumptions import AssumptionStatus, assumptions
+    from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 
     shares = len(loop_names(scenario)) > 1
     for line in load_warnings(link_loads(scenario), scenario) if shares else ():

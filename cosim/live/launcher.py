@@ -31,7 +31,7 @@ from cosim.record.run_directory import (
     write_scenario,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import require_equal_sizes, resolve_run, resolved_loops, tables_of
+from noack.config.resolution import resolve_run, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
@@ -147,7 +147,6 @@ def launch(
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)
         resolved = resolve_run(scenario)
-        require_equal_sizes(scenario)
         require_disk_space(loops, runs)
         if PLANT in spawn:
             # Compile now: the start barrier has a time limit.

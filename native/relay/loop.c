@@ -43,7 +43,6 @@ void noack_relay_open(noack_relay *relay) {
         own->hints[k] = -1;
         renew_header(relay, k);
     }
-    own->most_segments = MOST_SEGMENTS;
     struct timespec at_once = {0, 0};
     own->sleeps =
         syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from netem.link_state import Integers, LinkState
 from netem.relay_events import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 Array = NDArray[Any]

@@ -6,8 +6,8 @@ import numpy as np
 
 from noack.config.setpoint import input_at
 from noack.core.clock import NS_PER_S
-from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.matrices import require_length, require_shape
 

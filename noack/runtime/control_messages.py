@@ -77,7 +77,7 @@ class ChangeAnnouncement(ControlMessage):
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
     kept_losses: dict[str, FiniteFloat] = {}
-    """Probabilities for :func:`noack.impairments.kept_loss.remember`."""
+    """Probabilities for :func:`noack.impairments.loss_prediction.remember`."""
 
 
 class ChangeRequest(ControlMessage):

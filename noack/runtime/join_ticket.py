@@ -24,7 +24,7 @@ from noack.config.validation_messages import brief
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular
-from noack.impairments.kept_loss import found_probabilities, remember
+from noack.impairments.loss_prediction import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK, Address, family_of, text_of
 from noack.runtime.control_messages import NumericHost, SocketAddress

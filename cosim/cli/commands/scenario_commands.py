@@ -87,7 +87,7 @@ def check(
     from noack.config.loops import loop_names
     from noack.config.resolution import resolve
     from noack.config.scenario_file import dumps as scenario_toml
-    from noack.theory.assumptions import assumptions
+    from noack.theory.certificates.assumptions import assumptions
 
     loaded = cli.load_scenario(scenario, settings)
     if len(loop_names(loaded)) > 1:

@@ -183,7 +183,7 @@ def adversary(
     from cosim.analysis.adversary.worst_run import document, print_worst
     from cosim.live.progress import search_status
     from noack.config.resolution import resolve
-    from noack.theory.scenario_certificates import certify
+    from noack.theory.certificates.scenario_certificates import certify
 
     given = [] if horizon is None else [f"horizon_s={horizon}"]
     resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))

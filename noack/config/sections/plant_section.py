@@ -9,7 +9,7 @@ from noack.config.feature_kinds import AnyDisturbance, AnyPlant
 from noack.config.sections.model_section import require_read
 from noack.core.linear_systems import Vector
 from noack.disturbances.disturbance_settings import Place
-from noack.observers.estimation_model import NoiseVariances
+from noack.observers.observer_settings import NoiseVariances
 from noack.plants.linear import LinearSettings
 from noack.settings.matrices import (
     Row,
