@@ -275,8 +275,10 @@ def _build_validators() -> None:
     from noack.runtime.join_ticket import Ticket
 
     _build_scenario()
-    for one in (Ticket, LinkSettings, LossOf, *ControlMessage.__subclasses__()):
-        one.model_rebuild()
+    for section in (Ticket, LinkSettings, LossOf):
+        section.model_rebuild()
+    for message in ControlMessage.__subclasses__():
+        message.model_rebuild()
     prepare_changes()
 
 
