@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.loops import loop_scenario
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -22,7 +21,8 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.config.scenario import MOST_CHANGES
+from noack.config.scenario import loop_scenario
+from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.process_limits import cores

@@ -268,7 +268,7 @@ def _build_scenario() -> None:
 
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
-    from noack.config.scenario_changes import prepare_changes
+    from noack.config.scenario_checks import prepare_changes
     from noack.impairments.kinds.loss import LossOf
     from noack.impairments.link_settings import LinkSettings
     from noack.runtime.control_messages import ControlMessage

@@ -24,10 +24,9 @@ from cosim.record.packet_outcomes import updates_in
 from cosim.record.process_reports import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_record import Rows
-from noack.config.loops import loop_names
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError

@@ -25,8 +25,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of

@@ -20,7 +20,7 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from noack.config.scenario import Scenario
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import NamedTuple
 
-from noack.config.sections.run_sections import ClocksSection
+from noack.config.run_sections import ClocksSection
 from noack.core.clock import (
     NS_PER_S,
     SLEW_PPB,

@@ -24,11 +24,10 @@ from typing import Any, Protocol
 
 from setproctitle import setproctitle
 
-from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolved_loops, run_tables
-from noack.config.scenario import Scenario
-from noack.config.scenario_changes import prepare_changes
+from noack.config.scenario import Scenario, loops_of, phases_ns
+from noack.config.scenario_checks import prepare_changes
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import (
     CallerError,
