@@ -9,7 +9,6 @@ import typer
 from cosim.cli import command as cli
 from cosim.cli import completion
 from noack.core.errors import CallerError, ExitStatus
-from noack.traces.trace_formats import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
@@ -215,6 +214,7 @@ def _result(
     )
     from cosim.measurement.live.probe_result import ProbeResult
     from cosim.measurement.trace_sources import FILE_OPTIONS, read_source, refuse_unused
+    from noack.traces.trace_formats import find_trace
 
     if listen is not None:
         if sources:
