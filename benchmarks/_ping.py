@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._report import MeasurementError
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 
 PING_BYTES = 72
 PYTHON = (sys.executable, "-m", "benchmarks._ping")

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks._report import MeasurementError
 from cosim.doctor.probe import idle_lateness_ns
 from noack.core.clock import NS_PER_S
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 
 FIFO_PRIORITY = 50
 

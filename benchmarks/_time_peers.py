@@ -21,9 +21,9 @@ from typing import Protocol
 import numpy as np
 
 from benchmarks._driven_clocks import DrivenClocks
-from noack.core.clock_offset import ClockOffset, Restart
+from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address, family_of
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 from noack.runtime.time_exchange import TimeClient, TimeReference, answering
 
 KEY = bytes(range(32))

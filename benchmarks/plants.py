@@ -27,7 +27,7 @@ from noack.config.sections import PLANTS
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow, Message
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 from plant_server.plant import plants_of
 
 STEPS = 7500

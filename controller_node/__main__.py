@@ -3,25 +3,21 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import stoppable_imports
+from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from controller_node.controller import controllers_of
     from noack.core.errors import ExitStatus
-    from noack.runtime import process_entry
     from noack.runtime.live_driver import run_machines
-    from noack.runtime.process_life import RunProcess
+    from noack.runtime.run_process import join_run
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
-    """Run the controller in the run that a recorder or launcher has opened."""
-    return process_entry.main("controller", run_controllers, arguments)
-
-
-def run_controllers(process: RunProcess) -> None:
-    """Make the controller of each loop, and run them."""
-    machines = controllers_of(process.loops, process.phases_ns, start=process.start)
-    run_machines(process, machines)
+    """Run the controller of each loop in the run that a recorder or launcher has opened."""
+    with join_run("controller", arguments) as run:
+        controllers = controllers_of(run.loops, run.phases_ns, start=run.start)
+        run_machines(run, controllers)
+    return ExitStatus.OK
 
 
 if __name__ == "__main__":

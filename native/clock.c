@@ -13,7 +13,7 @@ int64_t clock_ns(int clock) {
     return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
 }
 
-/* The offset of the coordinator's clock, as noack.core.slewed_clock.SlewedClock applies it. */
+/* The offset of the coordinator's clock, as noack.core.clock.SlewedClock applies it. */
 static int64_t applied_offset_ns(const noack_clock *clock, int64_t own_ns) {
     int64_t since_ns = own_ns - clock->since_ns;
     /* The product of both numbers may exceed 64 bits. */

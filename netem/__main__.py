@@ -8,15 +8,14 @@ In a run, it is one of the run's processes. On its own, it relays for any UDP pr
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import stoppable_imports
+from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from netem.run_network import NetworkChannel, RunNetwork
     from noack.core.errors import ExitStatus, NoackError
     from noack.protocol.topology import ENDS
     from noack.runtime.command_line import Parser, failed
-    from noack.runtime.process_entry import add_options, join_run
-    from noack.runtime.process_life import RunProcess
+    from noack.runtime.run_process import RunProcess, add_options, join_run
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
@@ -29,9 +28,11 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
     add_options(joining)
     try:
-        options, more = joining.parse_known_args(given)
+        _, more = joining.parse_known_args(given)
         if not more:
-            return join_run("netem", run_network, options)
+            with join_run("netem", given) as run:
+                run_network(run)
+            return ExitStatus.OK
         from netem.stand_alone import alone
 
         return alone(given)
@@ -40,20 +41,20 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 
 
-def run_network(process: RunProcess) -> None:
+def run_network(run: RunProcess) -> None:
     """Relay the datagrams of a run by the core."""
-    network = RunNetwork(process.scenario, process.start, len(process.phases_ns))
-    with process.open_socket() as endpoint:
-        addresses = process.join(endpoint.getsockname()[:2])
+    network = RunNetwork(run.scenario, run.start, len(run.phases_ns))
+    with run.open_socket() as endpoint:
+        addresses = run.join(endpoint.getsockname()[:2])
         ways = [
             (addresses[ENDS[flow].sender], addresses[ENDS[flow].receiver])
-            for flow in process.scenario.network.flows
+            for flow in run.scenario.network.flows
         ]
         channel = NetworkChannel(
-            endpoint, ways, network=network, clock=process.clock, spin_ns=process.spin_ns,
-            loops=len(process.phases_ns),
+            endpoint, ways, network=network, clock=run.clock, spin_ns=run.spin_ns,
+            loops=len(run.phases_ns),
         )  # fmt: skip
-        process.run(network, channel, network)
+        run.run(network, channel, network)
 
 
 if __name__ == "__main__":

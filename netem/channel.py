@@ -17,7 +17,6 @@ from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
-from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -26,7 +25,7 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
-from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
 
 Rows = NDArray[np.void]
 

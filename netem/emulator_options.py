@@ -36,7 +36,7 @@ from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.address import text_of as address_text
 from noack.runtime.command_line import Parser
-from noack.runtime.process_entry import add_options
+from noack.runtime.run_process import add_options
 
 LINK_NAME = "relay"
 """Name of the link that the command line describes."""

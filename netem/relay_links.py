@@ -27,8 +27,7 @@ from noack.runtime.address import SocketName as SocketName
 from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.peer_sockets import enlarge_buffer
-from noack.runtime.udp_sockets import drops_of
+from noack.runtime.udp_sockets import drops_of, enlarge_buffer
 
 
 def say(line: str) -> None:

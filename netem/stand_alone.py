@@ -41,11 +41,9 @@ from noack.core.errors import CallerError, ExitStatus, NoackError, why
 from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
-from noack.runtime.command_line import failed
-from noack.runtime.json_log import LogFormat, log_event, log_format
+from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
 from noack.runtime.metrics_server import OPTION, metrics_server, require_package
-from noack.runtime.real_time_settings import realtime
-from noack.runtime.signals import Signals
+from noack.runtime.real_time_loop import realtime
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 50_000

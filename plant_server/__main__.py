@@ -3,25 +3,21 @@
 import sys
 from collections.abc import Sequence
 
-from noack.runtime.signals import stoppable_imports
+from noack.runtime.command_line import stoppable_imports
 
 with stoppable_imports():
     from noack.core.errors import ExitStatus
-    from noack.runtime import process_entry
     from noack.runtime.live_driver import run_machines
-    from noack.runtime.process_life import RunProcess
+    from noack.runtime.run_process import join_run
     from plant_server.plant import plants_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
-    """Run the plant in the run that a recorder or launcher has opened."""
-    return process_entry.main("plant", run_plants, arguments)
-
-
-def run_plants(process: RunProcess) -> None:
-    """Make the plant of each loop, and run them."""
-    machines = plants_of(process.loops, process.phases_ns)
-    run_machines(process, machines)
+    """Run the plant of each loop in the run that a recorder or launcher has opened."""
+    with join_run("plant", arguments) as run:
+        plants = plants_of(run.loops, run.phases_ns)
+        run_machines(run, plants)
+    return ExitStatus.OK
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import yaml
 from cosim.cli import app
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import Parser
-from noack.runtime.process_entry import add_options
+from noack.runtime.run_process import add_options
 
 ROOT = Path(__file__).parents[1]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
-from noack.core.python_process import cores
-from noack.core.row_display import Rows, as_html, as_text
+from noack.core.number_format import Rows, as_html, as_text
+from noack.core.process_limits import cores
 
 if TYPE_CHECKING:
     import pyarrow as pa

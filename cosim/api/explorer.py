@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.api.scenarios import Source, load, plain
 from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import write_whole
-from noack.core.row_display import as_text
+from noack.core.number_format import as_text
 
 if TYPE_CHECKING:
     from ipywidgets import Widget

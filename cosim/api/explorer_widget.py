@@ -18,7 +18,7 @@ from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, Draft
 from cosim.interactive.exploration_figure import exploration_figure
 from cosim.output.report.figure_style import settings
 from noack.core.errors import NoackError
-from noack.core.row_display import as_html
+from noack.core.number_format import as_html
 
 _QUIET_S = 0.3
 """So long after the last change, what takes longer than a redraw is computed."""

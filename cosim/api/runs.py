@@ -22,7 +22,7 @@ from cosim.record.run_directory import (
 from noack.config.resolution import run_tables
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
-from noack.core.row_display import as_html, as_text
+from noack.core.number_format import as_html, as_text
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -29,8 +29,7 @@ def main() -> None:
     """Entry point."""
     from noack.core.errors import NoackError
     from noack.core.process_limits import exhausted_limit
-    from noack.runtime.command_line import failed
-    from noack.runtime.signals import stoppable_imports
+    from noack.runtime.command_line import failed, stoppable_imports
 
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]

@@ -20,12 +20,10 @@ from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
+from noack.core.process_limits import cores as cores
 from noack.core.process_limits import exhausted_limit
-from noack.core.python_process import cores as cores
-from noack.runtime.command_line import failed
-from noack.runtime.json_log import LogFormat as LogFormat
-from noack.runtime.json_log import log_format
-from noack.runtime.signals import StopRequestError, stop_requests_raised
+from noack.runtime.command_line import LogFormat as LogFormat
+from noack.runtime.command_line import StopRequestError, failed, log_format, stop_requests_raised
 
 if TYPE_CHECKING:
     from rich.console import Console

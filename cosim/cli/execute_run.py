@@ -75,8 +75,7 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import Watcher, joint_watcher, later_watcher, launch
-        from cosim.live.run_log import RunLog
+        from cosim.live.launcher import RunLog, Watcher, joint_watcher, later_watcher, launch
         from noack.config.link_load import require_capacity
         from noack.protocol.topology import ROLES
 
@@ -172,8 +171,8 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
 
 def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.finalize import finalize
+    from cosim.live.launcher import log_end
     from cosim.live.progress import PatientConsole
-    from cosim.live.run_log import log_end
     from cosim.output.run_verdict import print_outcome
 
     # This takes minutes for a run of an hour.

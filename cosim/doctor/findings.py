@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cosim.doctor.machine_facts import Lateness, MachineFacts, RunRequirements
+from cosim.doctor.machine_measures import Lateness, MachineFacts, RunRequirements
 from noack.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5

@@ -1,4 +1,7 @@
-"""Measures a machine in a few seconds, with the sockets, timers and settings of a run."""
+"""Measures a machine in a few seconds, with the sockets, timers and settings of a run.
+
+The measurements stand beside what a scenario requires (:class:`RunRequirements`).
+"""
 
 import ctypes
 import json
@@ -10,44 +13,34 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from cosim.doctor.machine_facts import (
-    Buffer,
-    Disk,
-    Lateness,
-    MachineFacts,
-    RoundTrips,
-    RunRequirements,
-)
-from cosim.live.disk_space import needed_bytes
+from cosim.live.launcher import needed_bytes
 from cosim.output.viewer.live_viewer import has_display
 from cosim.record.environment import environment
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 from noack.runtime.address import LOOPBACK
-from noack.runtime.control_plane import RUNS
+from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
-from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 T = TypeVar("T")
-
 EXTRAS = {"fmi": "fmpy", "vehicle": "vehiclemodels", "cluster": "distributed",
           "mcap": "mcap", "metrics": "prometheus_client", "lab": "nicegui",
           "notebook": "ipywidgets"}  # fmt: skip
 """Extras of noack by name, and one module that each installs."""
-
 _DATAGRAM = bytes(72)
 _ROUND_TRIPS = 1000
 _FLOOD = 20_000
@@ -55,6 +48,122 @@ _WRITE_BYTES = 32 * 1024 * 1024
 _PATIENCE_S = 20.0
 _ANSWER_S = 2.0
 _PR_GET_TIMERSLACK = 30
+
+
+class RunRequirements(NamedTuple):
+    """What a scenario requires of the machine; times are wall time."""
+
+    name: str
+    duration_s: float
+    period_ns: int
+    """Period of the plant's steps."""
+    allowance_ns: int
+    """Lateness of updates and inputs that the certificates allow."""
+    realtime: bool
+    """Whether the scenario asks for real-time settings."""
+    fifo_priority: int
+    spin_us: float
+    ports: Mapping[str, int]
+    """Ports by key, without ports that are 0 (any free port)."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Steps of the plant per wall second."""
+        return NS_PER_S / self.period_ns
+
+
+def requirements_of(resolved: Scenario) -> RunRequirements:
+    """Return what a resolved scenario requires of the machine."""
+    period_ns = round(resolved.timing.plant_period_ns / resolved.speed)
+    settings = resolved.realtime
+    ports = {name: port for name, port in resolved.ports.model_dump().items() if port}
+    return RunRequirements(
+        name=resolved.name,
+        duration_s=resolved.horizon_s / resolved.speed,
+        period_ns=period_ns,
+        allowance_ns=resolved.certificate.late_periods * period_ns,
+        realtime=settings.enabled,
+        fifo_priority=settings.fifo_priority,
+        spin_us=settings.spin_us,
+        ports=ports,
+    )
+
+
+class Lateness(NamedTuple):
+    """Lateness of an idle loop that wakes up at the plant's rate."""
+
+    wakes: int
+    p50_us: float
+    p99_us: float
+    max_us: float
+    beyond: int
+    """Number of wake-ups that were later than the certificates allow."""
+
+
+class RoundTrips(NamedTuple):
+    """Round trips of datagrams to another process over UDP on the loopback."""
+
+    sent: int
+    lost: int
+    p50_us: float
+    p99_us: float
+
+
+class Buffer(NamedTuple):
+    """The receive buffer of a run's sockets."""
+
+    datagrams: int
+    """Number of a run's datagrams that it holds."""
+    granted_bytes: int
+    most_bytes: int | None
+    """Largest size without privileges; None if unknown."""
+
+
+class Disk(NamedTuple):
+    """The folder of the run directories."""
+
+    folder: str
+    free_bytes: int
+    needed_bytes: int
+    """Space for the run's rows until the run has ended."""
+    write_bytes_per_s: float
+
+
+@dataclass(frozen=True)
+class MachineFacts:
+    """All measurements. A failed measurement is one line with the reason."""
+
+    cores: int
+    """Cores that this process may use."""
+    cores_online: int
+    load: float | None
+    """Load average over the last minute."""
+    governor: str | None
+    """Frequency governor of the first core; None if unknown."""
+    granted: Mapping[str, str]
+    """For each real-time setting: applied or not permitted, as ``realtime`` reports it."""
+    timer_resolution_ns: int
+    timer_slack_ns: int | None
+    plain: Lateness | str
+    """Without real-time settings."""
+    realtime: Lateness | str
+    """With the real-time settings that are permitted."""
+    round_trips: RoundTrips | str
+    buffer: Buffer | str
+    ports_taken: Sequence[str]
+    """A line for each port of the scenario that is in use."""
+    control: float | str
+    """Seconds per query over the control plane (zenoh, over a Unix socket)."""
+    disk: Disk | str
+    runtime_folder: str | None
+    """Why the folder for the user's private files cannot be used; None if it can."""
+    display: bool
+    viewer: str | None
+    """Version of rerun; None if it cannot be imported."""
+    extras: Mapping[str, bool]
+    """Whether each extra of noack is installed."""
+    versions: Mapping[str, str | None]
+    """Versions of Python and of the libraries that a run depends on."""
 
 
 def measure(

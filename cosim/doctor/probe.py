@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S, RunClock
-from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.wire_format import Wire
+from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.address import LOOPBACK
 from noack.runtime.live_driver import LiveDriver
-from noack.runtime.real_time_loop import RecordSink, run_loop
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import RecordSink, realtime, run_loop
 from plant_server.plant import plants_of
 
 _WARM_UP = 20

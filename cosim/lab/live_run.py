@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
 
 _ADDRESS = re.compile(r"http://\S+")

@@ -1,25 +1,40 @@
-"""The processes that a launcher starts: start, exit status, reason of a failure, end.
+"""The processes that a launcher starts: start, exit status, reason of a failure, restart, end.
 
-They run on this host, or over ssh on others.
+They run on this host, or over ssh on others. ``ssh`` asks for nothing: a key, or an agent, must be
+set up, and the host's key known. The invitation goes through ssh to the process's standard input,
+and is in no file. :class:`RestartPolicy` says which failed processes are restarted or waited for,
+and which failures end the run.
 """
 
 import contextlib
 import os
+import shlex
+import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Annotated, NamedTuple, Self
 
+from pydantic import AfterValidator, Field, model_validator
+
+from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
-from cosim.live.remote_hosts import SSH_FAILED, RemoteStart, start_over_ssh
-from noack.core.errors import ExitStatus, MachineError
+from noack.config import toml_file
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import open_append
-from noack.core.python_process import python_command
-from noack.protocol.topology import RECORDER
+from noack.core.process_limits import python_command
+from noack.protocol.topology import LOOP_ROLES, PLANT, RECORDER
 from noack.runtime.join_ticket import Ticket
+from noack.settings.section import ScenarioSection
 
+SSH_FAILED = 255
+"""Exit status of ssh when its connection cannot be made, or breaks."""
+_CONNECT_WITHIN_S = 10
+_OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", f"ConnectTimeout={_CONNECT_WITHIN_S}")
 MODULES = {
     "recorder": "cosim.live.recorder",
     "netem": "netem.__main__",
@@ -27,14 +42,100 @@ MODULES = {
     "sensor": "sensor_node.__main__",
     "controller": "controller_node.__main__",
 }
+Failure = tuple[ExitStatus, str]
+"""Exit status and reason."""
+Child = ForkedProcess | subprocess.Popen[str]
+RESTART_BY_HAND_S = 60.0
+"""How long a run waits for the restart of a process that was started by hand."""
+
+
+def _require_printable(text: str) -> str:
+    if not text.isprintable():  # no argument of a command has a zero character
+        raise ValueError("has a control character")
+    return text
+
+
+_Word = Annotated[str, Field(min_length=1), AfterValidator(_require_printable)]
+
+
+class Host(ScenarioSection):
+    """Where a process runs."""
+
+    ssh: Annotated[_Word, Field(pattern=r"^[^-\s]\S*$")]
+    """The host, as the command ssh takes it: a name of ~/.ssh/config, HOST or USER@HOST."""
+    command: _Word = "noack"
+    """How noack is called there, e.g. "noack/.venv/bin/noack"; the shell of that host reads it."""
+    runs: _Word = "runs"
+    """Folder there for rows that cannot be sent to the recorder."""
+
+
+class Hosts(ScenarioSection):
+    """The hosts of a run: processes without a table run on the host of the recorder."""
+
+    listen: str
+    """Address of this host at which the others reach it: ADDRESS or ADDRESS:PORT."""
+    plant: Host | None = None
+    """Where the plant runs."""
+    sensor: Host | None = None
+    """Where the sensor runs."""
+    netem: Host | None = None
+    """Where the network emulator runs."""
+    controller: Host | None = None
+    """Where the controller runs."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.by_role:
+            raise ValueError(f"no process is on another host; name one of {', '.join(LOOP_ROLES)}")
+        return self
+
+    @property
+    def by_role(self) -> Mapping[str, Host]:
+        """The hosts of the processes that do not run here."""
+        given = {role: getattr(self, role) for role in LOOP_ROLES}
+        return {role: host for role, host in given.items() if host is not None}
+
+
+def load_hosts(path: Path) -> Hosts:
+    """Read a file of hosts.
+
+    Raises:
+        CallerError: it is wrong, or no ssh client is installed.
+    """
+    hosts = toml_file.validated(Hosts, toml_file.read(path, Hosts), str(path))
+    if shutil.which("ssh") is None:
+        raise CallerError("--hosts: no ssh client is installed; install openssh-client")
+    return hosts
+
+
+class RemoteStart(NamedTuple):
+    """What is needed to start the processes on other hosts."""
+
+    hosts: Mapping[str, Host]
+    invitation: str
+    """The content of the invitation."""
+
+
+def start_over_ssh(role: str, host: Host, invitation: str, log: IO[str]) -> subprocess.Popen[str]:
+    """Start a process on another host, which ends by itself, with the run.
+
+    Raises:
+        OSError: ssh cannot be started.
+    """
+    remote = f"{host.command} {role} --invitation - --runs {shlex.quote(host.runs)}"
+    child = subprocess.Popen(
+        ["ssh", *_OPTIONS, "--", host.ssh, remote],
+        stdin=subprocess.PIPE, stdout=log, stderr=log, encoding="utf-8",
+        start_new_session=True,  # the launcher handles Ctrl-C
+    )  # fmt: skip
+    assert child.stdin is not None
+    with suppress(BrokenPipeError), child.stdin:
+        child.stdin.write(invitation)
+    return child
+
 
 _NOT_EXECUTABLE, _NOT_FOUND = 126, 127
 """Exit statuses of a shell."""
-
-Failure = tuple[ExitStatus, str]
-"""Exit status and reason."""
-
-Child = ForkedProcess | subprocess.Popen[str]
 
 
 class ChildProcesses:
@@ -184,3 +285,99 @@ def signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
+
+
+class _Failed(NamedTuple):
+    """A process that has failed and may be restarted."""
+
+    failure: Failure
+    until_s: float
+    """Reading of the monotonic clock until which the run waits for the restart."""
+
+
+class RestartPolicy:
+    """Follows the failures of a run's processes."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        coordinator: Coordinator,
+        children: ChildProcesses,
+        on_failure: Callable[[str, float, str | None], None],
+        on_restart: Callable[[str, float], None],
+    ) -> None:
+        self._scenario = scenario
+        self._coordinator = coordinator
+        self._children = children
+        self._on_failure = on_failure
+        self._on_restart = on_restart
+        self._failed: dict[str, _Failed] = {}
+
+    def check(self) -> Failure | None:
+        """Restart what may be restarted; return why the run must end, None if it need not."""
+        exited = self._children.failures(self._coordinator.reported_failure)
+        return self._check_restarts(exited) or self._check_failures(exited)
+
+    def unfinished(self) -> Failure | None:
+        """At the end of the run: a failure whose restart did not happen."""
+        for failed in self._failed.values():
+            status, why = failed.failure
+            return status, f"{why}; not restarted before the end"
+        return None
+
+    def _check_restarts(self, exited: dict[str, Failure]) -> Failure | None:
+        """Follow the processes that the run waits for."""
+        for role, ((status, why), until_s) in list(self._failed.items()):
+            if self._coordinator.running_generation(role) is not None:
+                del self._failed[role]
+                self._on_restart(role, self._t_s())
+            elif role in exited:
+                return exited[role][0], f"{why}; restarted, {exited[role][1]}"
+            elif time.monotonic() > until_s:
+                return status, f"{why}; not restarted within {self._restart_within_s(role):g} s"
+        return None
+
+    def _check_failures(self, exited: dict[str, Failure]) -> Failure | None:
+        """Restart, or wait for, each process that has failed since the last look."""
+        for role, (status, why) in self._failures(exited).items():
+            within_s = self._restart_within_s(role)
+            started = self._coordinator.epoch_ns is not None
+            if not started or self._is_past_horizon() or role == PLANT or not within_s:
+                return status, why
+            if self._children.has_reported(role):  # a restarted process would fail alike
+                return status, why
+            self._failed[role] = _Failed((status, why), time.monotonic() + within_s)
+            launched = role in self._children
+            self._coordinator.allow_restart(role, why, dead=self._children.is_dead(role))
+            self._on_failure(why, self._t_s(), None if launched else role)
+            if launched:
+                try:
+                    self._children.restart(role)
+                except MachineError as error:
+                    return status, f"{why}; {error}"
+        return None
+
+    def _failures(self, exited: dict[str, Failure]) -> dict[str, Failure]:
+        """Failures that are not being waited for, by role."""
+        running = self._children.running()
+        failures = {
+            role: (ExitStatus.FAILED, why)
+            for role, why in self._coordinator.failures().items()
+            # The exit status of a launched process explains more than its report.
+            if not (role in running and self._coordinator.is_exiting(role))
+        }
+        if self._is_past_horizon() and RECORDER in running:
+            failures.pop(RECORDER, None)  # sorting a long record, it may not respond
+        return {role: one for role, one in (failures | exited).items() if role not in self._failed}
+
+    def _is_past_horizon(self) -> bool:
+        return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns
+
+    def _t_s(self) -> float:
+        return self._coordinator.now_ns() * 1e-9
+
+    def _restart_within_s(self, role: str) -> float:
+        given_s = self._scenario.recovery.rejoin_within_s
+        if given_s is None:
+            return 0.0 if role in self._children else RESTART_BY_HAND_S
+        return given_s

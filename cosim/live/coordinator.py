@@ -1,42 +1,58 @@
-"""The coordinator of a run: admission, start barrier, liveliness, stop.
+"""The coordinator of a run: admission, start barrier, liveliness, stop, changes of settings.
 
 It keeps the life cycle (:mod:`noack.runtime.life_cycle`) of each process. A restarted process takes
-over the address of the one before it, and numbers its messages above all earlier ones.
+over the address of the one before it, and numbers its messages above all earlier ones. A requested
+change of runtime parameters is checked, given a time, and announced.
 """
 
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.live.change_requests import ChangeRequests
+from noack.config.parameter_changes import (
+    ChangeSchedule,
+    ParameterChange,
+    changed,
+    current_parameters,
+    scheduled,
+)
+from noack.config.scenario import loop_scenario
+from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
-from noack.core.python_process import cores
+from noack.core.process_limits import cores
+from noack.impairments.loss_prediction import found_probabilities
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
     AdmissionRequest,
+    ChangeRequest,
     JoinRequest,
     RunProgress,
     parse_message,
 )
-from noack.runtime.control_plane import ControlPlane
+from noack.runtime.control_plane import ControlPlane, header_of, next_payload
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
-from noack.runtime.zenoh_session import header_of, next_payload
 
-_START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
-"""From the last arrival to the common epoch: time for the message to reach all processes. The
-longer one is for processes on other hosts, and for a loaded machine."""
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
 _REPORT_GRACE_S = 0.3
 """A process's last message may arrive this much later than its exit is seen."""
 _EXIT_GRACE_S = 5.0
 """By then a process has exited that has reported its end."""
+_CHANGE_DELAY_S = 0.2
+"""Wall time from a change's announcement to its effect: processes look every 0.05 s."""
+_MILLISECOND_NS = 1_000_000
+
+
+_START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
+"""From the last arrival to the common epoch: time for the message to reach all processes. The
+longer one is for processes on other hosts, and for a loaded machine."""
 
 
 class AdmissionPass(NamedTuple):
@@ -374,3 +390,82 @@ def _sender(key_expr: object) -> tuple[str, str]:
 
 def _payload(query: zenoh.Query) -> bytes:
     return b"" if query.payload is None else query.payload.to_bytes()
+
+
+class ChangeRequests:
+    """The changes of a run."""
+
+    def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
+        self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
+        self._plane = plane
+        loops = ticket.scenario.loops or ()
+        self._schedule, *self._of_loops = (
+            ChangeSchedule(one)
+            for one in (ticket.scenario, *(loop_scenario(ticket.scenario, one) for one in loops))
+        )
+        self.announced: list[dict[str, Any]] = []
+        """Announcements of all changes so far."""
+        for change in scheduled(ticket.scenario):
+            self._add(change, 0, "in the scenario")
+
+    def answer(
+        self, request: bytes, clock: Callable[[], int], obstacle: str | None
+    ) -> dict[str, Any]:
+        """Announce the requested change, unless there is an obstacle; return the parameters.
+
+        Raises:
+            CallerError: the settings cannot be changed, or not now.
+            PeerError: the message is not a change request.
+        """
+        settings = parse_message(ChangeRequest, request).get("settings", {})
+        from_s, now_ns = None, clock()
+        if settings:
+            if obstacle is not None:
+                raise CallerError(obstacle)
+            if len(self.announced) >= MOST_CHANGES:
+                raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
+            # Before the time is chosen, as it may take long.
+            for one in (self._schedule, *self._of_loops):
+                changed(one.last, settings)
+            now_ns = clock()
+            delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
+            t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
+            if t_ns >= self._scenario.timing.horizon_ns:
+                raise CallerError(
+                    f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply"
+                )
+            change = ParameterChange(len(self.announced), t_ns, settings)
+            requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
+            self._plane.announce_change(self._add(change, now_ns, requested_at))
+            from_s = t_ns / NS_PER_S
+        return {
+            "name": self._scenario.name,
+            "run_dir": self._run_dir,
+            "t_s": now_ns / NS_PER_S,
+            "from_s": from_s,
+            "runtime_parameters": current_parameters(self._schedule.last),
+        }
+
+    def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:
+        """Check and store a change; return its announcement.
+
+        Raises:
+            CallerError: the change is not valid for this run.
+        """
+        for one in (self._schedule, *self._of_loops):
+            one.announce("", change, 0, 0, -1)
+        announcement = {
+            "number": change.number,
+            "t_ns": change.t_ns,
+            "settings": dict(change.settings),
+            "requested_ns": requested_ns,
+            "requested_at": requested_at,
+            "kept_losses": found_probabilities(
+                *(
+                    one.network.link
+                    for one in self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
+                )
+            ),
+        }
+        self.announced.append(announcement)
+        return announcement

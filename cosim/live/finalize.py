@@ -44,7 +44,7 @@ from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
-from noack.core.python_process import cores
+from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
 
 _FEW_LOOPS = 4

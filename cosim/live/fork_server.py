@@ -25,12 +25,11 @@ from pathlib import Path
 from typing import IO
 
 from noack.core.errors import MachineError
-from noack.core.process_limits import require_limits
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command, require_limits
 from noack.runtime.command_line import TICKET_ON_STDIN
 
 _COMMON = (
-    "noack.runtime.control_plane", "noack.runtime.invitation", "noack.config.scenario_file",
+    "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
     "noack.config.resolution", "noack.core.random_streams", "cosim.record.environment",
 )  # fmt: skip
 """What the processes and the launcher import."""
@@ -58,7 +57,6 @@ ENVIRONMENT = {
 _MALLOPT = {-8: 2, -3: 131_072, -1: 131_072}
 """The last three of them, as glibc's mallopt takes them: it reads the environment only once."""
 _PYTHONS_GC_THRESHOLDS = (700, 10, 10)
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MOST_BYTES = 65_536
 _START_TIMEOUT_S = 120.0
 _PR_SET_CHILD_SUBREAPER = 36
@@ -118,8 +116,8 @@ class ForkServer:
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
             on_error.callback(self._socket.close)
-            self._process = self._forked(its) if of_itself else None
-            self._process = self._process or subprocess.Popen(
+            forked = self._forked(its) if of_itself else None
+            self._process = forked or subprocess.Popen(
                 python_command("-m", "cosim.live.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
                 stdin=subprocess.DEVNULL,
@@ -135,6 +133,7 @@ class ForkServer:
         That is one thread, and UTF-8 for files and streams.
         """
         _import(_COMMON)
+        _build_scenario()
         threads = len([*Path("/proc/self/task").iterdir()])
         if threads > 1 or sys.getfilesystemencoding() != "utf-8":
             return None
@@ -143,10 +142,11 @@ class ForkServer:
         self._socket.close()
         os.setsid()  # the launcher handles Ctrl-C
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        usual = (signal.default_int_handler, signal.SIG_DFL, signal.SIG_DFL)
-        for number, handler in zip(_ENDING, usual, strict=True):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, handler)
+                signal.signal(number, signal.SIG_DFL)
+                if number is signal.SIGINT:
+                    signal.signal(number, signal.default_int_handler)
         os.environ.update(ENVIRONMENT)
         with suppress(AttributeError):  # another C library
             for parameter, value in _MALLOPT.items():
@@ -259,15 +259,26 @@ def _fork_twice() -> int:
     return pid
 
 
+def _build_scenario() -> None:
+    """Build the validators of a scenario, which the launcher needs, too."""
+    from noack.config.scenario import Scenario
+
+    Scenario.model_rebuild()
+
+
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
     from noack.config.scenario_checks import prepare_changes
     from noack.impairments.kinds.loss import LossOf
     from noack.impairments.link_settings import LinkSettings
+    from noack.runtime.control_messages import ControlMessage
     from noack.runtime.join_ticket import Ticket
 
+    _build_scenario()
     for section in (Ticket, LinkSettings, LossOf):
         section.model_rebuild()
+    for message in ControlMessage.__subclasses__():
+        message.model_rebuild()
     prepare_changes()
 
 

@@ -1,7 +1,8 @@
 """The launcher: starts the processes of a run, follows them, and ends the run.
 
 When a process fails, the launcher names it, stops the run or restarts the process, and leaves a run
-directory with everything that was recorded.
+directory with everything that was recorded. Read :func:`launch` first; ``_Run.watch`` follows the
+run. :class:`WaitLimit` limits how long the launcher waits, longer on a loaded machine.
 """
 
 import contextlib
@@ -11,21 +12,18 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from cosim.live.child_processes import ChildProcesses, Failure
+from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
-from cosim.live.disk_space import require_disk_space
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.live.remote_hosts import RemoteStart
-from cosim.live.restart_policy import RestartPolicy
-from cosim.live.wait_limit import DEFAULT_S, WaitLimit
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
+    LEAST_FREE_BYTES,
     PROCESSES_FILE,
     active_run,
     new_run_dir,
@@ -33,24 +31,41 @@ from cosim.record.run_directory import (
     write_scenario,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import resolve_run, resolved_loops
+from noack.config.resolution import resolve_run, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
+from noack.protocol.record_tables import (
+    CONTROLLER_STEP,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
+from noack.runtime.command_line import Signals, log_event, stop_reason
 from noack.runtime.control_plane import run_name
-from noack.runtime.invitation import invitation_file
-from noack.runtime.join_ticket import Ticket, new_ticket, published
+from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
-from noack.runtime.signals import Signals, stop_reason
 
 if TYPE_CHECKING:
     from cosim.live.remote_access import Listening
 
-_POLL_S, _STARTING_POLL_S = 0.01, 0.002
 _STOP_TIMEOUT_S = 15.0
+DEFAULT_S = 30.0
+_MOST_SLOWED = 20.0
+_OVERLOADED = 1.5
+"""From this slow-down on, the message names the load as the likely cause."""
+_SOURCE = "noack"
+_EVERY_S = 1.0
+_UNTIL_THE_END = 3
+"""At the end of a run, spool, record and view exist together, each of about the same size."""
+
+
+_POLL_S, _STARTING_POLL_S = 0.01, 0.002
+
+
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
 
@@ -336,3 +351,143 @@ def _signalled(signals: Signals) -> Failure | None:
 def overtime_s(run_s: float) -> float:
     """How long the processes of a run of ``run_s`` of wall time may take to end after it."""
     return run_s * _OVERTIME_SHARE + _OVERTIME_S
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+@dataclass
+class WaitLimit:
+    """The time that the processes of a run have to get ready, or to end.
+
+    When the system load (one-minute average) is k > 1 times the number of cores, a process gets 1/k
+    of a core, and a second of waiting counts as 1/k s, but at least as 1/20 s.
+    """
+
+    within_s: float
+    cores: int = field(default_factory=_cores)
+    waited_s: float = 0.0
+    """Waited wall time, in seconds."""
+    counted_s: float = 0.0
+    """The part of it that counts."""
+    load: float = 0.0
+    """The newest load."""
+
+    def wait(self, wall_s: float, load: float) -> None:
+        """Count wall time under a system load."""
+        self.load = load
+        self.waited_s += wall_s
+        self.counted_s += wall_s / min(max(load / self.cores, 1.0), _MOST_SLOWED)
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the limit is reached."""
+        return self.counted_s > self.within_s
+
+    @property
+    def load_text(self) -> str:
+        """The newest load, for messages."""
+        return f"a load of {self.load:.1f} on {self.cores} cores"
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether the load extended the limit, so that it is the likely cause."""
+        return self.waited_s > _OVERLOADED * self.counted_s
+
+    def explain_start(self) -> str:
+        """Why processes were not ready within the limit, and what would help."""
+        waited = f"not ready in time: waited {self.waited_s:.0f} s"
+        if self.is_loaded:
+            return (
+                f"{waited}; likely cause: {self.load_text}; start fewer runs at once, or set "
+                f"start_within_s above {self.within_s:g}"
+            )
+        return f"{waited} (start_within_s); {self.load_text} is not the likely cause"
+
+    def explain_end(self) -> str:
+        """Why a run did not end within the limit after its horizon, and what would help."""
+        if self.is_loaded:
+            return f"likely cause: {self.load_text}; start fewer runs at once"
+        return "too slow or stopped; reduce the speed or the rates"
+
+
+class RunLog:
+    """Logs the start of a run, and its progress once a second of wall time."""
+
+    def __init__(self) -> None:
+        self._due_s = 0.0
+
+    def watcher(self) -> Watcher:
+        """Return the callbacks of the launcher."""
+        return Watcher(started=self._started, progress=self._progress)
+
+    def _started(self, run_dir: Path) -> None:
+        log_event(
+            "info", _SOURCE, f"run {run_dir} is prepared", event="run", directory=str(run_dir)
+        )
+
+    def _progress(self, report: dict[str, Any]) -> None:
+        if time.monotonic() < self._due_s:
+            return
+        self._due_s = time.monotonic() + _EVERY_S
+        names = ("t_s", "events", "deliveries", "longest_loss_burst", "x_norm")
+        message = f"simulated {report['t_s']:.1f} s"
+        fields = {name: report[name] for name in names}
+        log_event("info", _SOURCE, message, event="progress", **fields)
+
+
+def log_end(status: int, reason: str, run_dir: Path) -> None:
+    """Log how a run ended."""
+    log_event(
+        "info" if status == 0 else "error", _SOURCE, f"ended: {reason}",
+        event="end", status=status, reason=reason, directory=str(run_dir),
+    )  # fmt: skip
+
+
+def spool_bytes(resolved: Scenario) -> int:
+    """Bytes of the rows on fixed time grids; the number of event rows is not known in advance."""
+    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
+    ticks = resolved.timing.horizon_ns // resolved.timing.controller_period_ns
+    counts = {
+        PLANT_STEP: steps,
+        SENSOR_MEASUREMENT: steps // resolved.plant.measure_every,
+        CONTROLLER_STEP: ticks,
+        PLANT_ACTUATION: ticks,
+    }
+    types = tables_of(resolved)
+    return sum(rows * types[table].itemsize for table, rows in counts.items())
+
+
+def needed_bytes(resolved: Scenario) -> int:
+    """Bytes on the disk until the run has ended."""
+    return _UNTIL_THE_END * spool_bytes(resolved)
+
+
+def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
+    """Check that a run's record fits on the disk; warn if it may not.
+
+    Raises:
+        MachineError: the record needs more than the free space.
+    """
+    folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
+    if folder is None:
+        return
+    free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
+    if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
+        return
+    text = (
+        f"{runs}: this run records {_size(spool)} and needs {_size(_UNTIL_THE_END * spool)} until "
+        f"its end; {_size(free)} are free on the disk"
+    )
+    if free < spool:
+        raise MachineError(f"{text}; reduce horizon_s, or choose another disk with --runs")
+    print(f"noack: warning: {text}", file=sys.stderr)
+
+
+def _size(count: int) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB"):
+        if count < 1024 or unit == "PiB":
+            break
+        count //= 1024
+    return f"{count} {unit}"

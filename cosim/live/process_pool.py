@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 _ENVIRONMENT = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 ) | {"PYTHONSAFEPATH": "1"}
-"""One thread each, and no imports from the current folder (:mod:`noack.core.python_process`)."""
+"""One thread each, and no imports from the current folder (:mod:`noack.core.process_limits`)."""
 
 _ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 

@@ -1,36 +1,47 @@
-"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time."""
+"""Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time.
+
+An authority signs one certificate for the coordinator and one for all that join; its own key is
+forgotten. Each end accepts only the other one's certificate.
+"""
 
 import asyncio
 import datetime
 import ipaddress
 import socket
+import ssl
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
 from types import MappingProxyType
 from typing import NamedTuple
 
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
-from cosim.live.remote_hosts import Host, load_hosts
 from noack.config.run_sections import ClocksSection
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, PeerError, why
-from noack.protocol.invitation_proof import InvitationProof
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connection_forwarder import Protection, forwarding
-from noack.runtime.control_plane import RUNS, run_name
-from noack.runtime.invitation import own_host
-from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass
+from noack.runtime.control_plane import RUNS, run_name, socket_path
+from noack.runtime.coordinator_link import InvitationProof, Protection, forwarding, tls_context
+from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
 from noack.runtime.time_exchange import TimeReference, answering
-from noack.runtime.zenoh_session import socket_path
 
 _BACKLOG = 4096
 _FLOOD_PER_S = 100
 """Connections without an invitation that are a flood."""
+_VALID = datetime.timedelta(days=3650)
+"""A run may be long, and the hosts' dates may differ; an invitation ends by its pass."""
+
+
 _CALM_S, _MOST_CALM_S = 3, 60
 """Seconds without so many, after which it is over."""
 
@@ -120,8 +131,6 @@ def open_to_hosts(
     Raises:
         CallerError: the address cannot be used.
     """
-    from cosim.live.tls_keys import coordinator_context, new_tls_keys
-
     keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(ticket.run_id))
     with ExitStack() as stack:
         endpoint = stack.enter_context(_listen(listening.address))
@@ -184,3 +193,87 @@ class ConnectionFloodWatch:
                     f"the flood is over: {self._ended} connections without an invitation ended"
                 )
                 self._ended, self._needed = 0, min(2 * self._needed, _MOST_CALM_S)
+
+
+class KeyPair(NamedTuple):
+    """A certificate and its private key, as PEM text."""
+
+    certificate: str
+    private_key: str
+
+
+class TlsKeys(NamedTuple):
+    """The keys of one run."""
+
+    authority: str  # its certificate
+    coordinator: KeyPair
+    joining: KeyPair
+
+
+def new_tls_keys(host: str) -> TlsKeys:
+    """Return keys for a coordinator at a numeric address."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name("noack run")
+    authority = (
+        _builder(name, name, key.public_key())
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    addresses = [x509.IPAddress(ipaddress.ip_address(host))]
+    joining = [x509.DNSName("joining")]
+    return TlsKeys(
+        _pem(authority),
+        _signed("coordinator", addresses, ExtendedKeyUsageOID.SERVER_AUTH, name, key),
+        _signed("joining", joining, ExtendedKeyUsageOID.CLIENT_AUTH, name, key),
+    )
+
+
+def _signed(
+    who: str,
+    subjects: Sequence[x509.GeneralName],
+    usage: x509.ObjectIdentifier,
+    issuer: x509.Name,
+    authority: ec.EllipticCurvePrivateKey,
+) -> KeyPair:
+    key = ec.generate_private_key(ec.SECP256R1())
+    certificate = (
+        _builder(_name(who), issuer, key.public_key())
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName(subjects), critical=False)
+        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        .sign(authority, hashes.SHA256())
+    )
+    private = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    return KeyPair(_pem(certificate), private.decode())
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _VALID)
+        .not_valid_after(now + _VALID)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _pem(certificate: x509.Certificate) -> str:
+    return certificate.public_bytes(serialization.Encoding.PEM).decode()
+
+
+def coordinator_context(keys: TlsKeys) -> ssl.SSLContext:
+    """Return the TLS settings of the coordinator's end."""
+    return tls_context(keys.authority, *keys.coordinator, server=True)

@@ -15,7 +15,7 @@ import numpy as np
 from cosim.analysis.replay import replay
 from cosim.live.fork_server import ENVIRONMENT
 from cosim.record.run_record import RunRecord, load_record
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 from noack.protocol.record_tables import PLANT_STEP
 
 _LEAST_STEPS = 50_000

@@ -16,8 +16,15 @@ from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.log_lines import NOTICES, lines_in, notice_number, notices_of
-from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
+from noack.runtime.spool import (
+    NOTICES,
+    SPOOL,
+    SpoolWriter,
+    lines_in,
+    notice_number,
+    notices_of,
+    read_chunks,
+)
 from noack.runtime.telemetry import ReceivedRows
 
 

@@ -10,7 +10,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.core.row_display import Rows, as_html, as_text
+from noack.core.number_format import Rows, as_html, as_text
 from noack.impairments.markov_chain import NotPredictableError
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.certificates.assumptions import assumptions

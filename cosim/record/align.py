@@ -23,8 +23,7 @@ from cosim.record.recorded_changes import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
-from noack.core.linear_systems import row_norms
-from noack.core.model_flow import ModelFlow
+from noack.core.linear_systems import ModelFlow, row_norms
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

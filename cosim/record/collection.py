@@ -33,7 +33,6 @@ from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import ProcessReport, parse_message
-from noack.runtime.log_lines import notices_of
 from noack.runtime.spool import (
     KEPT_KEY,
     KEPT_REPORT,
@@ -42,6 +41,7 @@ from noack.runtime.spool import (
     SpoolWriter,
     chunks_of,
     kept_run_name,
+    notices_of,
     writer_of,
 )
 

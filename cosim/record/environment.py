@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
 from noack.core.file_access import write_whole
-from noack.core.python_process import cores
+from noack.core.process_limits import cores
 
 Kind = Literal["live", "simulated"]
 """Whether a run used processes (live) or virtual time (simulated)."""

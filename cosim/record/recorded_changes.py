@@ -12,7 +12,7 @@ from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.model_flow import ModelFlow
+from noack.core.linear_systems import ModelFlow
 from noack.protocol.record_tables import CONTROLLER_SETTING, OWNER, SETTINGS
 from noack.protocol.topology import CHANGEABLE
 

@@ -26,8 +26,7 @@ from noack.core.file_access import remove_folder
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.log_lines import stored_lines
-from noack.runtime.spool import SPOOL, spool_files
+from noack.runtime.spool import SPOOL, spool_files, stored_lines
 
 _BLOCK_BYTES = 64 * 1024 * 1024
 """Rows of several loops that are sorted at once."""

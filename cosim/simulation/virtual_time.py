@@ -20,11 +20,10 @@ from noack.config.resolution import has_loop, network_tables, resolve, shape_of,
 from noack.config.scenario import Scenario, loops_of, phases_ns
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
-from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
 from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER
-from noack.protocol.wire_format import Flow, Rejection
+from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of

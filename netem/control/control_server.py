@@ -1,7 +1,7 @@
 """Live control of a running emulator: its file, by which commands find it, and its queries.
 
-While an emulator runs, its file is in the user's runtime directory (:mod:`noack.runtime.lock_file`)
-beside the Unix socket on which it listens, which only its user can reach. Below ``netem/NAME`` it
+While an emulator runs, its file is in the user's runtime directory
+(:mod:`noack.runtime.private_folder`), beside the Unix socket on which it listens, which only its user can reach. Below ``netem/NAME`` it
 answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
 docs/netem-control.md describes, in a thread of its own. A query with a mistake is answered with one
 line, and changes nothing.
@@ -26,9 +26,9 @@ from noack.config.toml_file import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_kept_loss
-from noack.runtime import lock_file
+from noack.runtime import private_folder
+from noack.runtime.control_plane import cause_of, open_session
 from noack.runtime.private_folder import require_name
-from noack.runtime.zenoh_session import cause_of, open_session
 
 EMULATORS = "netem"
 """The folder of the files."""
@@ -44,7 +44,7 @@ def _locked(kind: str, name: str) -> Iterator[Path]:
     require_name(name, "emulator")
     with ExitStack() as stack:
         try:
-            path = stack.enter_context(lock_file.lock_file(kind, name, {}))
+            path = stack.enter_context(private_folder.lock_file(kind, name, {}))
         except FileExistsError:
             raise _in_use(name) from None
         yield path
@@ -92,7 +92,7 @@ def find(name: str | None) -> str:
         PeerError: it is still starting.
     """
     files = _files()
-    begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
+    begun = [file.path.stem for file in private_folder.live_lock_files(_STARTING)]
     if name not in files and (name in begun or (name is None and begun and not files)):
         raise PeerError(
             f"emulator {name or begun[0]!r} is starting; "
@@ -111,8 +111,8 @@ def find(name: str | None) -> str:
     return name
 
 
-def _files() -> dict[str, lock_file.LockFile]:
-    return {file.path.stem: file for file in lock_file.live_lock_files(EMULATORS)}
+def _files() -> dict[str, private_folder.LockFile]:
+    return {file.path.stem: file for file in private_folder.live_lock_files(EMULATORS)}
 
 
 _PUBLISH_S = 1.0

@@ -25,9 +25,8 @@ from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
-from noack.runtime.command_line import Parser, failed
-from noack.runtime.signals import Signals
-from noack.runtime.zenoh_session import answer_to, cause_of, open_session
+from noack.runtime.command_line import Parser, Signals, failed
+from noack.runtime.control_plane import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
 _SILENCE_S = 3.0

@@ -14,7 +14,10 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ValidationError, create_model, model_validator
 
-from noack.config.run_sections import MOST_LOOPS, LoopSection
+from noack.config.run_sections import (
+    MOST_LOOPS,
+    LoopSection,
+)
 from noack.config.scenario_checks import check_changes, check_sections
 from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain

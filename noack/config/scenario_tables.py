@@ -31,9 +31,9 @@ from noack.config.sections import (
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.row_display import as_html, as_text
+from noack.core.number_format import as_html, as_text
 from noack.plants.linear import LinearSettings
-from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
+from noack.protocol.topology import PROTOCOLS, LoopProtocol
 from noack.protocol.wire_format import Flow
 from noack.settings.section import ScenarioSection, period_ns
 from noack.trigger.decaying import DecayingSettings

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from noack.core.core_library import core, ffi
-from noack.core.linear_systems import Matrix, Vector
-from noack.core.matrix_exponential import SCRATCH_MATRICES
+from noack.core.linear_systems import SCRATCH_MATRICES, Matrix, Vector
 
 _MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
 

@@ -1,18 +1,26 @@
-"""Linear time-invariant systems: exact propagation, exact zero-order hold, norms.
+"""Linear time-invariant systems: exact propagation, exact zero-order hold, norms, exponentials.
 
 Time steps are integer nanoseconds; matrices are per second. The same step always gives the same
-matrix, bit for bit, whether it was cached or not, and on every processor.
+matrix, bit for bit, whether it was cached or not, and on every processor. A library's matrix
+exponential depends on the processor, by the BLAS below it: two hosts of one run, or a run and its
+replay on another machine, would then differ in the last bits of every state. So the core's is used
+(native/loop/exponential.c).
+
+Lyapunov equations are solved in numpy, since importing scipy.linalg takes 0.2 s. They are for
+bounds, which are enlarged by more than the rounding.
 """
 
+from bisect import bisect_right
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, ffi
-from noack.core.matrix_exponential import exponential
+from noack.core.core_library import core, ffi, pointer_to
 
+SCRATCH_MATRICES = 10
+"""Matrices of its size that the core needs for scratch."""
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
@@ -22,6 +30,18 @@ MatrixKey = tuple[tuple[int, ...], bytes]
 _CACHED_STEPS = 4096
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
+_MOST_STATES = 12
+"""The linear equations of a Lyapunov equation grow with the fourth power of the states."""
+
+
+def exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return e^M, (n, n). An entry that overflows is infinite or not a number."""
+    given = np.ascontiguousarray(matrix, np.float64)
+    result, scratch = np.empty_like(given), np.empty((SCRATCH_MATRICES, *given.shape))
+    if len(given):
+        pointers = (pointer_to(array, "double *") for array in (given, result, scratch))
+        core.noack_exponential(len(given), *pointers)
+    return result
 
 
 def matrix_key(matrix: Matrix) -> MatrixKey:
@@ -132,3 +152,63 @@ def spectral_abscissa(matrix: Matrix) -> float:
 
 def _reals(values: Matrix | Vector) -> Any:
     return ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))
+
+
+class ModelFlow:
+    """Propagates the state of the model with the closed-loop matrix H, (n, n), per second.
+
+    ``setpoint`` is the initial x_r, (n,); None is 0.
+    """
+
+    def __init__(self, H: Matrix, setpoint: Vector | None = None) -> None:
+        self.propagate = Propagator(H)
+        self._since_ns: list[int] = []
+        self._setpoints = [setpoint]
+        self.moved = setpoint is not None
+        """Whether any set-point differs from 0."""
+
+    def change(self, since_ns: int, setpoint: Vector | None) -> None:
+        """Change the set-point from ``since_ns`` on; times must not decrease."""
+        if not _same(self._setpoints[-1], setpoint):
+            self._since_ns.append(since_ns)
+            self._setpoints.append(setpoint)
+            self.moved = True
+
+    def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
+        """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
+        if not self.moved:
+            return self.propagate(x, to_ns - from_ns)
+        place = bisect_right(self._since_ns, from_ns)
+        while place < len(self._since_ns) and self._since_ns[place] < to_ns:
+            x = self._about(self._setpoints[place], x, self._since_ns[place] - from_ns)
+            from_ns = self._since_ns[place]
+            place += 1
+        return self._about(self._setpoints[place], x, to_ns - from_ns)
+
+    def _about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
+        if setpoint is None or dt_ns == 0:
+            return self.propagate(x, dt_ns)
+        moved: Vector = setpoint + self.propagate(x - setpoint, dt_ns)
+        return moved
+
+
+def _same(one: Vector | None, other: Vector | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return bool(np.array_equal(one, other))
+
+
+def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
+    """Return X with M X + X Mᵀ = Q, (n, n).
+
+    Raises:
+        numpy.linalg.LinAlgError: there is no unique solution.
+    """
+    n = len(M)
+    if n > _MOST_STATES:
+        from scipy.linalg import solve_continuous_lyapunov
+
+        return np.asarray(solve_continuous_lyapunov(M, Q))
+    one = np.eye(n)
+    equations = np.kron(M, one) + np.kron(one, M)
+    return np.asarray(np.linalg.solve(equations, Q.ravel()).reshape(n, n))

@@ -1,16 +1,25 @@
-"""Formats numbers for tables and messages: with units, significant digits, and intervals."""
+"""Formats numbers for tables and messages, and rows of texts for a terminal and a notebook.
 
+Numbers have units, significant digits, and intervals.
+"""
+
+import html
 import math
+import unicodedata
+from collections.abc import Sequence
 from decimal import Decimal
 
 NONE = "-"
 """Text for a missing number."""
-
 _DIGITS = 2  # significant digits of the half-width
 _ALONE = 4
 """Significant digits of a mean without an interval, or with an interval in exponent notation."""
 _FIXED = range(-5, 7)  # powers of ten that are written without exponent notation
 _SIZES = (1e9, 1e6, 1e3)
+Rows = Sequence[Sequence[str]]
+"""The first entry of a row is its name."""
+_CELL = 'style="text-align: left; vertical-align: top; line-height: 1.4"'
+"""At the cells, since the style sheets of notebooks align the text of each cell."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -77,3 +86,31 @@ def _rounded(number: float, last: int) -> str:
     """Round to a multiple of 10^last; this is the last written digit."""
     rounded = Decimal(repr(number)).quantize(Decimal(1).scaleb(last)) + 0  # no −0
     return f"{rounded:.{max(-last, 0)}f}"
+
+
+def as_text(rows: Rows) -> str:
+    """Return rows as aligned columns."""
+    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
+    lines = (
+        "  ".join(
+            entry + " " * (width - _width(entry)) for entry, width in zip(row, widths, strict=True)
+        )
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def as_html(rows: Rows) -> str:
+    """Return rows as an HTML table."""
+    body = "".join(
+        f'<tr><th scope="row" {_CELL}>{html.escape(name)}</th>'
+        + "".join(f"<td {_CELL}>{html.escape(entry)}</td>" for entry in entries)
+        + "</tr>"
+        for name, *entries in rows
+    )
+    return f"<table>{body}</table>"
+
+
+def _width(text: str) -> int:
+    """Return the width of a text in columns; a combining character, as in δ̲, has width 0."""
+    return sum(not unicodedata.combining(one) for one in text)

@@ -1,7 +1,12 @@
-"""Limits of the system on a process (``ulimit``): what a run needs, errors of who reached one."""
+"""Processes of the system: limits on them (``ulimit``), cores, and how Python children start.
+
+A child imports nothing from the current folder.
+"""
 
 import errno
+import os
 import resource
+import sys
 
 from noack.core.errors import MachineError, one_line
 
@@ -59,3 +64,17 @@ def _is_less(limit: int, needed: int) -> bool:
 
 def _gb(size_bytes: int) -> str:
     return f"{size_bytes / 1e9:.2g} GB"
+
+
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def python_command(*arguments: object) -> list[str]:
+    """Return the command that runs this Python interpreter with the given arguments.
+
+    With ``-P`` the interpreter does not import from the current folder, which may be writable for
+    other users.
+    """
+    return [sys.executable, "-P", *map(str, arguments)]

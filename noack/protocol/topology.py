@@ -5,24 +5,11 @@ actuations, may cross it, too (:mod:`noack.config.sections`).
 """
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from noack.protocol.wire_format import Flow
 
-
-class Ends(NamedTuple):
-    """The first sender of a flow and its last receiver."""
-
-    sender: str
-    receiver: str
-
-
-ENDS: Mapping[Flow, Ends] = {
-    Flow.MEASUREMENT: Ends("plant", "sensor"),
-    Flow.UPDATE: Ends("sensor", "controller"),
-    Flow.ACTUATION: Ends("controller", "plant"),
-    Flow.ACKNOWLEDGEMENT: Ends("controller", "sensor"),
-}
 RECEIVES: Mapping[str, Flow] = {
     "plant": Flow.ACTUATION,
     "sensor": Flow.MEASUREMENT,
@@ -39,6 +26,28 @@ SENDS: Mapping[str, Flow] = {
 """The flow that each process sends in every run."""
 PAPER = (Flow.UPDATE,)
 """What crosses the network in the paper's loop."""
+LOOP_ROLES = tuple(RECEIVES)
+PLANT = "plant"
+WITH_DEADLINES = ("plant", "controller")  # processes that act at nominal times
+CHANGEABLE = ("sensor", "netem", "controller")  # processes with runtime parameters
+RECORDER = "recorder"
+COORDINATOR = "coordinator"
+ROLES = (*LOOP_ROLES, RECORDER)
+
+
+class Ends(NamedTuple):
+    """The first sender of a flow and its last receiver."""
+
+    sender: str
+    receiver: str
+
+
+ENDS: Mapping[Flow, Ends] = {
+    Flow.MEASUREMENT: Ends("plant", "sensor"),
+    Flow.UPDATE: Ends("sensor", "controller"),
+    Flow.ACTUATION: Ends("controller", "plant"),
+    Flow.ACKNOWLEDGEMENT: Ends("controller", "sensor"),
+}
 
 
 def receiver_of(role: str, flow: Flow, network: Collection[Flow] = PAPER) -> str:
@@ -51,10 +60,40 @@ def sender_to(role: str, flow: Flow, network: Collection[Flow] = PAPER) -> str:
     return "netem" if flow in network and role != "netem" else ENDS[flow].sender
 
 
-LOOP_ROLES = tuple(RECEIVES)
-PLANT = "plant"
-WITH_DEADLINES = ("plant", "controller")  # processes that act at nominal times
-CHANGEABLE = ("sensor", "netem", "controller")  # processes with runtime parameters
-RECORDER = "recorder"
-COORDINATOR = "coordinator"
-ROLES = (*LOOP_ROLES, RECORDER)
+@dataclass(frozen=True)
+class LoopProtocol:
+    """A protocol of the loop."""
+
+    acknowledges: bool
+    """Whether updates are acknowledged, and x_s is reset by acknowledgements only.
+
+    Then the paper's theorems do not apply, and settings cannot change during a run.
+    """
+    states_caption: str
+    """When x_s and x_c jump, for readers; ``{known}`` is the state that they jump to."""
+    error_caption: str  # when the sensor's error is reset, for readers
+    summary: str  # one sentence for readers
+    reset: str  # when x_s is reset, for readers
+
+
+PROTOCOLS: Mapping[str, LoopProtocol] = {
+    "none": LoopProtocol(
+        acknowledges=False,
+        states_caption="At every event x_s jumps to {known}; x_c does so only when the update "
+        "arrives. ",
+        error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset when it exceeds the "
+        "threshold. The controller's error ‖e_c‖ = ‖x_c − x‖ may exceed the threshold while "
+        "packets are lost; no process of the loop can measure it.",
+        summary="Nothing is acknowledged.",
+        reset="at every event",
+    ),
+    "ack": LoopProtocol(
+        acknowledges=True,
+        states_caption="x_c jumps to {known} when an update arrives, x_s when its acknowledgement "
+        "arrives. ",
+        error_caption="The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; without "
+        "one, the sensor transmits repeatedly. The controller's error is ‖e_c‖ = ‖x_c − x‖.",
+        summary="**Updates are acknowledged.**",
+        reset="when an update is acknowledged",
+    ),
+}

@@ -1,16 +1,137 @@
-"""Errors of noack's command lines, as text and as JSON."""
+"""What all programs of noack share: errors as text and JSON, JSON Lines on standard error, signals.
+
+As JSON Lines, for log collectors, each line of text is an object with ``time`` (UTC), ``level``
+(info, warning, error), ``source`` (the program, e.g. ``noack netem``) and ``message``. An event has
+also its name, ``event``, and its numbers.
+
+A signal that ends a program is a flag that loops poll, an error elsewhere, an exit in the imports.
+In the loop of a process no write may be interrupted. A command is interrupted by an error, so that
+it cleans up. During the imports an error would be printed from within them, or caught there.
+"""
 
 import argparse
+import io
 import json
+import os
+import re
+import signal
 import sys
-from contextlib import suppress
-from typing import NoReturn
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from enum import StrEnum
+from types import FrameType
+from typing import Any, NoReturn, TextIO
 
-from noack.core.errors import CallerError, ExitStatus
-from noack.runtime.json_log import log_event
+from noack.core.errors import CallerError, ExitStatus, printable
 
+_LINE = re.compile(r"(?P<source>noack(?: [a-z]+)?): (?P<warning>warning: )?(?P<message>.*)")
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 """Environment variable of a launched process: its first line of input is its ticket."""
+_ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
+_ENDING = {
+    signal.SIGINT.value: ExitStatus.INTERRUPTED,
+    signal.SIGTERM.value: ExitStatus.TERMINATED,
+    signal.SIGHUP.value: ExitStatus.TERMINATED,
+}
+_REASONS = {
+    signal.SIGINT.value: "stopped by the user",
+    signal.SIGTERM.value: "stopped on request",
+    signal.SIGHUP.value: "stopped because the terminal was closed",
+}
+
+
+class LogFormat(StrEnum):
+    """Formats of the log on standard error."""
+
+    TEXT = "text"
+    JSONL = "jsonl"
+
+
+class JsonLog(io.TextIOBase):
+    """A text stream that writes a JSON object for each line to another stream.
+
+    Raises:
+        OSError: the other stream cannot be written.
+    """
+
+    encoding = "utf-8"
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._unfinished = threading.local()
+        self._lock = threading.Lock()
+
+    def write(self, text: str, /) -> int:
+        """Write text; a line is written when it is complete."""
+        *lines, rest = (getattr(self._unfinished, "text", "") + text).split("\n")
+        self._unfinished.text = rest
+        for line in lines:
+            if line.strip():
+                self._log_line(_COLOURS.sub("", line).strip())
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the other stream."""
+        self._stream.flush()
+
+    def fileno(self) -> int:
+        """Return the descriptor of the other stream."""
+        return self._stream.fileno()
+
+    def writable(self) -> bool:
+        """Return whether the stream can be written."""
+        return True
+
+    def log(self, level: str, source: str, message: str, **fields: Any) -> None:
+        """Write an object; a number that is not finite becomes null."""
+        from pydantic_core import to_json
+
+        now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        content = {"time": now, "level": level, "source": source, "message": printable(message)}
+        line = to_json(content | fields, inf_nan_mode="null", fallback=str).decode()
+        with self._lock:
+            self._stream.write(line + "\n")
+            self._stream.flush()
+
+    def _log_line(self, line: str) -> None:
+        found = _LINE.fullmatch(line)
+        if found is None:
+            self.log("info", "noack", line)
+        else:
+            self.log("warning" if found["warning"] else "info", found["source"], found["message"])
+
+
+@contextmanager
+def log_format(wanted: LogFormat) -> Iterator[None]:
+    """Write standard error in a format within the context."""
+    before = sys.stderr
+    if wanted is LogFormat.TEXT or before is None or isinstance(before, JsonLog):
+        yield
+        return
+    sys.stderr = JsonLog(before)
+    try:
+        yield
+    finally:
+        sys.stderr = before
+
+
+def log_event(level: str, source: str, message: str, **fields: Any) -> bool:
+    """Write an event if standard error is JSON Lines; return whether it is.
+
+    A full disk or a closed pipe is ignored.
+    """
+    stream = sys.stderr
+    if not isinstance(stream, JsonLog):
+        return False
+    try:
+        stream.log(level, source, message, **fields)
+    except (OSError, ValueError):
+        return True
+    return True
 
 
 class Parser(argparse.ArgumentParser):
@@ -43,3 +164,98 @@ def print_to_stderr(line: str) -> None:
     if sys.stderr is not None:
         with suppress(OSError, ValueError):  # full or broken pipe; closed
             print(line, file=sys.stderr, flush=True)
+
+
+class Signals:
+    """Turns signals into a flag; a loop ends when it polls the flag."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._received_ns = 0
+
+    @contextmanager
+    def handled(self) -> Iterator["Signals"]:
+        """Handle the signals while the context lasts; under nohup, SIGHUP stays ignored."""
+        handled = set(_ENDING)
+        if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+            handled.remove(signal.SIGHUP)
+        before = {number: signal.signal(number, self._note) for number in handled}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        now_ns = time.monotonic_ns()
+        if self.received is None:
+            self.received, self._received_ns = number, now_ns
+        elif now_ns - self._received_ns > _ECHO_NS:  # a second request: end at once
+            raise SystemExit(self.status)
+
+    @property
+    def status(self) -> ExitStatus:
+        """Exit status for the received signal, or OK."""
+        return _ENDING.get(self.received or 0, ExitStatus.OK)
+
+
+def stop_reason(number: int) -> str:
+    """Return why a program stops after a signal, with the signal's name."""
+    return f"{_REASONS[number]} ({signal.Signals(number).name})"
+
+
+class StopRequestError(KeyboardInterrupt):
+    """A signal asks the program to stop: what cleans up after Ctrl-C does so after each of them."""
+
+    def __init__(self, number: int = signal.SIGINT) -> None:
+        super().__init__(stop_reason(number))
+        self.exit_status = _ENDING[number]
+
+
+@contextmanager
+def stop_requests_raised() -> Iterator[None]:
+    """Raise StopRequestError on SIGINT, SIGTERM and SIGHUP while the context lasts.
+
+    Ignored signals stay ignored, and a handler that another program has set is not replaced.
+    """
+    came_ns: int | None = None
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        nonlocal came_ns
+        now_ns = time.monotonic_ns()
+        if came_ns is None or now_ns - came_ns > _ECHO_NS:
+            came_ns = now_ns
+            raise StopRequestError(number)
+
+    with _default_replaced(stop):
+        yield
+
+
+@contextmanager
+def stoppable_imports() -> Iterator[None]:
+    """End the process with one line and its exit status on a signal, while the context lasts."""
+    with _default_replaced(_end_at_once):
+        yield
+
+
+def _end_at_once(number: int, _frame: FrameType | None) -> None:
+    with suppress(OSError):  # standard error may be closed or full
+        os.write(2, f"noack: {stop_reason(number)}\n".encode())
+    os._exit(_ENDING[number])
+
+
+@contextmanager
+def _default_replaced(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    usual = (signal.SIG_DFL, signal.default_int_handler, _end_at_once)
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    replaced = {number: found for number, found in before.items() if found in usual}
+    for number in replaced:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, found in replaced.items():
+            signal.signal(number, found)

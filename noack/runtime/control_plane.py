@@ -1,15 +1,19 @@
 """The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
 
-The coordinator listens on a socket that no other user can reach; all other processes connect to it,
-those on other hosts by TLS.
-Loop data never travels here, and the loop never waits for it.
+Loop data never travels here, and the loop never waits for it. The coordinator listens on a Unix
+socket in the user's runtime directory, which is closed to other users; all other processes connect
+to it. From another host, a session connects through :mod:`noack.runtime.coordinator_link` by TLS to
+:mod:`cosim.live.remote_access`, which forwards to that socket. Both ends have certificates of the
+run.
 """
 
 import json
+import os
 import secrets
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any, Self
 
 import zenoh
@@ -18,28 +22,179 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario_tables import MOST_CHANGES
-from noack.core.errors import NoAnswerError, PeerError
+from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
+from noack.runtime.address import text_of
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.join_ticket import RemoteAccess, Ticket
+from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
-from noack.runtime.zenoh_session import (
-    cause_of,
-    first_reply,
-    label,
-    next_payload,
-    open_remote_session,
-    open_session,
-)
 
+LEASE_MS = 6000
+"""A connection whose other end is silent for longer breaks. On a busy machine a process may not run
+for seconds."""
+_CONNECT_MS = 5000
+_RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
+"""Of a connection whose other end does not answer."""
+_FOLDERS: dict[Path, int] = {}
+"""Descriptors of folders with sockets; they stay open, because zenoh may connect again."""
 _REQUEST_AGAIN_S = 5.0
 _POLL_S = 0.01
 """Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
-
-
 RUNS = "runs"
 """Folder of the active runs in the user's runtime directory: sockets, lock files."""
+
+
+_FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
+"""Time between two looks for a reply: at first, and as a share of the time waited so far."""
+
+
+def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
+    """Open a session that listens on a socket, or connects to it.
+
+    The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. Raise
+    zenoh.ZError if that fails, CallerError if other users have access to the folder.
+    """
+    return zenoh.open(session_config(endpoint_of(kind, name), listen=listen))
+
+
+@contextmanager
+def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
+    """Give a session with a coordinator on another host, in a run with this key.
+
+    Raises:
+        NoAnswerError: that fails.
+        MachineError: the link to the coordinator cannot be started.
+        CallerError: other users have access to the user's runtime directory.
+    """
+    # Processes on the coordinator's host need neither TLS nor asyncio.
+    from noack.runtime.coordinator_link import Destination, coordinator_link
+
+    destination = Destination(
+        remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
+        key.hex(),
+    )  # fmt: skip
+    address = text_of((remote.host, remote.port))
+    with ExitStack() as stack:
+        try:
+            path = stack.enter_context(coordinator_link(destination))
+            session = zenoh.open(session_config(f"unixsock-stream/{path}", listen=False))
+        except (NoAnswerError, zenoh.ZError) as error:
+            reason = error if isinstance(error, NoAnswerError) else cause_of(error)
+            raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
+        yield session
+
+
+def endpoint_of(kind: str, name: str) -> str:
+    """Return the zenoh endpoint of a socket, in the words of this process."""
+    return f"unixsock-stream/{socket_path(kind, name)}"
+
+
+def socket_path(kind: str, name: str) -> str:
+    """Return the path of a socket, in the words of this process.
+
+    It may have at most 107 bytes, so it goes through an open descriptor.
+    """
+    with open_private(kind, create=True) as folder:
+        known = _FOLDERS.get(folder.path)
+        if known is None or not os.path.samestat(os.fstat(known), os.fstat(folder.descriptor)):
+            known = _FOLDERS[folder.path] = os.dup(folder.descriptor)
+    return f"/proc/self/fd/{known}/{name}.sock"
+
+
+def session_config(
+    endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
+) -> zenoh.Config:
+    """Return the zenoh configuration of a listening or of a connecting session.
+
+    ``more`` has further zenoh settings by key.
+    """
+    config = zenoh.Config()
+    side, other = ("listen", "connect") if listen else ("connect", "listen")
+    settings: dict[str, Any] = {
+        "mode": "router" if listen else "client",
+        f"{side}/endpoints": [endpoint],
+        f"{other}/endpoints": [],
+        f"{side}/exit_on_failure": True,
+        f"{side}/timeout_ms": _CONNECT_MS,
+        f"{side}/retry": _RETRY,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,
+        "adminspace/enabled": False,  # it would publish the configuration
+        # Shared memory would bypass the socket for payloads of 3 KiB and more.
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": LEASE_MS,
+        # Rows of many loops take more than the two default places of 64 KiB: they would never fit.
+        "transport/link/tx/queue/size/background": 16,
+        # A batch without room is dropped at once: the loop must not wait.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    }
+    for key, value in (settings | dict(more or {})).items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
+    """Send a request to the listening session and return its answer; None without one in time.
+
+    Raise CallerError if the request was refused as wrong.
+    """
+    replies = session.get(key, FifoChannel(4), payload=question, timeout=timeout_s)
+    reply = first_reply(replies, time.monotonic() + timeout_s, poll_s=0.002)
+    if reply is not None and reply.err is not None:
+        raise CallerError(reply.err.payload.to_string())
+    return None if reply is None or reply.ok is None else reply.ok.payload.to_string()
+
+
+def first_reply(
+    replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
+) -> zenoh.Reply | None:
+    """Return the first reply before a reading of the monotonic clock; None without one.
+
+    ``poll_s`` is the longest time between two looks, which are more frequent in the beginning.
+    """
+    began_s = time.monotonic()
+    while (now_s := time.monotonic()) < until_s and not give_up():
+        try:
+            reply: zenoh.Reply | None = replies.try_recv()
+        except zenoh.ZError:  # the query ended without an answer
+            return None
+        if reply is not None:
+            return reply
+        time.sleep(min(poll_s, _FIRST_POLL_S + _POLL_SHARE * (now_s - began_s)))
+    return None
+
+
+def label(key: str, header: bytes = b"") -> bytes:
+    """Return the attachment of a message: the key with which it is sent, and a header."""
+    return b"\n".join((key.encode(), header))
+
+
+def header_of(sample: zenoh.Sample) -> bytes | None:
+    """Return the header of a message; None if it was sent with another key.
+
+    On an overloaded machine, after connections had broken, zenoh delivered a message to the
+    subscriber of another key: a confirmation of rows as a request to stop.
+    """
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    key, _, header = attachment.partition(b"\n")
+    return header if key == str(sample.key_expr).encode() else None
+
+
+def next_payload(subscriber: Any) -> bytes | None:
+    """Return the payload of a subscriber's next message with its key; None without one."""
+    while (sample := subscriber.try_recv()) is not None:
+        if header_of(sample) is not None:
+            payload: bytes = sample.payload.to_bytes()
+            return payload
+    return None
+
+
+def cause_of(error: zenoh.ZError) -> str:
+    """Return zenoh's message without the place in its own source."""
+    return str(error).partition(" at /")[0]
 
 
 def run_name(run_id: int) -> str:

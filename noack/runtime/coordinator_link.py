@@ -1,11 +1,30 @@
-"""Connects a process with a coordinator on another host, by a program of its own between both.
+"""The connection of a process with a coordinator on another host: proof, TLS, forwarded bytes.
 
-zenoh connects to a Unix socket without a name. The program accepts these connections, opens one
-with the coordinator for each, proves that it has an invitation, and forwards the bytes by TLS. It
-is a separate process, since a thread would keep the loop waiting for the interpreter's lock.
+zenoh connects to a Unix socket without a name. A program of its own accepts these connections,
+opens one with the coordinator for each, proves that it has an invitation, and forwards the bytes by
+TLS. It is a separate process, since a thread would keep the loop waiting for the interpreter's
+lock. The coordinator's host forwards accepted connections to its own socket, on a thread.
+
+A connection begins with the proof, which is checked before anything that costs more: a flood of
+connections without it costs little (:mod:`noack.runtime.connection_gate`), and never ends those
+with one. Layout, version 1::
+
+    offset  size  field
+         0     4  the bytes "NJ", version 1, reserved 0
+         4    16  tag: keyed BLAKE2b over the four bytes and the connection's addresses
+
+The addresses are those of the connecting end and of the coordinator, each as 16 bytes (of IPv4: 4
+bytes and 12 zeros) and its port in two bytes, big endian. So the proof of one connection is of no
+use for another one. The coordinator answers with one byte (:class:`Answer`); then TLS 1.3 begins,
+in which both ends have certificates. When too many handshakes of connections with a proof are
+unfinished, the oldest one ends of the host that has the most. When too many connections are
+forwarded, the newest ends of the host that has the most.
 """
 
 import asyncio
+import hashlib
+import hmac
+import ipaddress
 import json
 import os
 import secrets
@@ -15,17 +34,31 @@ import ssl
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 from noack.core.errors import MachineError, NoAnswerError, PeerError, why
-from noack.core.python_process import python_command
-from noack.protocol.invitation_proof import Answer, InvitationProof
-from noack.runtime.connection_forwarder import Streams, forwarding
+from noack.core.process_limits import python_command
+from noack.protocol.wire_format import KEY_BYTES, TAG_BYTES, Tagger
+from noack.runtime.connection_gate import FirstBytes, TaskLimit, accepting
 from noack.runtime.private_folder import open_private
-from noack.runtime.tls_context import tls_context
 
+_HEAD = b"NJ\x01\x00"
+PROOF_BYTES = len(_HEAD) + TAG_BYTES
+_PURPOSE = b"noack connections"
+_ADDRESS_BYTES = 16
+_PROOF_S = 5.0
+_HANDSHAKE_S = 5.0
+_CLOSE_S = 5.0
+_MOST_HANDSHAKES = 128
+_MOST_CONNECTIONS = 64
+_READ_BYTES = 1 << 16
+Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+OpenTarget = Callable[[], Awaitable[Streams]]
 _FOLDER = "links"
 _OPEN_S = 4.0
 """Longest time for a connection with the coordinator."""
@@ -44,6 +77,179 @@ _FLOODED = (
     "it had no room for this connection: other connections flood its port; start this process "
     "again, and see what `noack record` says about the flood"
 )
+
+
+class Answer(bytes, Enum):
+    """The coordinator's answer to a proof."""
+
+    ADMITTED = b"+"
+    REFUSED = b"-"
+    """The bytes are no proof for this connection under the key of this run."""
+    NO_ROOM = b"*"
+    """Too many connections wait; this one had not sent its proof."""
+
+
+class InvitationProof:
+    """Makes and checks proofs under the key of a run, which has 32 bytes."""
+
+    def __init__(self, key: bytes) -> None:
+        # A key of its own: the tags of datagrams are made with the run's key itself.
+        self._tag = Tagger(hashlib.blake2b(_PURPOSE, key=key, digest_size=KEY_BYTES).digest())
+
+    def make(self, own: tuple[str, int], coordinator: tuple[str, int]) -> bytes:
+        """Return the proof for a connection; addresses are numeric."""
+        return _HEAD + self._tag(_HEAD + _packed(own) + _packed(coordinator))
+
+    def check(self, found: bytes, other: tuple[str, int], own: tuple[str, int]) -> bool | None:
+        """Whether bytes are the proof of the other end; None: a part of one may be there."""
+        if not _HEAD.startswith(found[: len(_HEAD)]):
+            return False
+        if len(found) < PROOF_BYTES:
+            return None
+        return hmac.compare_digest(found, self.make(other, own))
+
+
+def _packed(address: tuple[str, int]) -> bytes:
+    """Return an address as bytes of a fixed length; a scope is left out."""
+    host = ipaddress.ip_address(address[0].partition("%")[0])
+    return host.packed.ljust(_ADDRESS_BYTES, b"\0") + address[1].to_bytes(2, "big")
+
+
+def tls_context(
+    authority: str, certificate: str, private_key: str, *, server: bool
+) -> ssl.SSLContext:
+    """Return the settings of one end, which accepts only the other end's certificate.
+
+    Args:
+        authority: the certificate that signed both, as PEM text.
+        certificate: of this end, as PEM text.
+        private_key: of this end, as PEM text.
+        server: whether this end is the coordinator.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(cadata=authority)
+    with _file_in_memory(private_key + certificate) as path:
+        context.load_cert_chain(path)
+    return context
+
+
+@contextmanager
+def _file_in_memory(secret: str) -> Iterator[str]:
+    """Give the path of a file with a text: ssl reads files only."""
+    descriptor = os.memfd_create("tls", os.MFD_CLOEXEC)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(secret)
+        file.flush()
+        yield f"/proc/self/fd/{descriptor}"
+
+
+@dataclass(frozen=True)
+class Protection:
+    """What accepted connections must have."""
+
+    context: ssl.SSLContext
+    proof: InvitationProof
+    unserved: Callable[[Counter[str]], None] = lambda count: None
+    """Called every second: how many connections without a proof ended since, by host."""
+
+
+def forwarding(
+    listening: socket.socket,
+    target: OpenTarget,
+    protection: Protection | None = None,
+    *,
+    linger_s: float = 0.0,
+) -> AbstractContextManager[asyncio.AbstractEventLoop]:
+    """Forward each connection to a new connection with the target, within the context.
+
+    The context yields the event loop in which ``target`` is called.
+
+    Args:
+        listening: a socket that listens; the caller closes it.
+        target: opens a connection.
+        protection: what accepted connections must have; None: bytes pass as they are.
+        linger_s: at the end, how long what was received may still be forwarded.
+    """
+    forwarder = _Forwarder(target, protection)
+    first = None
+    if protection is not None:
+        proof, own = protection.proof, listening.getsockname()
+        first = FirstBytes(
+            judge=lambda data, other: proof.check(data, other, own),
+            most=PROOF_BYTES,
+            within_s=_PROOF_S,
+            refused=Answer.REFUSED.value,
+            no_room=Answer.NO_ROOM.value,
+            unserved=protection.unserved,
+        )
+    return accepting(listening, forwarder.serve, first, name="forwarder", linger_s=linger_s)
+
+
+class _Forwarder:
+    """What happens to accepted connections."""
+
+    def __init__(self, target: OpenTarget, protection: Protection | None) -> None:
+        self._target, self._protection = target, protection
+        self._handshakes = TaskLimit(_MOST_HANDSHAKES)
+        self._connections = TaskLimit(_MOST_CONNECTIONS, end_newest=True)
+
+    async def serve(self, accepted: socket.socket, _: bytes, host: str) -> None:
+        """Forward a connection until one end closes it."""
+        if self._protection is not None:
+            accepted.send(Answer.ADMITTED.value)
+        connection = socket.socket(fileno=accepted.detach())
+        with self._handshakes.counted(host):
+            reader, writer = await self._streams(connection)
+        try:
+            with self._connections.counted(host):
+                await self._forward(reader, writer)
+        finally:
+            writer.transport.abort()
+
+    async def _streams(self, connection: socket.socket) -> Streams:
+        loop, reader = asyncio.get_running_loop(), asyncio.StreamReader()
+        protocol = asyncio.StreamReaderProtocol(reader)
+        context = None if self._protection is None else self._protection.context
+        transport, _ = await loop.connect_accepted_socket(
+            lambda: protocol,
+            connection,
+            ssl=context,
+            ssl_handshake_timeout=None if context is None else _HANDSHAKE_S,
+        )
+        return reader, asyncio.StreamWriter(transport, protocol, reader, loop)
+
+    async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Copy both directions until one ends; what was received by then is sent."""
+        loop = asyncio.get_running_loop()
+        inner_reader, inner_writer = await self._target()
+        copies = [
+            loop.create_task(_copy(reader, inner_writer)),
+            loop.create_task(_copy(inner_reader, writer)),
+        ]
+        try:
+            await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.gather(_close(inner_writer), _close(writer))
+        finally:
+            for copy in copies:
+                copy.cancel()
+            inner_writer.transport.abort()
+
+
+async def _close(writer: asyncio.StreamWriter) -> None:
+    """Close a connection when everything is sent; with TLS, once the other end has agreed."""
+    with suppress(OSError):  # TimeoutError is one
+        async with asyncio.timeout(_CLOSE_S):
+            writer.close()
+            await writer.wait_closed()
+
+
+async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    with suppress(OSError):
+        while data := await reader.read(_READ_BYTES):
+            writer.write(data)
+            await writer.drain()
 
 
 class Destination(NamedTuple):

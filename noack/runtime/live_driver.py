@@ -17,10 +17,10 @@ import numpy as np
 from noack.core.clock import RunClock
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.protocol.datagram_seal import TAG_BYTES
 from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
     HEADER_BYTES,
+    TAG_BYTES,
     Flow,
     Rejection,
     Wire,
@@ -28,8 +28,8 @@ from noack.protocol.wire_format import (
     rejected_of,
 )
 from noack.runtime.address import Address, SocketName, packed_name
-from noack.runtime.process_life import RunProcess
 from noack.runtime.real_time_loop import RecordSink
+from noack.runtime.run_process import RunProcess
 from noack.runtime.udp_sockets import CountingSocket, errors_by_text
 
 _UDP_GRO = 104

@@ -1,7 +1,7 @@
 """The user's active runs, and how to reach them from another terminal.
 
-The launcher keeps a lock file for its run (:mod:`noack.runtime.lock_file`), beside the socket of
-its control plane.
+The launcher keeps a lock file for its run (:mod:`noack.runtime.private_folder`), beside the socket
+of its control plane.
 """
 
 import json
@@ -15,11 +15,10 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from noack.config.toml_file import brief
 from noack.core.errors import CallerError, PeerError
-from noack.runtime import lock_file
+from noack.runtime import private_folder
 from noack.runtime.control_messages import ChangeReply, parse_message
-from noack.runtime.control_plane import RUNS, run_name
+from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session, run_name
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 30.0
 
@@ -39,13 +38,13 @@ _OPEN_RUN = TypeAdapter(OpenRun, config=ConfigDict(defer_build=True))
 def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
     """Keep a run's lock file while the context lasts."""
     run = OpenRun(run_name(ticket.run_id), ticket.run_dir, session)
-    with lock_file.lock_file(RUNS, run.name, run._asdict()) as path:
+    with private_folder.lock_file(RUNS, run.name, run._asdict()) as path:
         yield path
 
 
 def active_runs() -> list[OpenRun]:
     """Return the user's active runs. Raise PeerError if the file of one is not valid."""
-    return [_read(file) for file in lock_file.live_lock_files(RUNS)]
+    return [_read(file) for file in private_folder.live_lock_files(RUNS)]
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
@@ -91,7 +90,7 @@ def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
     return parse_message(ChangeReply, answer)
 
 
-def _read(file: lock_file.LockFile) -> OpenRun:
+def _read(file: private_folder.LockFile) -> OpenRun:
     try:
         return _OPEN_RUN.validate_json(file.content, strict=True)
     except ValidationError as error:

@@ -2,7 +2,8 @@
 
 One file per table and writer: a sequence of chunks ``first row (u64), bytes (u64), rows``, little
 endian. A killed writer leaves at most one incomplete chunk at the end, which readers ignore. Two
-writers may write the same rows; the row numbers identify them.
+writers may write the same rows; the row numbers identify them. A table of a run's log has lines of
+text, each a JSON object, in place of rows.
 """
 
 import contextlib
@@ -15,6 +16,7 @@ from typing import IO, BinaryIO, NamedTuple
 
 from noack.core.errors import MachineError, why
 from noack.core.file_access import open_append, read_regular
+from noack.protocol.machine_interface import GENERATION
 
 SPOOL = "spool"  # the spool's folder in the run directory
 KEPT_REPORT = "report"
@@ -26,6 +28,8 @@ RUN_NAME_FILE = "run_name.txt"
 _CHUNK = struct.Struct("<QQ")
 _READ_BYTES = 256 * 1024
 _MOST_NAME_BYTES = 1024
+NOTICES = "notices"
+_NEWLINE = b"\n"
 
 
 def writer_of(secret: str) -> str:
@@ -173,3 +177,29 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
     for path in spool_files(folder, table):
         yield from ((chunk.first, chunk.rows) for chunk in chunks_in(path))
+
+
+def notices_of(role: str) -> str:
+    """Name of a process's log lines in the spool."""
+    return f"{NOTICES}_{role}"
+
+
+def notice_number(generation: int, first: int) -> int:
+    """Number of a process's log line in the spool; it contains the generation."""
+    return generation * GENERATION + first
+
+
+def batch_of(lines: Iterable[bytes]) -> bytes:
+    """Return a batch of lines, each a JSON object without line breaks."""
+    return _NEWLINE.join(lines)
+
+
+def lines_in(batch: bytes) -> list[bytes]:
+    """Return the lines of a batch."""
+    return batch.split(_NEWLINE)
+
+
+def stored_lines(spool: Path, role: str) -> Iterator[bytes]:
+    """Yield the log lines of a process in a spool; a line may come twice."""
+    for _, batch in read_chunks(spool, notices_of(role)):
+        yield from lines_in(batch)

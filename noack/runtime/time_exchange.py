@@ -1,33 +1,63 @@
 """Exchanges of timestamps over UDP, from which a process bounds the offset of its clock.
 
 The client sends a request and reads replies whenever it is polled; nothing waits. The reference
-answers requests. Datagrams are authenticated (:mod:`noack.protocol.time_format`). A reply is
-accepted once, and only for an outstanding request. Whoever delays, repeats or drops datagrams can
-make the bound wider, but not wrong: a request is received after it was sent, and a reply was sent
-before it is received.
+answers requests. Datagrams are authenticated. A reply is accepted once, and only for an outstanding
+request. Whoever delays, repeats or drops datagrams can make the bound wider, but not wrong: a
+request is received after it was sent, and a reply was sent before it is received.
+
+Layout of a datagram, version 1, little endian. Request and reply have the same size, so that a
+forged source address gains no traffic::
+
+    offset  size  field
+         0     2  magic, the bytes "NC"
+         2     1  version, 1
+         3     1  kind: 1 request, 2 reply
+         4     4  reserved, 0
+         8    16  nonce: random in a request, repeated in its reply
+        24     8  number of the reference's clock; 0 in a request
+        32     8  time of the request's arrival, ns of the reference's clock; 0 in a request
+        40     8  time of sending the reply, ns of the same clock; 0 in a request
+        48    16  tag: keyed BLAKE2b over all that precedes it
+
+The magic bytes differ from those of the loop's datagrams, so that none passes for the other under
+the same key. The own sending time is not in the datagram: the client keeps it.
+
+A time of arrival is one on the monotonic clock that is never too early. The kernel stamps a
+datagram with the real-time clock (SO_TIMESTAMPNS). Slewing changes the rate of both clocks alike,
+so their difference changes only when the real-time clock is set (or the machine is suspended). It
+is read before and after a datagram's arrival, as an interval, since two clocks cannot be read at
+once. The smallest difference of these readings converts the stamp: the result is late by the width
+of the interval, but not early, if the clock was set at most once between two readings. If they show
+that it was set, the time of reading the datagram is used instead, as without stamps.
 """
 
+import hmac
 import secrets
 import select
 import socket
+import struct
+import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from enum import IntEnum
+from typing import NamedTuple
 
-from noack.core.clock_offset import ClockOffset, Exchange, Restart
+from noack.core.clock import ClockOffset, Exchange, Restart
 from noack.core.errors import CallerError, why
-from noack.protocol.time_format import (
-    NONCE_BYTES,
-    TIME_BYTES,
-    TimeDatagram,
-    TimeFormat,
-    TimeKind,
-)
-from noack.protocol.wire_format import Rejection
+from noack.protocol.wire_format import TAG_BYTES, TIMES_NS, Rejection, Tagger
 from noack.runtime.address import Address, family_of, text_of
-from noack.runtime.arrival_times import ArrivalSocket, HostClocks
 
+MAGIC = b"NC"
+VERSION = 1
+NONCE_BYTES = 16
+_CONTENT = struct.Struct("<2sBBI16sQqq")
+TIME_BYTES = _CONTENT.size + TAG_BYTES
+_SO_TIMESTAMPNS = 35
+_TIMESPEC = struct.Struct("@ll")
+_ANCILLARY_BYTES = 64
 PERIOD_NS = 20_000_000
 """Default of the shortest time between two requests."""
 MOST_AT_ONCE = 64
@@ -39,6 +69,189 @@ _MOST_OUTSTANDING = 64
 _FLOOD_PAUSE_S = 0.01
 """After a full batch the answering thread pauses: it reads at most 6,400 datagrams a second."""
 _STOP_CHECK_S = 0.2
+
+
+class TimeKind(IntEnum):
+    """What a datagram is."""
+
+    REQUEST = 1
+    REPLY = 2
+
+
+class TimeDatagram(NamedTuple):
+    """The content of a datagram."""
+
+    kind: TimeKind
+    nonce: bytes
+    clock: int = 0
+    received_ns: int = 0
+    sent_ns: int = 0
+
+
+class TimeFormat:
+    """Encodes and decodes datagrams under a key of 32 bytes."""
+
+    def __init__(self, key: bytes) -> None:
+        self._tag = Tagger(key)
+
+    def encode(self, content: TimeDatagram) -> bytes:
+        """Return the datagram."""
+        kind, *fields = content
+        packed = _CONTENT.pack(MAGIC, VERSION, kind, 0, *fields)
+        return packed + self._tag(packed)
+
+    def decode(self, datagram: bytes, kind: TimeKind) -> TimeDatagram | Rejection:
+        """Return the content of a datagram of this kind, or why it is rejected."""
+        if len(datagram) != TIME_BYTES:
+            return Rejection.LENGTH
+        magic, version, found, reserved, nonce, clock, received_ns, sent_ns = _CONTENT.unpack_from(
+            datagram
+        )
+        if magic != MAGIC or version != VERSION:
+            return Rejection.VERSION
+        if found != kind:
+            return Rejection.FLOW
+        if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
+            return Rejection.TAG
+        if reserved or not 0 <= received_ns <= sent_ns < TIMES_NS:
+            return Rejection.RANGE
+        return TimeDatagram(kind, nonce, clock, received_ns, sent_ns)
+
+
+class HostClocks:
+    """The clocks of this host; tests replace them."""
+
+    def monotonic_ns(self) -> int:
+        """Return a reading of the monotonic clock."""
+        return time.monotonic_ns()
+
+    def realtime_ns(self) -> int:
+        """Return a reading of the real-time clock."""
+        return time.time_ns()
+
+    def stamp_ns(self, stamp: bytes) -> int:
+        """Return the time of a kernel's stamp on the real-time clock."""
+        seconds, ns = _TIMESPEC.unpack_from(stamp)
+        return int(seconds) * 10**9 + int(ns)
+
+
+class ClockDifference(NamedTuple):
+    """What readings of real-time minus monotonic clock say; each reading is an interval.
+
+    While the real-time clock is not set, the difference is the same at all readings, and is from
+    ``lower_ns`` to ``upper_ns``.
+    """
+
+    least_ns: int
+    """The smallest lower end: no reading contains less."""
+    lower_ns: int
+    upper_ns: int
+
+    @property
+    def was_set(self) -> bool:
+        """Whether no difference agrees with all readings."""
+        return self.lower_ns > self.upper_ns
+
+    def joined(self, other: "ClockDifference") -> "ClockDifference":
+        """Return what the readings of both say."""
+        return ClockDifference(
+            min(self.least_ns, other.least_ns),
+            max(self.lower_ns, other.lower_ns),
+            min(self.upper_ns, other.upper_ns),
+        )
+
+
+def read_difference(clocks: HostClocks) -> ClockDifference:
+    """Read the difference; readings are rounded down, hence 1 ns more on both sides."""
+    before_ns = clocks.monotonic_ns()
+    real_ns = clocks.realtime_ns()
+    after_ns = clocks.monotonic_ns()
+    lower_ns = real_ns - after_ns - 1
+    return ClockDifference(lower_ns, lower_ns, real_ns + 1 - before_ns)
+
+
+def latest_arrival_ns(stamp_ns: int, read_ns: int, difference: ClockDifference) -> int:
+    """Return a monotonic time that is not before the arrival of a datagram.
+
+    Args:
+        stamp_ns: the kernel's stamp, real-time clock.
+        read_ns: when the datagram was read, monotonic clock.
+        difference: of the two clocks, read before and after the arrival.
+    """
+    return read_ns if difference.was_set else min(read_ns, stamp_ns + 1 - difference.least_ns)
+
+
+class Arrival(NamedTuple):
+    """A datagram, its source, and a time that is not before its arrival, monotonic clock."""
+
+    data: bytes
+    source: Address
+    latest_ns: int
+
+
+class ArrivalSocket:
+    """Reads an own UDP socket without blocking; ``most_bytes`` is the longest valid datagram.
+
+    A longer one is cut one byte above this.
+    """
+
+    def __init__(self, endpoint: socket.socket, most_bytes: int, clocks: HostClocks) -> None:
+        self._endpoint = endpoint
+        self._most_bytes = most_bytes
+        self._clocks = clocks
+        self._known: ClockDifference | None = None
+        """Read since before the last call that left the socket empty: before any later arrival."""
+        self.clock_sets = 0
+        """Calls with datagrams for which the real-time clock was found to have been set."""
+        self.errors = 0
+        """ICMP errors of earlier sends."""
+        endpoint.setblocking(False)
+        if sys.platform == "linux":
+            with suppress(OSError):
+                endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+    def receive(self, most: int) -> list[Arrival]:
+        """Return the datagrams that wait, at most ``most``."""
+        before, known = read_difference(self._clocks), self._known
+        self._known = known and known.joined(before)
+        waiting: list[tuple[bytes, Address, int | None, int]] = []
+        for _ in range(most):
+            try:
+                data, ancillary, _, source = self._endpoint.recvmsg(
+                    self._most_bytes + 1, _ANCILLARY_BYTES
+                )
+            except BlockingIOError:
+                self._known = before
+                break
+            except OSError:
+                self.errors += 1
+                continue
+            read_ns = self._clocks.monotonic_ns()
+            waiting.append((data, source[:2], self._stamp_ns(ancillary), read_ns))
+        if not waiting:
+            return []
+        after = read_difference(self._clocks)
+        self._known = self._known and self._known.joined(after)
+        if known is None:  # nothing was read before these arrivals
+            return [Arrival(data, source, read_ns) for data, source, _, read_ns in waiting]
+        difference = known.joined(before).joined(after)
+        self.clock_sets += difference.was_set
+        return [
+            Arrival(
+                data,
+                source,
+                read_ns if stamp_ns is None else latest_arrival_ns(stamp_ns, read_ns, difference),
+            )
+            for data, source, stamp_ns, read_ns in waiting
+        ]
+
+    def _stamp_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int | None:
+        for level, kind, stamp in ancillary:
+            is_stamp = (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS)
+            if is_stamp and len(stamp) >= _TIMESPEC.size:
+                return self._clocks.stamp_ns(stamp)
+        return None
+
 
 _HOST_CLOCKS = HostClocks()
 

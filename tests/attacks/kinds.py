@@ -9,8 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.protocol.datagram_seal import KEY_BYTES, TAG_BYTES
-from noack.protocol.wire_format import HEADER_BYTES, Encoder, Flow, Message, Rejection
+from noack.protocol.wire_format import (
+    HEADER_BYTES,
+    KEY_BYTES,
+    TAG_BYTES,
+    Encoder,
+    Flow,
+    Message,
+    Rejection,
+)
 from noack.runtime.address import LOOPBACK
 from tests.wire_decoder import Decoder
 

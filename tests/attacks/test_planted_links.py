@@ -27,7 +27,7 @@ from netem.relay_links import LinkSpec
 from noack.config.matrix_files import write_matrices
 from noack.core.errors import NoackError
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.invitation import write_invitation
+from noack.runtime.join_ticket import write_invitation
 from noack.runtime.spool import SPOOL, SpoolWriter
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.noack.runtime.test_invitation import INVITED

@@ -45,8 +45,7 @@ def doctor(
     Exit status 1: a finding is bad, so that no run is possible.
     """
     from cosim.doctor.findings import FindingStatus, document, judge, print_findings, worst
-    from cosim.doctor.machine_facts import requirements_of
-    from cosim.doctor.machine_measures import measure
+    from cosim.doctor.machine_measures import measure, requirements_of
     from cosim.live.progress import PatientConsole
     from noack.config.resolution import resolve
 

@@ -1,11 +1,14 @@
 """``noack measure``: losses, delays and the M of a real network."""
 
-from typing import TYPE_CHECKING
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from cosim.cli import command as cli
-from cosim.cli import measure_options as given
+from cosim.cli import completion
 from noack.core.errors import CallerError, ExitStatus
-from noack.traces.trace_formats import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
@@ -13,7 +16,112 @@ if TYPE_CHECKING:
     from cosim.measurement.network_measurement import MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
 
+Sources = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="FILE...|ADDRESS",
+        help="A packet trace, the name of a shipped one, captures of both ends, a fate file, a "
+        "run directory, delivery opportunities; or the address of a listener, to which a probe "
+        "is sent.",
+    ),
+]
+Listen = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Receive one probe there, e.g. 0.0.0.0:9100."),
+]
+Rate = Annotated[str, typer.Option(metavar="RATE", help="Datagrams of the probe.")]
+Duration = Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the probe.")]
+Size = Annotated[
+    int, typer.Option(metavar="BYTES", help="Size of the probe's datagrams, at least 100.")
+]
+RoundTrip = Annotated[
+    bool, typer.Option("--round-trip", help="The listener sends each datagram back.")
+]
+Silence = Annotated[
+    str,
+    typer.Option(
+        metavar="TIME",
+        help="Once a probe has begun, a listener ends after so long without a datagram. It waits "
+        "for a probe until Ctrl-C.",
+    ),
+]
+Save = Annotated[
+    Path | None, typer.Option(help="Write the raw trace to this file while probing (.csv).")
+]
+Flow = Annotated[
+    int, typer.Option(help="Flow of a capture or a fate file; 1 is the largest.", min=1)
+]
+SequenceAt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="OFFSET:BYTES[:little]",
+        help="Where the payloads of a capture of the receiver's end have sequence numbers.",
+    ),
+]
+Deadline = Annotated[
+    str | None,
+    typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
+]
+Shares = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SHARE",
+        help="Share of loss bursts and packets for which M is given, e.g. 99%; repeatable.",
+    ),
+]
+Windows = Annotated[
+    list[int] | None,
+    typer.Option(help="K of the (m, K) table; repeatable.", min=1, max=100_000_000),
+]
+Outage = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TIME",
+        help="Loss bursts of this duration or more are outages; by default a test decides.",
+    ),
+]
+ForScenario = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SCENARIO",
+        help="Report for which share of the time its certificate would have been void.",
+        autocompletion=completion.scenarios,
+    ),
+]
+Page = Annotated[
+    Path | None, typer.Option("--out", help="Write a page with tables and figures (.html).")
+]
+NetworkFile = Annotated[
+    Path | None,
+    typer.Option(help="Write a [network] section that reproduces the network (.toml)."),
+]
 _TRACE = "rural_n8_10kmh"
+
+
+class NetworkForm(StrEnum):
+    """How a measured network is written."""
+
+    TRACE = "trace"
+    MODEL = "model"
+
+
+class ClockRelation(StrEnum):
+    """Whether sending and receiving times are comparable."""
+
+    SAME = "same"
+    DIFFERENT = "different"
+
+
+Clocks = Annotated[
+    ClockRelation | None,
+    typer.Option(help="Whether both times of a file were read on the same clock."),
+]
+
+
+Form = Annotated[
+    NetworkForm,
+    typer.Option("--as", help="Write the network as the trace itself, or as a fitted model."),
+]
 
 
 @cli.command(cli.MEASURING, 10, [
@@ -26,29 +134,29 @@ _TRACE = "rural_n8_10kmh"
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
-    sources: given.Sources = None,
+    sources: Sources = None,
     *,
-    listen: given.Listen = None,
-    rate: given.Rate = "50hz",
-    duration: given.Duration = "60s",
-    size: given.Size = 128,
-    round_trip: given.RoundTrip = False,
-    silence: given.Silence = "30s",
-    save: given.Save = None,
-    flow: given.Flow = 1,
-    sequence_at: given.SequenceAt = None,
-    clocks: given.Clocks = None,
-    deadline: given.Deadline = None,
-    share: given.Shares = None,
-    window: given.Windows = None,
-    outage: given.Outage = None,
-    for_scenario: given.ForScenario = None,
+    listen: Listen = None,
+    rate: Rate = "50hz",
+    duration: Duration = "60s",
+    size: Size = 128,
+    round_trip: RoundTrip = False,
+    silence: Silence = "30s",
+    save: Save = None,
+    flow: Flow = 1,
+    sequence_at: SequenceAt = None,
+    clocks: Clocks = None,
+    deadline: Deadline = None,
+    share: Shares = None,
+    window: Windows = None,
+    outage: Outage = None,
+    for_scenario: ForScenario = None,
     settings: cli.SetOption = None,
-    out: given.Page = None,
+    out: Page = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
-    write: given.NetworkFile = None,
-    form: given.Form = given.NetworkForm.TRACE,
+    write: NetworkFile = None,
+    form: Form = NetworkForm.TRACE,
     json: cli.JsonOption = False,
 ) -> int:
     """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
@@ -64,13 +172,13 @@ def measure(
     if settings and for_scenario is None:
         raise CallerError("--set: replaces a value of the scenario of --for-scenario; give one")
     scenario = None if for_scenario is None else cli.load_scenario(for_scenario, settings)
-    if form is given.NetworkForm.MODEL and write is None:
+    if form is NetworkForm.MODEL and write is None:
         raise CallerError("--as model: is the form of --write; give its FILE.toml")
     files_of_figures = figure_files(figure_format, width)
     request = OutputRequest(out, files_of_figures, write, form.value, scenario)
     live = LiveOptions(rate, duration, size, round_trip, silence, save, options.deadline_s)
     how = SourceOptions(
-        None if clocks is None else clocks is given.ClockRelation.DIFFERENT,
+        None if clocks is None else clocks is ClockRelation.DIFFERENT,
         flow, sequence_at, period_ns_of(rate),
     )  # fmt: skip
     if _is_one_way_sender(sources, listen, live) and (
@@ -106,6 +214,7 @@ def _result(
     )
     from cosim.measurement.live.probe_result import ProbeResult
     from cosim.measurement.trace_sources import FILE_OPTIONS, read_source, refuse_unused
+    from noack.traces.trace_formats import find_trace
 
     if listen is not None:
         if sources:

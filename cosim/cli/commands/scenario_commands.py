@@ -182,8 +182,8 @@ def _print_plant(console: "Console", resolved: "Scenario") -> None:
 
 def _dependent_defaults(resolved: "Scenario") -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys."""
-    from cosim.live.restart_policy import RESTART_BY_HAND_S
-    from cosim.live.wait_limit import DEFAULT_S
+    from cosim.live.child_processes import RESTART_BY_HAND_S
+    from cosim.live.launcher import DEFAULT_S
 
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:

@@ -13,7 +13,7 @@ from cosim.measurement.live.probe_sender import ProbePlan, ProbeSender
 from cosim.measurement.live.stamped_socket import StampedSocket, host_number
 from noack.core.errors import NeverStartedError, PeerError
 from noack.runtime.address import Address, text_of
-from noack.runtime.signals import Signals
+from noack.runtime.command_line import Signals
 
 _LONGEST_WAIT_S = 0.1
 _BATCH = 256

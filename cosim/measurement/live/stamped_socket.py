@@ -18,8 +18,7 @@ from typing import NamedTuple
 from noack.core.errors import CallerError, MachineError, why
 from noack.protocol.probe_format import MAX_PROBE_BYTES
 from noack.runtime.address import Address, family_of, text_of
-from noack.runtime.peer_sockets import enlarge_buffer
-from noack.runtime.udp_sockets import drops_of
+from noack.runtime.udp_sockets import drops_of, enlarge_buffer
 
 _SO_TIMESTAMPNS = 35
 _TIMESPEC = struct.Struct("@ll")

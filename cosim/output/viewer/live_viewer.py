@@ -19,7 +19,7 @@ from types import FrameType
 from cosim.output.viewer.rerun_program import end_process
 from cosim.output.viewer.viewer_server import RecordingServer
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 
 _MAGIC = b"RRF"
 _PATIENCE_S = 5.0

@@ -13,7 +13,7 @@ from cosim.studies.campaign.campaign_run import Progress, run_campaign
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
 from cosim.studies.campaign.chunk_store import Store, opened
-from noack.runtime.signals import stop_requests_raised
+from noack.runtime.command_line import stop_requests_raised
 
 Show = Callable[[str], AbstractContextManager[object]]
 """Shows what is done meanwhile."""

@@ -148,7 +148,7 @@ class RunComparison:
         return [(key, *values) for key, values in self.settings.items()]
 
     def __repr__(self) -> str:
-        from noack.core.row_display import as_text
+        from noack.core.number_format import as_text
 
         legend = "\n".join(f"{run.label}  {run.title}  {run.directory}" for run in self.runs)
         return f"{legend}\n{as_text([('', *(run.label for run in self.runs)), *self.rows])}"

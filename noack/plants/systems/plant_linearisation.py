@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import logm
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantSystem
@@ -73,6 +72,8 @@ def linearise(
     if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
         return unknown
     with warnings.catch_warnings(action="ignore"):  # a singular matrix: the result is checked next
+        from scipy.linalg import logm  # takes 0.2 s: linear plants do not need it
+
         generator = np.real(logm(step)) / (_STEP_NS * 1e-9)
     if not np.isfinite(generator).all():
         return unknown

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.lyapunov_equation import solve_lyapunov
+from noack.core.linear_systems import Matrix, solve_lyapunov, spectral_abscissa
 
 Stack = NDArray[np.float64]
 EPSILON = 8 * float(np.finfo(float).eps)

@@ -25,8 +25,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.core.matrix_exponential import exponential
+from noack.core.linear_systems import Matrix, exponential, spectral_abscissa
 from noack.theory.bounds.contraction import (
     EPSILON,
     Decay,

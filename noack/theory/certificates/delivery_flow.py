@@ -34,8 +34,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.matrix_exponential import exponential
+from noack.core.linear_systems import Matrix, Vector, exponential, spectral_abscissa
 from noack.theory.bounds.contraction import (
     Stack,
     largest_eigenvalues,

@@ -26,8 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.core.cached_method import cached_method
-from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.core.lyapunov_equation import solve_lyapunov
+from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from cosim.doctor.machine_facts import requirements_of
+from cosim.doctor.machine_measures import requirements_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 

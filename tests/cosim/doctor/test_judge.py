@@ -10,15 +10,15 @@ import pytest
 from rich.console import Console
 
 from cosim.doctor.findings import FindingStatus, MachineFinding, judge, print_findings, worst
-from cosim.doctor.machine_facts import (
+from cosim.doctor.machine_measures import (
     Buffer,
     Disk,
     Lateness,
     MachineFacts,
     RoundTrips,
     RunRequirements,
+    lateness,
 )
-from cosim.doctor.machine_measures import lateness
 
 WANTED = RunRequirements(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,

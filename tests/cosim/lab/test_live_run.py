@@ -14,7 +14,7 @@ import pytest
 from cosim.interactive.draft import open_draft
 from cosim.lab import live_run
 from cosim.lab.live_run import LiveRun
-from noack.core.python_process import python_command
+from noack.core.process_limits import python_command
 
 
 def said(run: LiveRun, what: str, **fields: object) -> None:

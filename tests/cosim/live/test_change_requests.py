@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from cosim.live.change_requests import ChangeRequests
+from cosim.live.coordinator import ChangeRequests
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 

@@ -4,8 +4,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from cosim.live.disk_space import require_disk_space, spool_bytes
-from cosim.live.launcher import launch
+from cosim.live.launcher import launch, require_disk_space, spool_bytes
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

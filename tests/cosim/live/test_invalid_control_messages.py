@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.live import coordinator
-from cosim.live.telemetry_recorder import Recorder
+from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.spool_conversion import finish_record
 from noack.config.resolution import resolve

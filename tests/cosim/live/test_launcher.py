@@ -13,8 +13,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES
+from noack.runtime.command_line import Signals
 from noack.runtime.join_ticket import new_ticket, published
-from noack.runtime.signals import Signals
 
 KILLED = "sensor died: killed by SIGKILL"
 

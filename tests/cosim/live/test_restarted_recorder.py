@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from cosim.live import process_tokens
-from cosim.live.telemetry_recorder import Recorder
+from cosim.live import recorder
+from cosim.live.recorder import Recorder
 from cosim.output.viewer.recording_file import ViewError
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve
@@ -22,8 +22,7 @@ from noack.core.errors import MachineError
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.log_lines import NOTICES, batch_of
-from noack.runtime.spool import SPOOL, read_chunks
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 
@@ -134,7 +133,7 @@ def test_a_restarted_recorder_does_not_wait_for_ended_processes(
     assert run.recorder.finished
     run.follow(Start(2, 0), "b", present=["plant"])
     assert not run.recorder.finished
-    monkeypatch.setattr(process_tokens, "_DISCOVERY_S", -1.0)
+    monkeypatch.setattr(recorder, "_DISCOVERY_S", -1.0)
     assert not run.recorder.finished
     assert run.report("plant") == {}
     assert run.recorder.finished

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cosim.live.wait_limit import WaitLimit
+from cosim.live.launcher import WaitLimit
 
 
 def reached_after_s(limit: WaitLimit, load: float, step_s: float = 0.125) -> float:

@@ -22,8 +22,8 @@ from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
-from noack.runtime.record_handover import OwnSpool
 from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
+from noack.runtime.telemetry import OwnSpool
 from tests.cosim.summaries import alone
 
 RUN = "0123456789abcdef"

@@ -16,8 +16,7 @@ from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
-from noack.runtime.log_lines import notices_of
-from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled
 
 

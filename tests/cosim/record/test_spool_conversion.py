@@ -18,8 +18,7 @@ from noack.config.scenario_file import validate
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
-from noack.runtime.log_lines import notices_of
-from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 
 LOOPS = 3
 

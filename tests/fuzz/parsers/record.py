@@ -33,8 +33,7 @@ from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, validate
-from noack.runtime.log_lines import notices_of
-from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.cosim.summaries import alone
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited

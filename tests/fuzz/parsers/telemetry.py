@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from cosim.live.telemetry_recorder import Recorder
+from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.spool_conversion import finish_record
 from noack.config.resolution import resolve, run_tables
 from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import OWNER
-from noack.runtime.log_lines import NOTICES, batch_of
+from noack.runtime.spool import NOTICES, batch_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import workspace

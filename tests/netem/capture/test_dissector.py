@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.protocol.datagram_seal import TAG_BYTES
-from noack.protocol.wire_format import HEADER_BYTES, Encoder, Flow, Message
+from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
 from tests.netem.capture.batches import file_of
 from tests.netem.capture.conftest import Tshark
 from tests.netem.capture.reader import read

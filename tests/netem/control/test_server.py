@@ -15,8 +15,8 @@ from netem.relay_links import DIRECTIONS
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import Counters, LinkSettings
+from noack.runtime.control_plane import open_session
 from noack.runtime.private_folder import private_folder
-from noack.runtime.zenoh_session import open_session
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from netem.relay import Relay
 from netem.relay_links import Address, LinkReport, LinkSpec, Tap
 from noack.impairments.link_settings import LinkSettings
-from noack.runtime.peer_sockets import enlarge_buffer
+from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60
 """Timeout for events that never happen; no test measures time with it."""

@@ -22,7 +22,7 @@ from netem.tc_words import settings_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import RecordedDecision
 from noack.protocol.record_tables import Fate
-from noack.runtime import peer_sockets
+from noack.runtime import udp_sockets
 from tests.netem.engine.relays import (
     HOSTS,
     KeepAll,
@@ -348,7 +348,7 @@ def all_of(direction: DirectionReport) -> int:
 
 @pytest.fixture
 def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peer_sockets, "_BUFFER_BYTES", 16_384)
+    monkeypatch.setattr(udp_sockets, "_BUFFER_BYTES", 16_384)
 
 
 @pytest.mark.parametrize("version", [4, 6])

@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.clock import RunClock, SlewedRunClock
-from noack.core.clock_offset import ClockOffset, Exchange
+from noack.core.clock import ClockOffset, Exchange, RunClock, SlewedClock, SlewedRunClock
 from noack.core.core_library import core, ffi
-from noack.core.slewed_clock import SlewedClock
 
 EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.clock_offset import (
+from noack.core.clock import (
     RELATIVE_RATE_PPB,
     ClockOffset,
     Exchange,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
-from noack.core.lyapunov_equation import solve_lyapunov
+from noack.core.linear_systems import solve_lyapunov
 
 SIZES = (1, 2, 5, 14)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from noack.core.matrix_exponential import exponential
+from noack.core.linear_systems import exponential
 
 SIZES = (1, 2, 5, 14)
 _PRINT_BITS = """
 import numpy as np
-from noack.core.matrix_exponential import exponential
+from noack.core.linear_systems import exponential
 draw = np.random.default_rng(3)
 for n in (1, 2, 4, 9, 16):
     for scale in (1e-6, 0.1, 1.0, 30.0):

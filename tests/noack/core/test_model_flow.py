@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.core.linear_systems import Propagator
-from noack.core.model_flow import ModelFlow
+from noack.core.linear_systems import ModelFlow, Propagator
 
 H = np.array([[0.0, 1.0], [-1.0, -1.5]])
 X = np.array([1.0, -0.5])

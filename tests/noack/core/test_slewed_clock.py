@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.clock_offset import ClockOffset, Exchange
-from noack.core.slewed_clock import SLEW_PPB, SlewedClock
+from noack.core.clock import SLEW_PPB, ClockOffset, Exchange, SlewedClock
 from tests.noack.core.true_offsets import PPB, PS, SCALE, TrueOffset, exchanges
 
 slews_ppb = st.sampled_from([1_300_000, SLEW_PPB, PPB - 1])

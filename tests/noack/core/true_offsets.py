@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from heapq import heappop, heappush
 from random import Random
 
-from noack.core.clock_offset import ClockOffset, Exchange, OffsetInterval
+from noack.core.clock import ClockOffset, Exchange, OffsetInterval
 
 PS, PPB = 1000, 10**9
 SCALE = PS * PPB

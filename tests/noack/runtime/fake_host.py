@@ -4,7 +4,7 @@ import socket
 import struct
 from random import Random
 
-from noack.runtime.arrival_times import HostClocks
+from noack.runtime.time_exchange import HostClocks
 
 PS = 1000  # per ns
 

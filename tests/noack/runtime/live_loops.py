@@ -132,12 +132,12 @@ class Live:
         self._stack.close()
 
 
-def received(endpoint: socket.socket) -> list[bytes]:
+def received(endpoint: socket.socket, most_bytes: int = 2048) -> list[bytes]:
     """Return the datagrams that wait at a socket; loopback delivers at once."""
     found = []
     while True:
         try:
-            found.append(endpoint.recv(2048))
+            found.append(endpoint.recv(most_bytes))
         except BlockingIOError:
             return found
 

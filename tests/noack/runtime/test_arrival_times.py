@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.runtime import arrival_times
-from noack.runtime.arrival_times import (
+from noack.runtime import time_exchange
+from noack.runtime.time_exchange import (
     ArrivalSocket,
     ClockDifference,
     latest_arrival_ns,
@@ -95,7 +95,7 @@ def with_the_largest_difference(stamp_ns: int, read_ns: int, difference: ClockDi
 
 @pytest.mark.parametrize("broken", [without_width, with_the_largest_difference])
 def test_the_check_finds_a_mistake(broken: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arrival_times, "latest_arrival_ns", broken)
+    monkeypatch.setattr(time_exchange, "latest_arrival_ns", broken)
     with pytest.raises(AssertionError):
         check_arrivals(Random(1), ARRIVALS)
 
@@ -135,7 +135,7 @@ def endpoint(request: pytest.FixtureRequest) -> Iterator[socket.socket]:
 @pytest.mark.skipif(sys.platform != "linux", reason="kernel stamps are those of Linux")
 def test_a_datagram_that_waited_has_the_time_of_its_arrival(endpoint: socket.socket) -> None:
     """Unless the machine stalls while the clocks are read, which is tried again."""
-    clocks = arrival_times.HostClocks()
+    clocks = time_exchange.HostClocks()
     arrivals = ArrivalSocket(endpoint, 10, clocks)
     for _ in range(1000):
         assert arrivals.receive(5) == []

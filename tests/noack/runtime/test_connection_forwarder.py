@@ -12,10 +12,15 @@ from typing import Literal, get_args
 
 import pytest
 
-from cosim.live.tls_keys import KeyPair, TlsKeys, coordinator_context, new_tls_keys
-from noack.protocol.invitation_proof import PROOF_BYTES, Answer, InvitationProof
-from noack.runtime import connection_forwarder, connection_gate
-from noack.runtime.connection_forwarder import Protection, forwarding
+from cosim.live.remote_access import KeyPair, TlsKeys, coordinator_context, new_tls_keys
+from noack.runtime import connection_gate, coordinator_link
+from noack.runtime.coordinator_link import (
+    PROOF_BYTES,
+    Answer,
+    InvitationProof,
+    Protection,
+    forwarding,
+)
 
 KEYS = new_tls_keys("127.0.0.1")
 PROOF = InvitationProof(bytes(32))
@@ -92,7 +97,7 @@ def test_a_flood_keeps_nobody_out(
     """The flood fills all places between any two steps of one who joins, from his address too."""
     monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
     monkeypatch.setattr(connection_gate, "_ROOM", 16)
-    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 3600.0)
+    monkeypatch.setattr(coordinator_link, "_PROOF_S", 3600.0)
     foreign = InvitationProof(b"\1" * 32)
     with echo() as listening, ExitStack() as stack:
         address = listening.getsockname()
@@ -121,7 +126,7 @@ def test_a_flood_keeps_nobody_out(
 def test_a_flood_of_one_host_does_not_end_a_slow_connection_of_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 3600.0)
+    monkeypatch.setattr(coordinator_link, "_PROOF_S", 3600.0)
     monkeypatch.setattr(connection_gate, "_MOST_WAITING", 64)
     monkeypatch.setattr(connection_gate, "_ROOM", 16)
     with echo() as listening, ExitStack() as stack:
@@ -152,7 +157,7 @@ def test_a_proof_is_for_its_connection_only() -> None:
 
 
 def test_without_a_proof_a_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_forwarder, "_PROOF_S", 0.0)
+    monkeypatch.setattr(coordinator_link, "_PROOF_S", 0.0)
     monkeypatch.setattr(connection_gate, "_CHECK_S", 0.01)
     with (
         echo() as listening,

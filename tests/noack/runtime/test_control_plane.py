@@ -16,21 +16,18 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 import noack.runtime.control_plane
-import noack.runtime.process_entry
-import noack.runtime.zenoh_session
+import noack.runtime.run_process
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES
+from noack.runtime.command_line import Signals
 from noack.runtime.control_messages import Admission, MissingRows, RunStart, parse_message
-from noack.runtime.control_plane import RUNS, ControlPlane, run_name
+from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.private_folder import private_folder
-from noack.runtime.process_entry import _admitted
-from noack.runtime.process_life import RunProcess
-from noack.runtime.signals import Signals
-from noack.runtime.zenoh_session import cause_of, label
+from noack.runtime.run_process import RunProcess, _admitted
 from tests.attacks.other_user import needs_root, output_of_another_user
 from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for
@@ -122,7 +119,7 @@ def test_another_user_can_neither_connect_nor_listen(
 def test_a_process_without_a_coordinator_says_so(
     ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(noack.runtime.zenoh_session, "_CONNECT_MS", 200)
+    monkeypatch.setattr(noack.runtime.control_plane, "_CONNECT_MS", 200)
     with pytest.raises(NoAnswerError, match="cannot reach the run's coordinator: Unable"):
         ControlPlane(ticket, "plant")
     error = zenoh.ZError("Timeout! at /home/builder/.cargo/git/zenoh/orchestrator.rs:388.")
@@ -145,7 +142,7 @@ def test_every_zenoh_session_is_opened_in_one_place() -> None:
     root = Path(noack.__file__).parents[1]
     rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["zenoh_session.py"]
+    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["control_plane.py"]
 
 
 @pytest.mark.parametrize(
@@ -217,8 +214,8 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
             admission = {"generation": 0, "admitted_ns": 0, "from_ns": 0}
             return json.dumps(admission | {"address": None, "replaces": None}).encode()
 
-    monkeypatch.setattr(noack.runtime.process_entry, "ControlPlane", Silent)
-    monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)
+    monkeypatch.setattr(noack.runtime.run_process, "ControlPlane", Silent)
+    monkeypatch.setattr(noack.runtime.run_process, "lifeline_cut", lambda: False)
     asking = partial(_admitted, "plant", changed(ticket, launched=launched), Signals())
     if launched:
         assert asking().plane is cast(Any, tries[2])

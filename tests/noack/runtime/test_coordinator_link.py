@@ -9,12 +9,19 @@ from contextlib import suppress
 
 import pytest
 
-from cosim.live.tls_keys import TlsKeys, coordinator_context, new_tls_keys
+from cosim.live.remote_access import TlsKeys, coordinator_context, new_tls_keys
 from noack.core.errors import NoAnswerError, PeerError
-from noack.protocol.invitation_proof import Answer, InvitationProof
 from noack.runtime import coordinator_link as link_module
-from noack.runtime.connection_forwarder import Protection, Streams, forwarding
-from noack.runtime.coordinator_link import Destination, connect, coordinator_link
+from noack.runtime.coordinator_link import (
+    Answer,
+    Destination,
+    InvitationProof,
+    Protection,
+    Streams,
+    connect,
+    coordinator_link,
+    forwarding,
+)
 
 KEYS, KEY = new_tls_keys("127.0.0.1"), bytes(32)
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from noack.runtime import host_clock
-from noack.runtime.host_clock import clock_identity
+from noack.core import clock as host_clock
+from noack.core.clock import clock_identity
 
-_PRINT = "from noack.runtime.host_clock import clock_identity; print(clock_identity())"
+_PRINT = "from noack.core.clock import clock_identity; print(clock_identity())"
 
 
 def _elsewhere(*before: str) -> str:

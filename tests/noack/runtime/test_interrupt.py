@@ -33,7 +33,7 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
     [
         ["cosim.cli", "typer", "--version"],
         ["netem", "netem.channel", "--help"],
-        ["plant_server", "noack.runtime.process_entry", "--help"],
+        ["plant_server", "noack.runtime.run_process", "--help"],
     ],
 )
 def test_a_signal_during_the_imports_gives_one_line(

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from noack.core.errors import CallerError, PeerError
-from noack.runtime.invitation import (
+from noack.runtime.join_ticket import (
+    RemoteAccess,
+    Ticket,
     invitation_file,
     own_host,
     read_invitation,
     write_invitation,
 )
-from noack.runtime.join_ticket import RemoteAccess, Ticket
 from tests.fuzz.parsers.ticket import _TICKET
 
 REMOTE = RemoteAccess(

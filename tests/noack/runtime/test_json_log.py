@@ -14,8 +14,14 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from netem.__main__ import main
 from noack.core.errors import ExitStatus
-from noack.runtime.command_line import failed, print_to_stderr
-from noack.runtime.json_log import JsonLog, LogFormat, log_event, log_format
+from noack.runtime.command_line import (
+    JsonLog,
+    LogFormat,
+    failed,
+    log_event,
+    log_format,
+    print_to_stderr,
+)
 
 Object = dict[str, Any]
 

@@ -6,6 +6,8 @@ It also runs with a core that has sanitizers (tests/native/test_sanitized.py).
 import errno
 import os
 import signal
+import socket
+import struct
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,10 +19,8 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
-from noack.core.clock import SlewedRunClock
-from noack.core.clock_offset import ClockOffset, Exchange
+from noack.core.clock import ClockOffset, Exchange, SlewedClock, SlewedRunClock
 from noack.core.core_library import core
-from noack.core.slewed_clock import SlewedClock
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -67,6 +67,41 @@ def measurements(count: int, loops: int = 1) -> list[Message]:
         measurement(k + 1, draw.normal(size=2).tolist(), loop)
         for k in range(count) for loop in range(loops)
     ]  # fmt: skip
+
+
+UDP_SEGMENT, UDP_GRO = 103, 104
+DATAGRAM_BYTES = 32 + 2 * 8 + 16
+
+
+@pytest.mark.parametrize("together", [2, 40, 64])
+def test_datagrams_that_the_kernel_passes_together_are_handled_one_by_one(
+    content: dict[str, Any], together: int
+) -> None:
+    """More than the driver takes at once, the last message of each part shorter than others."""
+    given = measurements(4, 50)
+    with closing(Live("sensor", [scenario(content)] * 50)) as live:
+        live.peer.connect(live.address)
+        sizes = {len(live.encoder.encode(one)) for one in given}
+        assert len(sizes) == 1
+        head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", *sizes))]
+        for first in range(0, len(given), together):
+            part = b"".join(map(live.encoder.encode, given[first : first + together]))
+            live.peer.sendmsg([part + b"short"] if first else [part], head)
+        live.drive_until_accepted(len(given))
+        assert live.driver.core.sources[0].received == len(given) + len(
+            range(together, len(given), together)
+        )
+        rows = live.rows.tables[SENSOR_MEASUREMENT]
+        assert [row[0] for row in rows] == [one.loop for one in given]
+
+
+def test_messages_of_loops_that_tick_together_are_sent_together(content: dict[str, Any]) -> None:
+    with closing(Live("plant", [scenario(content)] * 50, since_ns=HOUR_NS)) as live:
+        live.peer.setsockopt(socket.IPPROTO_UDP, UDP_GRO, 1)
+        live.drive(lambda: live.driver.core.sent >= 500)
+        sizes = [len(one) for one in received(live.peer, 65_536)]
+        assert max(sizes) == 64 * DATAGRAM_BYTES
+        assert sum(sizes) == live.driver.core.sent * DATAGRAM_BYTES
 
 
 @pytest.mark.parametrize(("loops", "encrypted"), [(1, False), (1, True), (3, False), (70, True)])

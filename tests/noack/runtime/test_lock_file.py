@@ -10,7 +10,7 @@ import pytest
 
 from noack.core import file_access
 from noack.core.errors import MachineError
-from noack.runtime import lock_file
+from noack.runtime import private_folder
 from noack.runtime.private_folder import open_private
 
 
@@ -36,13 +36,13 @@ def test_a_file_is_stale_to_each_of_two_readers(monkeypatch: pytest.MonkeyPatch)
     found = []
 
     def and_look(*arguments: Any, **how: Any) -> bool:
-        monkeypatch.setattr(lock_file, "lock", file_access.lock)
+        monkeypatch.setattr(private_folder, "lock", file_access.lock)
         locked = file_access.lock(*arguments, **how)
-        found.extend(lock_file.live_lock_files("k"))
+        found.extend(private_folder.live_lock_files("k"))
         return locked
 
-    monkeypatch.setattr(lock_file, "lock", and_look)
-    assert lock_file.live_lock_files("k") == found == []
+    monkeypatch.setattr(private_folder, "lock", and_look)
+    assert private_folder.live_lock_files("k") == found == []
 
 
 def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
@@ -53,13 +53,13 @@ def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
     with ExitStack() as new:
 
         def stopped(*arguments: Any, **how: Any) -> bool:
-            monkeypatch.setattr(lock_file, "lock", file_access.lock)
-            new.enter_context(lock_file.lock_file("k", "lab", {}))
+            monkeypatch.setattr(private_folder, "lock", file_access.lock)
+            new.enter_context(private_folder.lock_file("k", "lab", {}))
             leave("lab.sock", "lab.sock.lock")
             return file_access.lock(*arguments, **how)
 
-        monkeypatch.setattr(lock_file, "lock", stopped)
-        lock_file.live_lock_files("k")
+        monkeypatch.setattr(private_folder, "lock", stopped)
+        private_folder.live_lock_files("k")
         assert names() == ["lab.json", "lab.sock", "lab.sock.lock"]
     assert names() == []
 
@@ -70,7 +70,7 @@ def test_a_file_that_cannot_be_written_leaves_nothing() -> None:
     try:
         with (
             pytest.raises(MachineError, match=r"lab\.json: cannot be written: File too large"),
-            lock_file.lock_file("k", "lab", {"long": "x" * 2000}),
+            private_folder.lock_file("k", "lab", {"long": "x" * 2000}),
         ):
             raise AssertionError("it was written")
     finally:

@@ -8,7 +8,7 @@ import pytest
 _PROGRAM = """
 import mmap, resource, sys
 from pathlib import Path
-from noack.runtime.memory_lock import lock_memory
+from noack.runtime.real_time_loop import lock_memory
 
 def resident_bytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
@@ -33,11 +33,11 @@ print(grown, faults_of_writing(small), int(status["VmLck"].split()[0]) * 1024)
 _FORKED = """
 import mmap, os, re, sys, threading
 from pathlib import Path
-from noack.runtime.memory_lock import lock_memory
+from noack.runtime.real_time_loop import lock_memory
 
 def private_bytes():
     text = Path("/proc/self/smaps_rollup").read_text()
-    return sum(int(kib) * 1024 for kib in re.findall("Private_.*: *([0-9]+) kB", text))
+    return sum(int(kib) * 1024 for kib in re.findall("Private_Dirty: *([0-9]+) kB", text))
 
 inherited = mmap.mmap(-1, 2**23, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 inherited.write(b"x" * 2**23)

@@ -13,15 +13,16 @@ from noack.protocol.wire_format import Flow
 from noack.runtime import udp_sockets
 from noack.runtime.address import LOOPBACK
 from noack.runtime.live_driver import LoopChannel
-from noack.runtime.peer_sockets import (
+from noack.runtime.udp_sockets import (
     IN_A_FLOOD,
     IN_AN_INTERVAL,
+    SHED,
     FloodWatch,
     SourceCount,
+    bind,
     enlarge_buffer,
     open_beside,
 )
-from noack.runtime.udp_sockets import SHED, bind
 from tests.noack.runtime.live_loops import Live, measurement, scenario
 
 

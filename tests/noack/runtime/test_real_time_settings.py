@@ -6,11 +6,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from noack.runtime.real_time_settings import _fifo
+from noack.runtime.real_time_loop import _fifo
 
 _PROGRAM = """
 import os, sys
-from noack.runtime.real_time_settings import realtime
+from noack.runtime.real_time_loop import realtime
 with realtime(True, int(sys.argv[1]), int(sys.argv[2])) as applied:
     if {applied["sched_fifo"], applied["affinity"]} != {"applied"}:
         sys.exit("skip: SCHED_FIFO needs a privilege, pinning two cores")

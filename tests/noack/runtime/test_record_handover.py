@@ -9,9 +9,8 @@ import pytest
 
 from noack.core.errors import NoAnswerError
 from noack.protocol.machine_interface import Record
-from noack.runtime.record_handover import OwnSpool, deliver_report
 from noack.runtime.spool import kept_run_name
-from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer
+from noack.runtime.telemetry import OwnSpool, ReceivedRows, TelemetryBuffer, deliver_report
 
 ROW = np.dtype([("number", "<i8")])
 

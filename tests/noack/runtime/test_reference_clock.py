@@ -15,16 +15,17 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record
 from noack.protocol.record_tables import LOST_NS
-from noack.runtime.arrival_times import HostClocks
-from noack.runtime.clock_record import FOUND, LOST, ClockRecord
 from noack.runtime.join_ticket import new_ticket
 from noack.runtime.reference_clock import (
+    FOUND,
+    LOST,
     LOST_AFTER_NS,
+    ClockRecord,
     ClockReport,
     ReferenceClock,
     reference_clock,
 )
-from noack.runtime.time_exchange import TimeReference, answering
+from noack.runtime.time_exchange import HostClocks, TimeReference, answering
 
 KEY = bytes(range(32))
 ROOMY = ClocksSection(largest_error_us=1e6)  # a busy machine gives wide bounds

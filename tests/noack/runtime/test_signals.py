@@ -7,7 +7,7 @@ import time
 import pytest
 
 from noack.core.errors import ExitStatus
-from noack.runtime.signals import Signals
+from noack.runtime.command_line import Signals
 
 
 def test_a_signal_forwarded_several_times_counts_once() -> None:

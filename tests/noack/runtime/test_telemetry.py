@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.log_lines import NOTICES, lines_in, notices_of
+from noack.runtime.spool import NOTICES, lines_in, notices_of
 from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer, first_row
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])

@@ -11,12 +11,20 @@ import numpy as np
 import pytest
 
 from benchmarks._driven_clocks import DrivenClocks
-from noack.core.clock_offset import ClockOffset, Restart, RestartCause
+from noack.core.clock import ClockOffset, Restart, RestartCause
 from noack.core.errors import CallerError
-from noack.protocol.time_format import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
-from noack.runtime.arrival_times import HostClocks
-from noack.runtime.time_exchange import MOST_AT_ONCE, TimeClient, TimeReference, answering
+from noack.runtime.time_exchange import (
+    MOST_AT_ONCE,
+    TIME_BYTES,
+    HostClocks,
+    TimeClient,
+    TimeDatagram,
+    TimeFormat,
+    TimeKind,
+    TimeReference,
+    answering,
+)
 
 KEY = bytes(range(32))
 LOOPBACKS = ("127.0.0.1", "::1")
