@@ -197,10 +197,9 @@ class Run:
         """Write all figures of the report into ``report-figures`` in the run directory.
 
         Args:
-            format: svg, png, pdf or pgf; pdf and pgf have the fonts of LaTeX, which need not be
-                installed.
+            format: svg, png or pdf; a PDF has the fonts of LaTeX, which need not be installed.
             width: ``"column"`` (3.5 in), ``"page"`` (7.16 in), or inches; by default a column for
-                pdf and pgf, and 10 in for svg and png.
+                pdf, and 10 in for svg and png.
 
         Returns:
             The paths.

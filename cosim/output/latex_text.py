@@ -1,4 +1,4 @@
-"""Plain text as LaTeX, for tables and labels of figures; it compiles with pdfLaTeX, too."""
+"""Plain text as LaTeX; it compiles with pdfLaTeX, too."""
 
 import re
 import unicodedata
@@ -34,7 +34,6 @@ _TYPESET = re.compile(
     r"|(?<=(?<![A-Za-z0-9_])[A-Za-z])_(?P<letter>[A-Za-z0-9])(?!\w)"
 )
 _DEEPEST, _LONGEST_SCRIPT = 4, 200
-_UNESCAPED_DOLLAR = re.compile(r"(?<!\\)\$")
 
 
 def latex_text(text: str, depth: int = 0) -> str:
@@ -74,20 +73,6 @@ def _closing(text: str, begin: int) -> int:
         if not depth:
             return place
     return -1
-
-
-def latex_label(text: str) -> str:
-    """Return a label of a figure, in which matplotlib's mathematics is between dollars."""
-    parts = _UNESCAPED_DOLLAR.split(text)
-    return "".join(
-        f"${_mathematics(part)}$" if i % 2 else latex_text(part.replace(r"\$", "$"))
-        for i, part in enumerate(parts)
-    )
-
-
-def _mathematics(text: str) -> str:
-    text = text.replace(r"\mathdefault", r"\mathrm")  # matplotlib's own command
-    return "".join(f"{_SYMBOLS[one]} " if one in _SYMBOLS else one for one in text)
 
 
 def _plain(text: str) -> str:

@@ -24,7 +24,7 @@ def fidelity(
         Path | None,
         typer.Option(
             "--out",
-            help="Write a figure of the differences over time (.svg, .png, .pdf, .pgf).",
+            help="Write a figure of the differences over time (.svg, .png, .pdf).",
         ),
     ] = None,
     width: cli.WidthOption = None,

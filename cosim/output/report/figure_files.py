@@ -39,22 +39,12 @@ FIGURE_SUFFIXES = tuple(f".{one}" for one in FigureFormat)
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format of the file's ending; the same figure gives the same bytes.
 
-    The images of a PGF picture are written beside it.
-
     Raises:
-        CallerError: another ending than .svg, .png, .pdf or .pgf.
+        CallerError: another ending than .svg, .png or .pdf.
         MachineError: the file cannot be written.
     """
     kind = _kind_of(path)
-    if kind is FigureFormat.PGF:
-        from cosim.output.report.pgf_picture import pgf_picture
-
-        with paper_fonts(figure):
-            code, images = pgf_picture(figure, path.stem)
-        for name, content in images.items():
-            write_whole(path.with_name(name), content)
-        write_whole(path, code)
-    elif kind is FigureFormat.PDF:
+    if kind is FigureFormat.PDF:
         with paper_fonts(figure), characters_of_paper_fonts(figure):
             content = _saved(figure, kind)
         write_whole(path, content)

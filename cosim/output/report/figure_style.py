@@ -69,7 +69,6 @@ _PAPER_SETTINGS: dict[Any, Any] = {
     "font.family": ["cmr10", "DejaVu Serif"],  # the second one has what the first one lacks
     "mathtext.fontset": "cm",
     "pdf.fonttype": 42,  # publishers refuse fonts of type 3
-    "pgf.rcfonts": False,  # the document's own
 }
 _DOLLAR = re.compile(r"(?<!\\)\$")
 _BOLD = ["cmb10", "DejaVu Serif"]

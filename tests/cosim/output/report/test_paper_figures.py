@@ -1,4 +1,4 @@
-"""Figures for papers: PDF and PGF with the fonts of LaTeX, written without a LaTeX."""
+"""Figures for papers: PDF with the fonts of LaTeX, written without a LaTeX."""
 
 import re
 from pathlib import Path
@@ -16,20 +16,14 @@ from cosim.output.figure_format import figure_files
 from cosim.output.report.figure_files import save_figure, save_figures
 from cosim.output.report.figure_style import characters_of_paper_fonts, settings
 from noack.core.errors import CallerError
-from tests.cosim.output.latex import compiled
-
-HOSTILE = r"50 % of A_1 & {x} #1 ^2 ~ \input{/etc/passwd} <M − 1> ‖x‖ 漢"
-IMAGE = "loops-img0.png"
 
 
-def figure_of(title: str, *, image: bool = False) -> Figure:
+def figure_of(title: str) -> Figure:
     with settings():
         figure = Figure(figsize=(4, 3))
         axes = figure.subplots()
         axes.set(title=title.replace("$", r"\$"), xlabel=r"norm $\|e_c\|$", yscale="log")
         axes.plot(np.arange(1, 9), 10.0 ** -np.arange(1, 9))
-        if image:
-            axes.imshow(np.arange(6.0).reshape(2, 3), extent=(1, 8, 1e-8, 1), aspect="auto")
     return figure
 
 
@@ -37,8 +31,7 @@ def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Pa
     figure = figure_of("title")
     save_figure(figure, tmp_path / "before.svg")
     before = dict(mpl.rcParams)
-    for kind in ("pdf", "pgf"):
-        save_figure(figure, tmp_path / f"a.{kind}")
+    save_figure(figure, tmp_path / "a.pdf")
     save_figure(figure, tmp_path / "after.svg")
     assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
     assert dict(mpl.rcParams) == before
@@ -66,29 +59,6 @@ def test_computer_modern_has_other_characters_at_the_place_of_some(tmp_path: Pat
     assert b"Cmtt10" in (tmp_path / "a.pdf").read_bytes()
 
 
-def test_a_pgf_picture_has_escaped_texts_and_no_commands_of_matplotlibs(tmp_path: Path) -> None:
-    save_figure(figure_of(HOSTILE), tmp_path / "a.pgf")
-    text = (tmp_path / "a.pgf").read_text()
-    assert r"50 \% of A\textsubscript{1} \& \{x\} \#1 \textasciicircum{}2" in text
-    assert r"\textbackslash{}input\{/etc/passwd\}" in text
-    assert r"\ensuremath{\|}x\ensuremath{\|} ?" in text
-    assert "mathdefault" not in text
-    assert re.search(r"\$\\mathrm\{10\^\{.*?\}\}\$", text)
-
-
-def test_an_image_is_beside_its_pgf_picture(tmp_path: Path) -> None:
-    save_figure(figure_of("map", image=True), tmp_path / "loops.pgf")
-    assert (tmp_path / IMAGE).read_bytes().startswith(b"\x89PNG")
-    assert f"{{{IMAGE}}}" in (tmp_path / "loops.pgf").read_text()
-
-
-def test_pgf_pictures_compile(tmp_path: Path) -> None:
-    save_figure(figure_of(HOSTILE), tmp_path / "a.pgf")
-    save_figure(figure_of("map", image=True), tmp_path / "loops.pgf")
-    body = r"\resizebox{\linewidth}{!}{\input{a.pgf}}\input{loops.pgf}"
-    assert compiled(body, ("pgf",), tmp_path).read_bytes().startswith(b"%PDF")
-
-
 def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
     def drawn() -> Figure:
         raise AssertionError
@@ -101,14 +71,14 @@ def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
 
 def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
-    words = ["report", str(run.directory), "--format", "pgf", "--json"]
+    words = ["report", str(run.directory), "--format", "pdf", "--json"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     names = sorted(path.name for path in (run.directory / "report-figures").iterdir())
     assert names == [
-        "errors.pgf", "input.pgf", "inter-event.pgf", "losses.pgf", "state-norm.pgf", "states.pgf",
+        "errors.pdf", "input.pdf", "inter-event.pdf", "losses.pdf", "state-norm.pdf", "states.pdf",
     ]  # fmt: skip
-    with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf, pgf'):
+    with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):
         run.save_figures("eps")
 
 
@@ -119,9 +89,6 @@ def test_figures_are_as_wide_as_a_paper_wants_with_legible_texts(tmp_path: Path)
             box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", path.read_bytes())
             assert box is not None
             assert float(box[1]) == pytest.approx(points, abs=0.01)
-    for path in run.save_figures("pgf"):
-        sizes = re.findall(r"\\fontsize\{([\d.]+)\}", path.read_text())
-        assert {float(size) for size in sizes} == {8.0}, path.name
     drawn = run.save_figures("svg")
     assert drawn[0].read_text().count('width="720pt"') == 1
 
