@@ -33,16 +33,16 @@ def fidelity(
     """Compare a run with the ideal loop in continuous time, effect by effect."""
     from cosim.analysis.fidelity import compute_fidelity
     from cosim.live.progress import PatientConsole
-    from cosim.output.fidelity_table import print_fidelity
-    from cosim.output.report.figure_files import save_drawn
-    from cosim.output.report.signal_figures import fidelity_figure
+    from cosim.output.figure_files import save_figure
+    from cosim.output.run_verdict import print_fidelity
+    from cosim.output.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
         found = compute_fidelity(load_record(path, loop))
         if out is not None:
-            save_drawn(lambda: fidelity_figure(found), out, width)
+            save_figure(fidelity_figure(found), out, width)
     if json:
         cli.print_json(found.as_json())
     else:

@@ -26,7 +26,7 @@ def summary(
     """
     from cosim.analysis.run_summary import outcome_of_loop
     from cosim.live.finalize import reopen
-    from cosim.output.run_result_tables import summary_tables
+    from cosim.output.run_tables import summary_tables
     from cosim.output.run_verdict import print_outcome
 
     outcome = outcome_of_loop(reopen(chosen_run(run_dir, runs)), loop)

@@ -5,14 +5,12 @@ from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.timing_statistics import latency_us, lateness_parts
-from cosim.output.report import signal_figures
-from cosim.output.report.axes import Bound, BoundKind
-from cosim.output.report.clock_figure import ClockErrors, clock_errors, clock_figure
-from cosim.output.report.loss_figure import LossPanel, loss_figure
+from cosim.output import signal_figures
+from cosim.output.figure_description import Bound, BoundKind, FigureDescription
+from cosim.output.signal_figures import ClockErrors, LossPanel
 from cosim.record.align import AlignedRun, aligned_parts
 from cosim.record.decimate import Reals, decimate, decimate_all
 from cosim.record.packet_outcomes import packet_outcomes
@@ -21,8 +19,11 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import (
+    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
+    LOST_NS,
+    OWNER,
     PLANT_STEP,
     Fate,
 )
@@ -33,24 +34,14 @@ Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKin
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
 
-class RunFigure(NamedTuple):
-    """A figure with its caption."""
-
-    name: str
-    figure: Figure
-    caption: str
-    description: str
-    """Text alternative of the figure."""
-
-
 BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
 
 
-def pictures(
+def run_figures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
-) -> dict[str, Callable[[], RunFigure]]:
-    """Return functions that draw the figures of a run, by name.
+) -> dict[str, Callable[[], FigureDescription]]:
+    """Return functions that describe the figures of a run, by name.
 
     Args:
         record: the run's record, of any length, including 0.
@@ -63,7 +54,7 @@ def pictures(
         with np.errstate(all="ignore"):  # a diverged run has figures, too
             return _thinned(record)
 
-    found = {
+    described = {
         "states": lambda: _states(record, aligned()),
         "errors": lambda: _errors(record, aligned().run, _bounding(envelopes, "e_c")),
         "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
@@ -72,15 +63,15 @@ def pictures(
         "losses": lambda: _losses(record),
     }
     if record.kind == "live" if timed is None else timed:
-        found |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
+        described |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
     if errors := clock_errors(record):
-        found["clocks"] = lambda: _clocks(record.scenario, errors)
-    return found
+        described["clocks"] = lambda: _clocks(record.scenario, errors)
+    return described
 
 
 def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
     return [
-        Bound(label, t_s, values, kind)
+        Bound(label=label, x=t_s, y=values, kind=kind)
         for label, what, t_s, values, kind in envelopes
         if what == quantity
     ]
@@ -128,7 +119,7 @@ def _reduced(record: RunRecord, table: str, column: str) -> tuple[Reals, Reals]:
     return np.concatenate(t_s), np.concatenate(values)
 
 
-def _states(record: RunRecord, aligned: _Thinned) -> RunFigure:
+def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
     crossed, joined = packet_outcomes(record), aligned.run
     events = record.events()
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "sequence")
@@ -136,7 +127,7 @@ def _states(record: RunRecord, aligned: _Thinned) -> RunFigure:
     forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.fate == Fate.FORCED])
     scenario, names = record.scenario, record.loop.state_names
     known = "x" if scenario.coverage.knows_state else "x̂"
-    figure = signal_figures.paper_figure(
+    return signal_figures.states_figure(
         mode=scenario.mode,
         t_s=_seconds(joined.t_ns),
         x=joined.x if aligned.true_x is None else aligned.true_x,
@@ -149,17 +140,13 @@ def _states(record: RunRecord, aligned: _Thinned) -> RunFigure:
         received_s=_seconds(deliveries["t_ns"]),
         forced=forced,
         title=scenario.name,
-    )
-    return RunFigure(
-        "states",
-        figure,
-        "States, and the times between transmissions and between deliveries. "
+        caption="States, and the times between transmissions and between deliveries. "
         + scenario.protocol.states_caption.format(known=known)
         + _known(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
-        f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
-        f"{len(events)} transmissions, of which {int(dropped.sum())} were lost, and for "
-        f"{len(deliveries)} deliveries, of which {int(forced.sum())} were forced.",
+        description=f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
+        f"Below, stems for {len(events)} transmissions, of which {int(dropped.sum())} were "
+        f"lost, and for {len(deliveries)} deliveries, of which {int(forced.sum())} were forced.",
     )
 
 
@@ -177,32 +164,34 @@ def _known(scenario: Scenario) -> str:
     return f"x̂ is the estimate of the observer, from {outputs}. "
 
 
-def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFigure:
+def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> FigureDescription:
     t_s = _seconds(joined.t_ns)
-    return RunFigure(
-        "errors",
-        signal_figures.error_figure(
-            t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
-        ),
-        record.scenario.protocol.error_caption
+    return signal_figures.error_figure(
+        t_s,
+        joined.e_s_norm,
+        joined.threshold,
+        joined.e_c_norm,
+        bounds,
+        caption=record.scenario.protocol.error_caption
         + (
             ""
             if record.scenario.coverage.knows_state
             else " Both are relative to x̂, the sensor's estimate of x."
         )
         + _dashed(bounds),
-        "Error norms over time on a logarithmic axis: "
+        description="Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
     )
 
 
-def _state_norm(record: RunRecord, bounds: list[Bound]) -> RunFigure:
+def _state_norm(record: RunRecord, bounds: list[Bound]) -> FigureDescription:
     t_s, x_norm = _state_norms(record)
-    return RunFigure(
-        "state-norm",
-        signal_figures.state_norm_figure(t_s, x_norm, bounds),
-        "Norm of the plant's state." + _dashed(bounds),
-        "Norm of the state over time on a logarithmic axis"
+    return signal_figures.state_norm_figure(
+        t_s,
+        x_norm,
+        bounds,
+        caption="Norm of the plant's state." + _dashed(bounds),
+        description="Norm of the state over time on a logarithmic axis"
         + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
     )
 
@@ -219,33 +208,36 @@ def _state_norms(record: RunRecord) -> tuple[Reals, Reals]:
     return np.concatenate(t_s), np.concatenate(norms)
 
 
-def _input(record: RunRecord) -> RunFigure:
+def _input(record: RunRecord) -> FigureDescription:
     names, table = record.loop.input_names, CONTROLLER_STEP
     title, caption = "Control input $u = K x_c$", "Control input u = K x_c, held between ticks."
     if record.scenario.network.actuation is not None:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
     t_s, u = _reduced(record, table, "u")
-    return RunFigure(
-        "input",
-        signal_figures.input_figure(t_s, u, names, title),
-        f"{caption} Equal inputs are drawn one inside the other.",
-        f"Control inputs {', '.join(names)} over time.",
+    return signal_figures.input_figure(
+        t_s,
+        u,
+        names,
+        title,
+        caption=f"{caption} Equal inputs are drawn one inside the other.",
+        description=f"Control inputs {', '.join(names)} over time.",
     )
 
 
-def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
+def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> FigureDescription:
     event_s = _seconds(record.events()["t_ns"])
-    return RunFigure(
-        "inter-event",
-        signal_figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
-        "Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
-        "Inter-event times on a logarithmic axis"
+    return signal_figures.inter_event_figure(
+        event_s,
+        lower_bounds,
+        record.scenario.horizon_s,
+        caption="Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
+        description="Inter-event times on a logarithmic axis"
         + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
     )
 
 
-def _losses(record: RunRecord) -> RunFigure:
+def _losses(record: RunRecord) -> FigureDescription:
     outcomes, network = packet_outcomes(record), record.scenario.network
     bursts = outcomes.loss_bursts()
     kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
@@ -265,17 +257,16 @@ def _losses(record: RunRecord) -> RunFigure:
         panels.append(
             LossPanel("Of actuations", "consecutive lost actuations", "bursts", lost, limit)
         )
-    return RunFigure(
-        "losses",
-        loss_figure(panels),
-        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
+    return signal_figures.loss_figure(
+        panels,
+        caption="Effective losses of updates: dropped, corrupted, or delivered out of order. "
         f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
-        f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
+        description=f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
         f"{network.longest_burst} consecutive losses are allowed.",
     )
 
 
-def _lateness(record: RunRecord) -> RunFigure:
+def _lateness(record: RunRecord) -> FigureDescription:
     scenario = record.scenario
     period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
     late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
@@ -283,41 +274,59 @@ def _lateness(record: RunRecord) -> RunFigure:
     longest = ", ".join(
         f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
     )
-    return RunFigure(
-        "lateness",
-        signal_figures.lateness_figure(late_us, period_us),
-        "Share of a process's steps with at least this lateness. Lateness is measured from the "
-        "deadline (plant, controller), the time of the measurement (sensor), or the arrival "
-        "of the datagram at the socket (network).",
-        f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
+    return signal_figures.lateness_figure(
+        late_us,
+        period_us,
+        caption="Share of a process's steps with at least this lateness. Lateness is measured "
+        "from the deadline (plant, controller), the time of the measurement (sensor), or the "
+        "arrival of the datagram at the socket (network).",
+        description="Complementary distribution of lateness on logarithmic axes; maximum: "
+        f"{longest}.",
     )
 
 
-def _latency(record: RunRecord) -> RunFigure:
+def _latency(record: RunRecord) -> FigureDescription:
     event_ns, taken_us = latency_us(record)
-    return RunFigure(
-        "latency",
-        signal_figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
-        "Sensor-to-controller latency: wall time from the event to the controller's update.",
-        f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
+    return signal_figures.latency_figure(
+        _seconds(event_ns),
+        taken_us,
+        record.scenario.horizon_s,
+        caption="Sensor-to-controller latency: wall time from the event to the controller's "
+        "update.",
+        description=f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
     )
 
 
-def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> RunFigure:
+def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
+    """Return the bounds of the processes whose clock is not the recorder's, by process."""
+    errors = {}
+    for table in CLOCK_TABLES:
+        if table not in record.tables:
+            continue
+        rows = record.columns(table, "t_ns", "error_ns")
+        if (rows["error_ns"] != 0).any():
+            error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
+            errors[OWNER[table]] = ClockErrors(rows["t_ns"] / NS_PER_S, error_us)
+    return errors
+
+
+def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDescription:
     assert scenario.clocks is not None  # else the record has no tables of clocks
     largest = ", ".join(
         f"{process} " + ("never known" if one.largest_us is None else f"{one.largest_us:.3g} µs")
         for process, one in errors.items()
     )
     lost = [process for process, one in errors.items() if one.lost.any()]
-    return RunFigure(
-        "clocks",
-        clock_figure(errors, scenario.clocks.largest_error_us, scenario.horizon_s),
-        "Bound of the difference between a process's time and the recorder's, for the processes "
-        f"on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with which "
-        "claims hold."
+    return signal_figures.clock_figure(
+        errors,
+        scenario.clocks.largest_error_us,
+        scenario.horizon_s,
+        caption="Bound of the difference between a process's time and the recorder's, for the "
+        f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
+        "which claims hold."
         + (f" Cross: from here on, the bound was lost ({', '.join(lost)})." if lost else ""),
-        f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
+        description="Bounds of the clocks' errors over time on a logarithmic axis; largest: "
+        f"{largest}.",
     )
 
 

@@ -1,25 +1,73 @@
-"""The width of figures, and the sizes that follow from it.
+"""Style of all figures drawn by matplotlib: the sizes that follow from their width, and settings.
 
 A page of noack shows figures of 10 inches. A paper prints them as wide as a column or a page, where
 texts must keep a size that one can read: a figure is laid out for its width, not scaled to it.
+This module does not use pyplot, and does not change matplotlib's global settings permanently.
 """
 
-import re
-import textwrap
-from collections.abc import Iterator
+import functools
+import io
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from cosim.output.figure_format import SCREEN_IN
+from cosim.output.palette import Colour
+
+# If matplotlib cannot write its cache, it warns in every run; the warning is of no use here.
+logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+P = ParamSpec("P")
+Rgb = tuple[float, float, float]
+
+INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
+"""Text and frames, grid lines, background; a page replaces them in dark mode."""
 
 _PAPER_DPI = 600  # what publishers require of line art
 _EM_PER_CHARACTER = 0.6
-_EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
 _POINTS_PER_IN = 72
+_SETTINGS: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": INK,
+    "axes.formatter.limits": (-4, 5),
+    "axes.formatter.use_mathtext": True,
+    "axes.facecolor": PAPER,
+    "axes.grid": True,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.titley": 1.0,
+    "figure.dpi": 100,
+    "figure.facecolor": PAPER,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "legend.borderaxespad": 0.3,
+    "legend.borderpad": 0.0,
+    "legend.columnspacing": 1.4,
+    "legend.frameon": False,
+    "legend.labelcolor": INK,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 5,
+    "mathtext.fontset": "dejavusans",
+    "savefig.dpi": 120,  # 1200 pixels wide
+    "svg.fonttype": "path",
+    "svg.hashsalt": "noack",
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+}
 
 
 class FigureLayout(NamedTuple):
@@ -91,8 +139,6 @@ _SCREEN = FigureLayout(SCREEN_IN)
 _WIDTH: ContextVar[FigureLayout] = ContextVar("figure_layout", default=_SCREEN)
 _ROOM_BESIDE_TITLE_IN = 5.0
 _LEAST_SCALE, _LEAST_BESIDE = 0.6, 0.4
-_SHORTEST_LINE = 8
-_UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
 
 
 def layout() -> FigureLayout:
@@ -103,15 +149,12 @@ def layout() -> FigureLayout:
 @contextmanager
 def figure_width(width_in: float) -> Iterator[None]:
     """Draw and save figures of this width within the context."""
-    token = _WIDTH.set(_of_paper(width_in) if width_in < SCREEN_IN else _wide(width_in))
+    is_paper = width_in < SCREEN_IN
+    token = _WIDTH.set(_of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in))
     try:
         yield
     finally:
         _WIDTH.reset(token)
-
-
-def _wide(width_in: float) -> FigureLayout:
-    return _SCREEN._replace(width_in=width_in)
 
 
 def _of_paper(width_in: float) -> FigureLayout:
@@ -125,28 +168,39 @@ def _of_paper(width_in: float) -> FigureLayout:
     )  # fmt: skip
 
 
-def fit_to_paper(figure: Figure) -> None:
-    """In a paper, make lines thinner and markers smaller, and break long labels of axes."""
-    space = layout()
-    if not space.is_paper:
-        return
-    for line in figure.findobj(Line2D):
-        assert isinstance(line, Line2D)
-        line.set_linewidth(line.get_linewidth() * space.line_scale)
-        line.set_markersize(line.get_markersize() * space.line_scale)
-        line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
-    character_in = _EM_PER_CHARACTER_OF_LABEL * space.label_pt / _POINTS_PER_IN
-    for axes in figure.axes:
-        place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
-        for axis, length_in in (
-            (axes.xaxis, place.width * width_in), (axes.yaxis, place.height * height_in),
-        ):  # fmt: skip
-            most = max(int(length_in / character_in), _SHORTEST_LINE)
-            axis.set_label_text(_wrapped(axis.get_label_text(), most))
+@contextmanager
+def settings(extra: Mapping[Any, Any] | None = None) -> Iterator[None]:
+    """Apply only these settings within the context, regardless of the user's matplotlibrc."""
+    with mpl.rc_context(), warnings.catch_warnings():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_SETTINGS | layout().settings() | dict(extra or {}))
+        # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
 
 
-def _wrapped(label: str, most: int) -> str:
-    """Break a label into lines; a unit in brackets stays in one line."""
-    bound = _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), label)
-    lines = textwrap.wrap(bound, most, break_long_words=False)
-    return "\n".join(lines).replace(_NO_BREAK, " ")
+class NotebookFigure(Figure):
+    """A figure that a notebook shows although it was not created by pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with settings():
+            self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Decorate a function that draws a figure: it draws with these settings."""
+
+    @functools.wraps(draw)
+    def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
+        with settings():
+            return draw(*arguments, **options)
+
+    return drawn
+
+
+def rgb(colour: Colour) -> Rgb:
+    """Return a colour of the palette in matplotlib's format."""
+    r, g, b = (part / 255 for part in colour)
+    return r, g, b
