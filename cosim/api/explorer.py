@@ -106,9 +106,10 @@ class Explorer:
             NoackError: there is no such state.
         """
         from cosim.interactive.exploration_figure import exploration_figure
+        from cosim.output.figure_drawing import draw
 
         _ = self.certificate
-        return exploration_figure(self._results.shown(self._state(state)))
+        return draw(exploration_figure(self._results.shown(self._state(state))))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from.

@@ -5,9 +5,8 @@ from typing import TypeVar
 
 from cosim.interactive.draft import Draft
 from cosim.interactive.ensemble import Ensemble, explore_ensemble
-from cosim.interactive.exploration import Exploration, why_not_exact
-from cosim.interactive.figure_curves import Shown
-from cosim.interactive.run_exploration import run_of
+from cosim.interactive.exploration import Exploration, run_of, why_not_exact
+from cosim.interactive.exploration_figure import Shown
 from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

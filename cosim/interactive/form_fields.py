@@ -13,8 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from cosim.interactive.controls import example_of
-from cosim.interactive.draft import Draft, DraftError, Mistake
-from cosim.interactive.toml_edit import value_text
+from cosim.interactive.draft import Draft, DraftError, Mistake, value_text
 from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import value_of

@@ -309,6 +309,6 @@ def _write_recording(
 
 
 def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
-    from cosim.output.report.report_page import write_report  # imports matplotlib
+    from cosim.output.report_page import write_report  # imports matplotlib
 
     return write_report(run, summary, run_dir, loop)

@@ -6,17 +6,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.output.all_certificates import SCHEDULE, Certificates
-from cosim.output.assumptions_table import print_assumptions
-from cosim.output.certificate_rows import constant_rows, plants_of
+from cosim.analysis.margin_search import MarginResult
+from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.output.result_tables import ResultTable
-from cosim.output.unlimited_losses_report import print_unlimited
-from noack.core.number_format import duration
+from cosim.output.run_verdict import print_assumptions
+from noack.core.number_format import duration, number
 from noack.theory.assumptions import assumptions
 from noack.theory.certified_bounds import BOX
 from noack.theory.envelope_formula import envelope_formula
 from noack.theory.network_limits import MOST_S
 from noack.theory.scenario_certificates import outside_box
+from noack.theory.unlimited_losses import UnlimitedLosses
 
 
 def print_certificates(console: Console, found: Certificates) -> None:
@@ -119,8 +119,8 @@ def _print_constants(console: Console, found: Certificates) -> None:
     if any(one.persistent_constants for one in certificates):
         console.print(
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
-            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ and "
-            "x_c − x̂.[/]"
+            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ "
+            "and x_c − x̂.[/]"
         )
     if any(one.other for one in certificates):
         console.print(
@@ -168,3 +168,121 @@ def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
     if any(certificate.constants for _, certificate in found):
         caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
         yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])
+
+
+_MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
+
+
+MARGIN_HEADINGS = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
+
+
+def margin_title(margin: MarginResult) -> str:
+    """Return the title of the table of the bounds."""
+    delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
+    mode = "model-based" if margin.mode == "model" else "zero-order hold"
+    times = f"with an update every {margin.period_s:g} s"
+    if not margin.is_periodic:
+        times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
+    return (
+        f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
+        f"{times}, {mode}{delay}"
+    )
+
+
+def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of the bounds."""
+    for m, found in margin.caps:
+        yield str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}", found.verdict
+
+
+def print_margin(console: Console, margin: MarginResult) -> None:
+    """Print the bounds for each M, and the verdicts."""
+    table = Table(title=margin_title(margin))
+    for heading in MARGIN_HEADINGS:
+        table.add_column(heading, justify="left" if heading == "verdict" else "right")
+    for *cells, verdict in margin_rows(margin):
+        table.add_row(*cells, f"[{_MARGIN_STYLES[verdict]}]{verdict}[/]")
+    console.print(table)
+    console.print(margin.verdict, soft_wrap=True, highlight=False)
+    if margin.period is not None:
+        text = f"for {margin.guarantee}: {margin.period.text}"
+        console.print(text, soft_wrap=True, highlight=False)
+    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
+    note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
+    if not margin.is_periodic:
+        note += " In brackets: the time to the next update."
+    console.print(f"[dim]{note}[/]")
+
+
+def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
+    """Yield the bounds of the growth for each M."""
+    rows = [*margin_rows(margin)]
+    yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
+
+
+_RARE = 1e-4
+"""Rows are shown from this probability on, up to the first one that is exceeded less often."""
+_MOMENT = {1: "mean", 2: "root mean square"}
+
+
+def print_unlimited(
+    console: Console, found: UnlimitedLosses | None, unpredictable: str | None
+) -> None:
+    """Print what holds although the network does not limit the losses."""
+    if unpredictable is not None:
+        console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
+    if found is None:
+        return
+    likely = [one for one in found.bursts if one.probability < 1 - _RARE]
+    if (
+        shown := [one for one in likely if one.probability > _RARE]
+        + [one for one in found.bursts if one not in likely][:1]
+    ):
+        table = Table(
+            title="without the guarantee: a run's longest burst of losses, and the bounds that "
+            f"hold as long as none is longer; runs of {found.horizon_s:g} s"
+        )
+        for heading in ("longest burst", "P(longer burst)", "events", "Δ", "X"):
+            table.add_column(heading, justify="right")
+        for one in shown:
+            table.add_row(
+                f"{one.most}", f"≤ {number(1 - one.probability, 3)}", f"≤ {one.events}",
+                number(one.delta, 4), number(one.state, 4),
+            )  # fmt: skip
+        console.print(table)
+    for sentence in sentences(found):
+        console.print(sentence, markup=False, highlight=False)
+
+
+def sentences(found: UnlimitedLosses) -> Iterator[str]:
+    """Yield what is certified about moments, and almost surely."""
+    p = f"{found.largest_probability:.4g}"
+    losses = f"independent losses with probability {p}"
+    if not found.is_independent:
+        losses = f"losses with probability at most {p} given any past"
+    for one in found.moments:
+        decay = f" e^(−{one.rate_per_s:.3g}t)" if one.rate_per_s else ""
+        yield (
+            f"Without the guarantee, {losses}: at every time t, the {_MOMENT[one.order]} of ‖x‖ is "
+            f"at most {one.state:.4g}{decay}, that of ‖e_c‖ at most "
+            f"{one.controller_error:.4g}{decay}."
+        )
+    if found.void is not None:
+        order = _MOMENT[len(found.moments) + 1]
+        yield f"Without the guarantee no {order} is certified: {found.void}."
+    if found.sure_rate_per_s is not None:
+        yield f"x decays almost surely, at every rate below {found.sure_rate_per_s:.3g} /s."
+    if found.paper_rate_per_s is not None:
+        at = ", ".join(
+            f"{_MOMENT[order]} at most {value:.4g}"
+            for order, value in enumerate(found.at_events, start=1)
+        )
+        yield (
+            f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "
+            f"almost surely, at every rate below {found.paper_rate_per_s:.3g} /s."
+        )
+    if found.moments or found.bursts:
+        yield (
+            "These are statements about many runs: one run cannot violate a mean. The "
+            "probabilities are bounds; a campaign shows the frequencies."
+        )

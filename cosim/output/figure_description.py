@@ -7,7 +7,7 @@ Arrays may have any length, including 0, and values that are not finite, which a
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -92,8 +92,8 @@ class Marks:
     """Width of the marker's strokes."""
     order: float = 2.0
     opacity: float = 1.0
-    stems: bool = False
-    """Draw a line from 0 to each point."""
+    stems: Colour | None = None
+    """Colour of lines from 0 to each point; None: no lines."""
     framed: bool = False
     """Draw a thin edge, so that points which touch can be told apart."""
     at_top: bool = False
@@ -243,15 +243,19 @@ class FigureDescription:
     """Title of the whole figure; beside it is the legend of the first panel."""
     scale: ColourScale | None = None
 
+    def captioned(self, caption: str, description: str = "") -> "FigureDescription":
+        """Return the figure with a caption and a text alternative."""
+        return replace(self, caption=caption, description=description)
 
-def one_panel(name: str, panel: Panel, height_in: float, **texts: str) -> FigureDescription:
-    """Describe a figure of one panel; ``texts`` are its caption and description."""
-    return FigureDescription(name=name, rows=[Row(panels=[panel], height_in=height_in)], **texts)
+
+def one_panel(name: str, panel: Panel, height_in: float) -> FigureDescription:
+    """Describe a figure of one panel."""
+    return FigureDescription(name=name, rows=[Row(panels=[panel], height_in=height_in)])
 
 
 def time_axis(t_s: Reals, *, numbers: bool = True, label: str = TIME) -> Axis:
     """Return the axis of times (k,) in ascending order, from 0 if they begin near 0."""
-    ends = (None, None)
+    ends: tuple[float | None, float | None] = (None, None)
     if len(t_s) and t_s[-1] > t_s[0]:
         start = 0.0 if 0 <= t_s[0] < 0.05 * t_s[-1] else float(t_s[0])
         ends = (start, float(t_s[-1]))

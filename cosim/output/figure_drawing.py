@@ -63,8 +63,6 @@ drawn smaller."""
 _IN_SHORT = (
     ("certified for every plant of the uncertainty ", "certified: "),
     ("certified for the scenario's ", "certified: "),
-    ("certified for the ", "certified: "),
-    ("certified from the ", "certified: "),
 )
 """What the legends of papers leave out of the labels of bounds."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
@@ -146,7 +144,7 @@ def _placed(described: FigureDescription) -> tuple[list[_Placed], tuple[float, f
         top_in = _head_in(_labels(described.rows[0].panels[0]), space.width_in)
     right_in = space.right_in + (4 * _BAR_IN if described.scale is not None else 0.0)
     for row in described.rows:
-        columns = _columns(row, space.width_in - right_in)
+        columns = _columns(row, space.width_in)
         for first in range(0, len(row.panels), columns):
             has_heading = bool(described.heading) and not placed
             line = _placed_line(row, first, columns, top_in, right_in, has_heading=has_heading)
@@ -377,18 +375,18 @@ def _(item: Marks, axes: Axes, norm: Normalize | None) -> Artist | None:
         "alpha": item.opacity, "zorder": item.order, "linestyle": "none",
     }  # fmt: skip
     if item.x_error is not None or item.y_error is not None:
-        errors = [None if e is None else np.atleast_2d(e)[:, seen] for e in
-                  (item.y_error, item.x_error)]  # fmt: skip
-        errors = [e[0] if e is not None and len(e) == 1 else e for e in errors]
-        points, *_ = axes.errorbar(x, y, *errors, elinewidth=1.0, markersize=size, **style)
-        return points
+        y_error, x_error = (
+            None if error is None else error[..., seen] for error in (item.y_error, item.x_error)
+        )
+        axes.errorbar(x, y, y_error, x_error, elinewidth=1.0, markersize=size, **style)
+        return Line2D([], [], markersize=size, **style)
     if item.reduced:
         keep = decimate(x, y, _MARKS)
         x, y = x[keep], y[keep]
         size *= min(max(math.sqrt(_CROWD / len(keep)), 0.4), 1.0)
-    if item.stems:
+    if item.stems is not None:
         feet = np.column_stack([np.zeros(len(x)), y, np.full(len(x), np.nan)])
-        axes.plot(np.repeat(x, 3), feet.ravel(), linewidth=1.0, color=style["color"])
+        axes.plot(np.repeat(x, 3), feet.ravel(), linewidth=1.0, color=rgb(item.stems))
     if item.framed:
         style |= {"markeredgecolor": PAPER, "markeredgewidth": 0.5}
     if item.at_top:
@@ -513,7 +511,7 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
     if described.ticks is not None:
         axis.set_ticks([*described.ticks], labels=[*described.ticks.values()])
     if not has_numbers:
-        axes.tick_params(**{"labelbottom" if which == "x" else "labelleft": False}, which="both")
+        axis.set_tick_params(which="both", labelbottom=False, labelleft=False)
     if described.about is not None and described.logarithmic:
         _limit_log_axis(axes, described.about, described.decades)
     elif described.about is not None:

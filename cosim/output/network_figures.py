@@ -1,7 +1,8 @@
 """The figures of loops that share a network: the network, the errors and states of all loops."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from cosim.output.figure_description import (
     plain,
     time_axis,
 )
+from cosim.output.run_figures import envelopes, run_figures
 from cosim.record.decimate import Reals
 from cosim.record.run_record import RecordedRun
 from noack.core.number_format import number
@@ -37,6 +39,28 @@ _MOST_ROWS = 24
 """Up to so many rows of the map have the names of their loops."""
 _BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
 _MEDIAN, _LARGEST = 2, 5
+
+
+def page_figures(
+    run: RecordedRun,
+    summary: Callable[[], RunSummary],
+    loop: str | None = None,
+    *,
+    bounded: bool = True,
+) -> Mapping[str, Callable[[], FigureDescription]]:
+    """Return functions that describe the figures of a run's page, or of a loop's, by name.
+
+    Args:
+        run: the record.
+        summary: returns the summary, which the figures of a network need.
+        loop: name of the loop; None for the run.
+        bounded: whether certified bounds are drawn, which are slow to compute.
+    """
+    if loop is None and run.names[1:]:
+        figures = {figure.name: figure for figure in network_figures(run, summary())}
+        return {name: partial(figures.__getitem__, name) for name in figures}
+    record = run.loop(loop)
+    return run_figures(record, envelopes(record) if bounded else ())
 
 
 def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescription]:
@@ -73,11 +97,10 @@ def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescrip
             description=f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at "
             f"most {number(largest)}.",
         ),
-        error_map(
-            over_time, names, stayed,
-            caption="Largest ‖e_c‖ of each loop in each interval; no colour before its first "
+        error_map(over_time, names, stayed).captioned(
+            "Largest ‖e_c‖ of each loop in each interval; no colour before its first "
             f"delivery.{order}",
-            description=f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
+            f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
     ]  # fmt: skip
 
@@ -89,7 +112,7 @@ def _link_rows(
     most = np.asarray(in_flight.max_by_interval, np.float64)
     mean = np.asarray(in_flight.mean_by_interval, np.float64)
     t_s = np.asarray((np.arange(len(mean)) + 0.5) * in_flight.width_s, np.float64)
-    queue = [
+    queue: list[Item] = [
         Band(x=t_s, low=np.zeros(len(t_s)), high=most, label="largest of an interval",
              colour=palette.NETWORK, opacity=0.3, steps="mid"),
         Line(x=t_s, y=mean, label="mean", colour=palette.NETWORK),
@@ -146,16 +169,13 @@ def _curves(t_s: Reals, values: Reals, names: Sequence[str]) -> list[Item]:
     ]  # fmt: skip
 
 
-def error_map(
-    over_time: LoopsOverTime, names: Sequence[str], stayed: Bools, **texts: str
-) -> FigureDescription:
+def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
     """Describe ‖e_c‖ of each loop, a row, over time, as colours.
 
     Args:
         over_time: the errors.
         names: of the loops.
         stayed: (L,) the loops that did not diverge, to which the colours are scaled.
-        texts: caption and description.
     """
     count, values = len(names), np.where(over_time.errors > 0, over_time.errors, np.nan)
     scale = None
@@ -181,7 +201,7 @@ def error_map(
     )  # fmt: skip
     height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
     rows = [Row(panels=[panel], height_in=height_in)]
-    return FigureDescription(name="map", rows=rows, scale=scale, **texts)
+    return FigureDescription(name="map", rows=rows, scale=scale)
 
 
 def _known(values: Reals, stayed: Bools) -> Reals:

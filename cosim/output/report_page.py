@@ -14,14 +14,13 @@ from urllib.parse import quote
 
 import numpy as np
 
-from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.over_time import worst_loop
 from cosim.analysis.summary_model import LoopSummary, RunSummary
 from cosim.output import glossary
 from cosim.output.figure_description import FigureDescription
 from cosim.output.network_figures import network_figures
 from cosim.output.page_kit import templates, value_text, words
-from cosim.output.run_figures import Envelope, run_figures
+from cosim.output.run_figures import envelopes, run_figures
 from cosim.output.run_tables import (
     CAPTION,
     HEADINGS,
@@ -42,7 +41,7 @@ from cosim.record.run_directory import (
     file_of_loop,
     read_object,
 )
-from cosim.record.run_record import RecordedRun, RunRecord
+from cosim.record.run_record import RecordedRun
 from noack.config.scenario import Scenario
 from noack.core.file_access import write_whole
 from noack.core.number_format import seconds
@@ -133,14 +132,6 @@ def write_report(
                if (run_dir / (file := file_of_loop(REPORT_FILE, one.name))).is_file()},
     )  # fmt: skip
     return write_whole(run_dir / file_of_loop(REPORT_FILE, loop), page(report))
-
-
-def envelopes(record: RunRecord) -> Sequence[Envelope]:
-    """Return the certified bounds of a loop, to be drawn with the quantities that they bound."""
-    try:
-        return RunClaims(record).envelopes()
-    except Exception:  # the figures are useful without them
-        return []
 
 
 def page(report: Report) -> str:

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.timing_statistics import latency_us, lateness_parts
 from cosim.output import signal_figures
@@ -67,6 +68,14 @@ def run_figures(
     if errors := clock_errors(record):
         described["clocks"] = lambda: _clocks(record.scenario, errors)
     return described
+
+
+def envelopes(record: RunRecord) -> Sequence[Envelope]:
+    """Return the certified bounds of a loop, to be drawn with the quantities that they bound."""
+    try:
+        return RunClaims(record).envelopes()
+    except Exception:  # the figures are useful without them
+        return []
 
 
 def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
@@ -140,11 +149,12 @@ def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
         received_s=_seconds(deliveries["t_ns"]),
         forced=forced,
         title=scenario.name,
-        caption="States, and the times between transmissions and between deliveries. "
+    ).captioned(
+        "States, and the times between transmissions and between deliveries. "
         + scenario.protocol.states_caption.format(known=known)
         + _known(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
-        description=f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
+        f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
         f"Below, stems for {len(events)} transmissions, of which {int(dropped.sum())} were "
         f"lost, and for {len(deliveries)} deliveries, of which {int(forced.sum())} were forced.",
     )
@@ -167,31 +177,25 @@ def _known(scenario: Scenario) -> str:
 def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> FigureDescription:
     t_s = _seconds(joined.t_ns)
     return signal_figures.error_figure(
-        t_s,
-        joined.e_s_norm,
-        joined.threshold,
-        joined.e_c_norm,
-        bounds,
-        caption=record.scenario.protocol.error_caption
+        t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
+    ).captioned(
+        record.scenario.protocol.error_caption
         + (
             ""
             if record.scenario.coverage.knows_state
             else " Both are relative to x̂, the sensor's estimate of x."
         )
         + _dashed(bounds),
-        description="Error norms over time on a logarithmic axis: "
+        "Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
     )
 
 
 def _state_norm(record: RunRecord, bounds: list[Bound]) -> FigureDescription:
     t_s, x_norm = _state_norms(record)
-    return signal_figures.state_norm_figure(
-        t_s,
-        x_norm,
-        bounds,
-        caption="Norm of the plant's state." + _dashed(bounds),
-        description="Norm of the state over time on a logarithmic axis"
+    return signal_figures.state_norm_figure(t_s, x_norm, bounds).captioned(
+        "Norm of the plant's state." + _dashed(bounds),
+        "Norm of the state over time on a logarithmic axis"
         + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
     )
 
@@ -215,24 +219,19 @@ def _input(record: RunRecord) -> FigureDescription:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
     t_s, u = _reduced(record, table, "u")
-    return signal_figures.input_figure(
-        t_s,
-        u,
-        names,
-        title,
-        caption=f"{caption} Equal inputs are drawn one inside the other.",
-        description=f"Control inputs {', '.join(names)} over time.",
+    return signal_figures.input_figure(t_s, u, names, title).captioned(
+        f"{caption} Equal inputs are drawn one inside the other.",
+        f"Control inputs {', '.join(names)} over time.",
     )
 
 
 def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> FigureDescription:
     event_s = _seconds(record.events()["t_ns"])
     return signal_figures.inter_event_figure(
-        event_s,
-        lower_bounds,
-        record.scenario.horizon_s,
-        caption="Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
-        description="Inter-event times on a logarithmic axis"
+        event_s, lower_bounds, record.scenario.horizon_s
+    ).captioned(
+        "Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
+        "Inter-event times on a logarithmic axis"
         + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
     )
 
@@ -257,11 +256,10 @@ def _losses(record: RunRecord) -> FigureDescription:
         panels.append(
             LossPanel("Of actuations", "consecutive lost actuations", "bursts", lost, limit)
         )
-    return signal_figures.loss_figure(
-        panels,
-        caption="Effective losses of updates: dropped, corrupted, or delivered out of order. "
+    return signal_figures.loss_figure(panels).captioned(
+        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
         f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
-        description=f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
+        f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
         f"{network.longest_burst} consecutive losses are allowed.",
     )
 
@@ -274,26 +272,21 @@ def _lateness(record: RunRecord) -> FigureDescription:
     longest = ", ".join(
         f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
     )
-    return signal_figures.lateness_figure(
-        late_us,
-        period_us,
-        caption="Share of a process's steps with at least this lateness. Lateness is measured "
+    return signal_figures.lateness_figure(late_us, period_us).captioned(
+        "Share of a process's steps with at least this lateness. Lateness is measured "
         "from the deadline (plant, controller), the time of the measurement (sensor), or the "
         "arrival of the datagram at the socket (network).",
-        description="Complementary distribution of lateness on logarithmic axes; maximum: "
-        f"{longest}.",
+        f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
     )
 
 
 def _latency(record: RunRecord) -> FigureDescription:
     event_ns, taken_us = latency_us(record)
     return signal_figures.latency_figure(
-        _seconds(event_ns),
-        taken_us,
-        record.scenario.horizon_s,
-        caption="Sensor-to-controller latency: wall time from the event to the controller's "
-        "update.",
-        description=f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
+        _seconds(event_ns), taken_us, record.scenario.horizon_s
+    ).captioned(
+        "Sensor-to-controller latency: wall time from the event to the controller's update.",
+        f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
     )
 
 
@@ -318,15 +311,13 @@ def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDesc
     )
     lost = [process for process, one in errors.items() if one.lost.any()]
     return signal_figures.clock_figure(
-        errors,
-        scenario.clocks.largest_error_us,
-        scenario.horizon_s,
-        caption="Bound of the difference between a process's time and the recorder's, for the "
+        errors, scenario.clocks.largest_error_us, scenario.horizon_s
+    ).captioned(
+        "Bound of the difference between a process's time and the recorder's, for the "
         f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
         "which claims hold."
         + (f" Cross: from here on, the bound was lost ({', '.join(lost)})." if lost else ""),
-        description="Bounds of the clocks' errors over time on a logarithmic axis; largest: "
-        f"{largest}.",
+        f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
     )
 
 

@@ -6,6 +6,7 @@ The terminal (:mod:`cosim.output.run_verdict`), the report and the files of ``--
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from cosim.analysis.fidelity import is_against
@@ -43,6 +44,7 @@ CAPTION = (
     "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
+_FEW = 3
 
 
 def summary_tables(summary: RunSummary) -> Iterator[ResultTable]:
@@ -71,6 +73,29 @@ def shares_network(summary: RunSummary) -> bool:
 def mode_words(mode: str) -> str:
     """Return what the controller does between updates."""
     return "model-based" if mode == "model" else "zero-order hold"
+
+
+def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
+    """Return what a run was, how it ended, and its results, in a few lines."""
+    loop, shared = summary.loops[0], shares_network(summary)
+    mode = f"{len(summary.loops)} loops" if shared else mode_words(loop.mode)
+    verdicts = Counter(str(claim.verdict) for one in summary.loops for claim in one.claims)
+    norms = (loop.initial_state_norm, loop.final_state_norm)
+    of_loop = [
+        (
+            "events",
+            f"{loop.events}; {loop.deliveries} received, {loop.drops} lost, "
+            f"longest loss burst {loop.longest_loss_burst}",
+        ),
+        ("‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)),
+    ]
+    return [
+        ("run", f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"),
+        ("ended", f"at {summary.reached_s:g} s of {summary.horizon_s:g} s: {summary.exit.reason}"),
+        *(network_rows(summary)[:_FEW] if shared else of_loop),
+        ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
+        ("directory", str(directory)),
+    ]  # fmt: skip
 
 
 # One loop

@@ -62,7 +62,6 @@ def states_figure(
     forced: Flags,
     title: str = "",
     x_hat: Reals | None = None,
-    **texts: str,
 ) -> FigureDescription:
     """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
@@ -79,7 +78,6 @@ def states_figure(
         forced: (d,) whether the guarantee forced the delivery.
         title: title of the run, shown after "MB-ET" or "ZOH-ET".
         x_hat: (k, n) the sensor's estimate of x; None if it measures x exactly.
-        texts: caption and description.
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
@@ -116,7 +114,6 @@ def states_figure(
                 items=_receptions(received_s, received, forced, broadcast_s[dropped]),
             )], height_in=1.2),
         ],
-        **texts,
     )  # fmt: skip
 
 
@@ -141,30 +138,25 @@ def _intervals(t_s: Reals) -> Reals:
 
 def _broadcasts(t_s: Reals, interval_s: Reals, dropped: Flags) -> list[Item]:
     return [
-        Marks(x=t_s[~dropped], y=interval_s[~dropped], label="sent", colour=SENSOR, stems=True),
+        Marks(x=t_s[~dropped], y=interval_s[~dropped], label="sent", colour=SENSOR, stems=SENSOR),
         Marks(x=t_s[dropped], y=interval_s[dropped], label="sent, lost", colour=LOST, marker="x",
-              size=6.5, stroke=1.8, stems=True),
+              size=6.5, stroke=1.8, stems=SENSOR),
     ]  # fmt: skip
 
 
 def _receptions(t_s: Reals, interval_s: Reals, forced: Flags, dropped_s: Reals) -> list[Item]:
     return [
         Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER,
-              stems=True),
+              stems=CONTROLLER),
         Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED,
-              marker="D", size=6.0, stems=True),
+              marker="D", size=6.0, stems=CONTROLLER),
         Marks(x=dropped_s, y=np.zeros(len(dropped_s)), label="lost", colour=LOST, marker="x",
               order=3),
     ]  # fmt: skip
 
 
 def error_figure(
-    t_s: Reals,
-    e_s_norm: Reals,
-    threshold: Reals,
-    e_c_norm: Reals,
-    bounds: Sequence[Bound] = (),
-    **texts: str,
+    t_s: Reals, e_s_norm: Reals, threshold: Reals, e_c_norm: Reals, bounds: Sequence[Bound] = ()
 ) -> FigureDescription:
     """‖e_s‖ with its threshold, and ‖e_c‖ with its bounds, on a logarithmic axis.
 
@@ -174,22 +166,19 @@ def error_figure(
         threshold: (k,) threshold of the trigger.
         e_c_norm: (k,) ‖x_c − x‖; NaN where unknown.
         bounds: certified bounds on ‖e_c‖.
-        texts: caption and description.
     """
     lines = [
         Line(x=t_s, y=e_c_norm, label=r"$\|e_c\|$ controller", colour=CONTROLLER, width=2.6),
         Line(x=t_s, y=e_s_norm, label=r"$\|e_s\|$ sensor", colour=SENSOR, width=1.1),
         Line(x=t_s, y=threshold, label="threshold", colour=THRESHOLD, width=1.8),
     ]
-    return _norms("errors", "Error norms", lines, bounds, 2.7, texts)
+    return _norms("errors", "Error norms", lines, bounds, 2.7)
 
 
-def state_norm_figure(
-    t_s: Reals, x_norm: Reals, bounds: Sequence[Bound] = (), **texts: str
-) -> FigureDescription:
+def state_norm_figure(t_s: Reals, x_norm: Reals, bounds: Sequence[Bound] = ()) -> FigureDescription:
     """‖x‖, (k,) at times (k,), with its bounds, on a logarithmic axis."""
     line = Line(x=t_s, y=x_norm, label=r"$\|x\|$ plant", colour=PLANT, width=2.4)
-    return _norms("state-norm", "Norm of the state", [line], bounds, 2.1, texts)
+    return _norms("state-norm", "Norm of the state", [line], bounds, 2.1)
 
 
 def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
@@ -200,22 +189,21 @@ def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
         for i, (stage, norms) in enumerate(zip(fidelity.stages, fidelity.stage_norms, strict=True))
     ]  # fmt: skip
     title = f"{plain(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
-    return _norms("fidelity", title, lines, (), 2.7, {})
+    return _norms("fidelity", title, lines, (), 2.7)
 
 
 def _norms(
     name: str, title: str, lines: Sequence[Line], bounds: Sequence[Bound], height_in: float,
-    texts: Mapping[str, str],
 ) -> FigureDescription:  # fmt: skip
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
     measured = np.concatenate([line.y for line in lines])
     y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
     panel = Panel(title=title, items=[*lines, *bounds], x=time_axis(lines[0].x), y=y)
-    return one_panel(name, panel, height_in, **texts)
+    return one_panel(name, panel, height_in)
 
 
 def input_figure(
-    t_s: Reals, u: Reals, input_names: Sequence[str], title: str = "Control input", **texts: str
+    t_s: Reals, u: Reals, input_names: Sequence[str], title: str = "Control input"
 ) -> FigureDescription:
     """Control inputs; each is held until the next.
 
@@ -224,7 +212,6 @@ def input_figure(
         u: (k, m) inputs.
         input_names: m names.
         title: of the figure.
-        texts: caption and description.
     """
     m = len(input_names)
     lines = [
@@ -235,11 +222,11 @@ def input_figure(
         for i, name in enumerate(input_names)
     ]  # fmt: skip
     panel = Panel(title=title, items=lines, x=time_axis(t_s), y=Axis(label="input"))
-    return one_panel("input", panel, 1.7, **texts)
+    return one_panel("input", panel, 1.7)
 
 
 def inter_event_figure(
-    broadcast_s: Reals, bounds: Sequence[Bound] = (), until_s: float | None = None, **texts: str
+    broadcast_s: Reals, bounds: Sequence[Bound] = (), until_s: float | None = None
 ) -> FigureDescription:
     """Inter-event times t_i − t_{i−1} over time, with a histogram.
 
@@ -247,15 +234,14 @@ def inter_event_figure(
         broadcast_s: (e,) times t_i of all transmissions.
         bounds: lower bounds of the inter-event time, certified or from the paper's formula.
         until_s: end of the time axis; by default the last event.
-        texts: caption and description.
     """
     y = Axis(label="inter-event time [s]", logarithmic=True)
-    items = [*bounds, _dots(broadcast_s[1:], np.diff(broadcast_s), SENSOR)]
-    return _over_time("inter-event", "Inter-event times", items, y, until_s, texts)
+    items: list[Item] = [*bounds, _dots(broadcast_s[1:], np.diff(broadcast_s), SENSOR)]
+    return _over_time("inter-event", "Inter-event times", items, y, until_s)
 
 
 def latency_figure(
-    t_s: Reals, latency_us: Reals, until_s: float | None = None, **texts: str
+    t_s: Reals, latency_us: Reals, until_s: float | None = None
 ) -> FigureDescription:
     """Sensor-to-controller latency over time, with a histogram.
 
@@ -263,11 +249,10 @@ def latency_figure(
         t_s: (d,) event times of the updates that arrived.
         latency_us: (d,) wall µs from the event to the controller's update.
         until_s: end of the time axis; by default the last event.
-        texts: caption and description.
     """
     y = Axis(label="latency [wall µs]", logarithmic=True)
-    items = [_dots(t_s, latency_us, CONTROLLER)]
-    return _over_time("latency", "Sensor-to-controller latency", items, y, until_s, texts)
+    items: list[Item] = [_dots(t_s, latency_us, CONTROLLER)]
+    return _over_time("latency", "Sensor-to-controller latency", items, y, until_s)
 
 
 def _dots(t_s: Reals, values: Reals, colour: Colour) -> Marks:
@@ -276,7 +261,6 @@ def _dots(t_s: Reals, values: Reals, colour: Colour) -> Marks:
 
 def _over_time(
     name: str, title: str, items: Sequence[Item], y: Axis, until_s: float | None,
-    texts: Mapping[str, str],
 ) -> FigureDescription:  # fmt: skip
     """Describe values over time, and their histogram on the same logarithmic axis."""
     dots = items[-1]
@@ -288,7 +272,7 @@ def _over_time(
         title=title, items=items, x=Axis(label=TIME, ends=ends), y=y,
         beside=Panel(items=[bars], x=Axis(label="count", whole=True), y=Axis(logarithmic=True)),
     )  # fmt: skip
-    return one_panel(name, panel, 2.1, **texts)
+    return one_panel(name, panel, 2.1)
 
 
 class LossPanel(NamedTuple):
@@ -304,13 +288,13 @@ class LossPanel(NamedTuple):
     limit: int | None
 
 
-def loss_figure(panels: Sequence[LossPanel], **texts: str) -> FigureDescription:
+def loss_figure(panels: Sequence[LossPanel]) -> FigureDescription:
     """The losses that occurred, beside what the guarantee allows: histograms side by side."""
     row = Row(
         panels=[*map(_loss_panel, panels)], height_in=1.9, narrowest_in=_LOSSES_NARROWEST_IN,
         widest_in=_LOSSES_WIDEST_IN,
     )  # fmt: skip
-    return FigureDescription(name="losses", rows=[row], **texts)
+    return FigureDescription(name="losses", rows=[row])
 
 
 def _loss_panel(panel: LossPanel) -> Panel:
@@ -336,14 +320,13 @@ def _loss_panel(panel: LossPanel) -> Panel:
 
 
 def lateness_figure(
-    lateness_us: Mapping[str, QuantileSketch], period_us: float | None = None, **texts: str
+    lateness_us: Mapping[str, QuantileSketch], period_us: float | None = None
 ) -> FigureDescription:
     """Share of steps with at least a given lateness, per process.
 
     Args:
         lateness_us: by process, the lateness of its steps in wall µs.
         period_us: the plant's period in wall µs, beyond which a step counts as late.
-        texts: caption and description.
     """
     items: list[Item] = []
     for i, (process, late_us) in enumerate(lateness_us.items()):
@@ -360,7 +343,7 @@ def lateness_figure(
         x=Axis(label="lateness [wall µs]", logarithmic=True),
         y=Axis(label="share of steps at least as late", logarithmic=True),
     )
-    return one_panel("lateness", panel, 2.5, **texts)
+    return one_panel("lateness", panel, 2.5)
 
 
 def _later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
@@ -396,7 +379,7 @@ class ClockErrors(NamedTuple):
 
 
 def clock_figure(
-    errors: Mapping[str, ClockErrors], allowed_us: float, until_s: float | None = None, **texts: str
+    errors: Mapping[str, ClockErrors], allowed_us: float, until_s: float | None = None
 ) -> FigureDescription:
     """Bound of the error of each process's clock over time; it has a gap while it is lost.
 
@@ -405,7 +388,6 @@ def clock_figure(
         allowed_us: largest bound with which claims hold; crosses at this height show where a bound
             was lost.
         until_s: end of the time axis; by default the last comparison.
-        texts: caption and description.
     """
     last_s = max((one.t_s.max(initial=0.0) for one in errors.values()), default=0.0)
     last_s = last_s if until_s is None else until_s
@@ -430,4 +412,4 @@ def clock_figure(
         x=time_axis(np.array([0.0, last_s])),
         y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
     )
-    return one_panel("clocks", panel, 1.9, **texts)
+    return one_panel("clocks", panel, 1.9)

@@ -43,8 +43,8 @@ def certify(
 
     Exit status 1: nothing can be certified.
     """
-    from cosim.output.all_certificates import certificates_of
     from cosim.output.certificate_report import certificate_tables, print_certificates
+    from cosim.output.certificates import certificates_of
 
     loaded = cli.load_scenario(scenario, settings)
     if weight == "chosen":

@@ -42,7 +42,7 @@ def margin(
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.live.progress import PatientConsole
-    from cosim.output.margin_report import margin_tables, print_margin
+    from cosim.output.certificate_report import margin_tables, print_margin
     from noack.config.resolution import resolve
 
     if play and json:

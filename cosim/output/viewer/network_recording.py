@@ -33,12 +33,9 @@ from cosim.analysis.over_time import QUANTILES, WorstLoop, quantiles
 from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.pictures.network_picture import NetworkDiagram
-from cosim.output.viewer.pictures.picture import panel
-from cosim.output.viewer.pictures.picture_choice import picture_of
-from cosim.output.viewer.recording import LoopView
-from cosim.output.viewer.recording_file import Nanoseconds, RecordingFile
-from cosim.output.viewer.recording_text import about
+from cosim.output.viewer.network_diagram import NetworkDiagram
+from cosim.output.viewer.pictures.picture import panel, picture_of
+from cosim.output.viewer.recording import LoopView, Nanoseconds, RecordingFile, about
 from cosim.record.decimate import Reals, is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE

@@ -11,12 +11,10 @@ import numpy as np
 from cosim.analysis.over_time import loops_over_time, worst_loop
 from cosim.analysis.summary_model import RunSummary
 from cosim.output.viewer.live_viewer import LiveView
+from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.network_recording import ERROR, PICTURED, SIZE, NetworkRecording
-from cosim.output.viewer.pictures.network_picture import NetworkDiagram
-from cosim.output.viewer.pictures.picture_choice import picture_of
-from cosim.output.viewer.recording import RunView
-from cosim.output.viewer.recording_file import ViewError
-from cosim.output.viewer.recording_text import about
+from cosim.output.viewer.pictures.picture import picture_of
+from cosim.output.viewer.recording import RunView, ViewError, about
 from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.decimate import is_long
 from cosim.record.environment import Kind

@@ -10,6 +10,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from cosim.output.network_table import loop_row, network_rows
+from cosim.output.report.network_figures import error_map, norms_figure
 from typer.testing import CliRunner, Result
 
 from cosim.analysis.network_summary import in_flight
@@ -24,9 +26,7 @@ from cosim.analysis.over_time import (
 from cosim.analysis.summary_model import ExitPart, read_summary
 from cosim.cli import app
 from cosim.live.finalize import reopen
-from cosim.output.network_table import loop_row, network_rows
-from cosim.output.report.network_figures import error_map, norms_figure
-from cosim.output.viewer.opening_time import opening_time_ns
+from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record, load_run
 from noack.config.resolution import network_tables

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.cli import app
-from cosim.output.all_certificates import (
+from cosim.output.certificates import (
     IDEAL,
     SCHEDULE,
     Certificates,

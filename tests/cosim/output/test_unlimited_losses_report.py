@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cosim.output.all_certificates import Certificates
 from cosim.output.certificate_report import print_certificates
+from cosim.output.certificates import Certificates
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.recording_file import ViewError
+from cosim.output.viewer.recording import ViewError
 from cosim.output.viewer.run_view import write_loop_view
 from cosim.record import decimate, run_record
 from cosim.record.environment import write_environment

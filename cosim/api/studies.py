@@ -1,20 +1,109 @@
-"""Campaigns: a scenario over a grid of settings, with many random draws at each point."""
+"""The certificates of a scenario, and its margin of losses."""
 
 import shutil
 import sys
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
+from cosim.api.runs import Run
+from cosim.api.scenarios import Source, load
+from cosim.measurement.network_measurement import Measurement, MeasurementOptions
+from cosim.measurement.trace_sources import read_source
+from cosim.output.certificates import Certificates, certificates_of
 from cosim.shipped_files import find_shipped
+from noack.config.resolution import resolve
 from noack.core.errors import CallerError
 from noack.core.python_process import cores
 from noack.core.row_display import Rows, as_html, as_text
+from noack.theory.joint_spectral_radius import ACCURACY
+from noack.traces.shipped_traces import find_trace
+
+
+def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
+    """Return the certificates of a scenario, with their constants and conditions.
+
+    >>> import noack
+    >>> found = noack.certify("lane_following")
+    >>> found.schedule.constants is None  # there is one
+    False
+    >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
+    no two events closer than 8 ms
+
+    Args:
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
+            that more can be certified, which takes some seconds.
+        late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
+            own value.
+
+    Raises:
+        NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
+            the paper's, its plant is not linear or is disturbed, or the state is not fully
+            measured.
+    """
+    return certificates_of(load(scenario), weight, late)
+
+
+def margin(
+    scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
+) -> MarginResult:
+    """Return the largest M for which a loop is stable under every loss pattern.
+
+    >>> import noack
+    >>> noack.margin("lane_periodic", most_m=3, period=False).stable_m
+    3
+
+    Args:
+        scenario: a scenario whose trigger has a longest time between two events, as ``periodic``
+            and ``deadline`` have, or a source that :func:`noack.load` accepts.
+        most_m: largest M to examine.
+        accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
+        period: whether to search for the longest period with the scenario's own M, too.
+
+    Raises:
+        NoackError: the scenario is wrong; or its trigger has no longest time, its loop is not
+            linear, or its delay varies or is not below the shortest period.
+    """
+    return find_margin(
+        resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
+    )
+
+
+def measure(
+    *sources: str | PathLike[str],
+    deadline_s: float | None = None,
+    outage_s: float | None = None,
+    shares: Sequence[float] | None = None,
+) -> Measurement:
+    """Measure a network from a packet trace, as ``noack measure`` does.
+
+    >>> import noack
+    >>> found = noack.measure("rural_n8_10kmh", deadline_s=0.1)
+    >>> found.longest_loss_burst >= 1
+    True
+
+    Args:
+        sources: a file, the name of a shipped trace, or files that belong together.
+        deadline_s: a packet that takes longer counts as lost.
+        outage_s: loss bursts of this duration or more are outages; by default a test decides.
+        shares: shares of loss bursts and packets for which M is given.
+
+    Raises:
+        NoackError: a file cannot be read, or is not a trace.
+    """
+    trace = read_source([find_trace(str(source)) for source in sources])
+    options = MeasurementOptions(deadline_s=deadline_s, outage_s=outage_s)
+    if shares is not None:
+        options = MeasurementOptions(deadline_s, tuple(shares), outage_s=outage_s)
+    return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), trace.notes)
+
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -114,15 +203,16 @@ class CampaignResult:
         Raises:
             NoackError: the campaign has no such figure.
         """
+        from cosim.output.figure_drawing import draw
         from cosim.studies.campaign.campaign_figures import figures
 
-        drawn = {}
-        for name, one, _ in figures(self._finished.summary, self._finished.store):
-            if figure in (None, name):
-                return one
-            drawn[name] = one
+        known = []
+        for described in figures(self._finished.summary, self._finished.store):
+            if figure in (None, described.name):
+                return draw(described)
+            known.append(described.name)
         named = f'"{figure}": no such figure' if figure else "no figure"
-        raise CallerError(f"{named} in this campaign; it has {', '.join(drawn) or 'none'}")
+        raise CallerError(f"{named} in this campaign; it has {', '.join(known) or 'none'}")
 
     def report(self) -> Path:
         """Return the path of the page with all tables and figures."""
@@ -216,3 +306,57 @@ def _table(rows: list[dict[str, Any]]) -> "pa.Table":
     import pyarrow as pa
 
     return pa.Table.from_pylist(rows)
+
+
+if TYPE_CHECKING:
+    from cosim.output.result_tables import ResultTable
+
+Result = Run | Certificates | MarginResult | CampaignResult
+
+
+def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
+    """Write the tables of a result, each as LaTeX (booktabs) and as CSV, as ``--tables`` does.
+
+    >>> import noack, tempfile
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> files = noack.save_tables(noack.certify("lane_following"), folder.name)
+    >>> [file.name for file in files]
+    ['certificates.tex', 'certificates.csv', 'limits.tex', 'limits.csv']
+    >>> folder.cleanup()
+
+    Args:
+        result: a run, or what :func:`noack.certify`, :func:`noack.margin` or
+            :func:`noack.campaign` returned.
+        folder: where the files are written; it is made if it does not exist.
+
+    Returns:
+        The paths.
+
+    Raises:
+        NoackError: it is another object, or a file cannot be written.
+    """
+    from cosim.output.result_tables import save_tables as save
+
+    return save(_tables(result), Path(folder))
+
+
+def _tables(result: Result) -> "Iterable[ResultTable]":
+    """Return the tables that the command of such a result prints."""
+    match result:
+        case Run():
+            from cosim.output.run_tables import summary_tables
+
+            return summary_tables(result.summary)
+        case Certificates():
+            from cosim.output.certificate_report import certificate_tables
+
+            return certificate_tables(result)
+        case MarginResult():
+            from cosim.output.certificate_report import margin_tables
+
+            return margin_tables(result)
+        case CampaignResult():
+            from cosim.studies.campaign.campaign_report import campaign_tables
+
+            return campaign_tables(result._finished.summary)
+    raise CallerError(f"{type(result).__name__}: has no tables")

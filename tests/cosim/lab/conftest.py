@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cosim.lab.page.lab_browser import Served
+from tests.cosim.lab.lab_browser import Served
 from tools.screenshot_recording import Browser
 
 

@@ -11,9 +11,8 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from cosim.lab.page import address_guard, lab_server
-from cosim.lab.page.address_guard import AddressGuard
-from cosim.lab.page.lab_server import LabOptions
+from cosim.lab.lab_server import AddressGuard, LabOptions
+from cosim.lab import lab_server
 
 SECRET, OPENING = "s" * 43, "o" * 43
 

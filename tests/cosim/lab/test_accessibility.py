@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 pytest.importorskip("axe_core_python", reason="axe-core-python is not installed")
 
-from tests.cosim.lab.page.lab_browser import TEXT, Page
+from tests.cosim.lab.lab_browser import TEXT, Page
 from tools.screenshot_recording import Browser
 
 TABS = ("explore", "run live", "recorded runs", "tutorial")

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from tests.cosim.lab.page.lab_browser import TEXT, Page, Served
+from tests.cosim.lab.lab_browser import TEXT, Page, Served
 from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
 

@@ -1,15 +1,18 @@
 """Recorded runs: key numbers, claims and figures; replay and fidelity on request."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
+from fastapi import FastAPI
+from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
 
-from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
-from cosim.lab.page.run_verdict_card import show_verdict
+from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.output.figure_format import SCREEN_IN
+from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
 from noack.core.errors import NoackError
 
 _COLUMN_IN = 3.5
@@ -36,9 +39,9 @@ class Opened(NamedTuple):
 def opened(directory: Path, width_in: float) -> Opened:
     """Read a run and draw figures of a width; called in the worker process."""
     import noack
-    from cosim.api.run_facts import run_facts
-    from cosim.output.report.figure_files import inline
-    from cosim.output.report.figure_layout import figure_width
+    from cosim.output.figure_files import markup_of
+    from cosim.output.figure_style import figure_width
+    from cosim.output.run_tables import run_facts
     from cosim.output.run_verdict import verdict
 
     run = noack.open_run(directory)
@@ -46,10 +49,10 @@ def opened(directory: Path, width_in: float) -> Opened:
     with figure_width(width_in):
         for name in _FIGURES:
             with suppress(NoackError):
-                figures.append(inline(run.plot(name), f"run-{name}", f"figure: {name}"))
+                figures.append(markup_of(run.plot(name), f"run-{name}", f"figure: {name}"))
     claims = [(str(one.verdict), f"{one.what} ({one.source})") for one in run.claims]
     lines = [(line.text, line.style) for line in verdict(run.summary)]
-    return Opened(lines, run_facts(run), claims, figures)
+    return Opened(lines, run_facts(run.summary, run.directory), claims, figures)
 
 
 def replayed(directory: Path) -> str:
@@ -165,3 +168,40 @@ class RunsPanel:
 
         button = ui.button(words, on_click=ask).props("outline no-caps")
         answer.move()
+
+
+_TONES = {GOOD: "text-positive", DOUBTFUL: "text-warning", BAD: "text-negative", NEUTRAL: ""}
+# A run directory may come from somebody else; a report needs no scripts.
+_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:"
+
+
+def show_verdict(lines: Iterable[tuple[str, str]], name: str) -> None:
+    """Show the lines of a verdict, each with its style, and the link to the report of a run."""
+    with ui.card().classes("w-full gap-1").props('role=region aria-label="verdict"'):
+        for text, style in lines:
+            ui.label(text).classes(f"text-base {_TONES[style]}")
+        ui.link(
+            "report of this run (all figures and tables)", f"report/{quote(name)}", new_tab=True
+        )
+
+
+def serve_reports(application: FastAPI, services: LabServices) -> None:
+    """Serve the reports of recorded runs below the page's address; a missing one is written."""
+
+    @application.get("/report/{name}")
+    async def report(name: str) -> Response:
+        if name not in services.recorded():
+            return PlainTextResponse(f"no run {name} is recorded in {services.runs}", 404)
+        try:
+            page = await services.compute(report_page, services.runs / name)
+        except NoackError as error:
+            return PlainTextResponse(str(error), 409)
+        headers = {"content-security-policy": _POLICY, "cache-control": "no-store"}
+        return HTMLResponse(page, headers=headers)
+
+
+def report_page(directory: Path) -> bytes:
+    """Return the report of a run, which is written if missing; called in the worker process."""
+    from cosim.live.finalize import run_report
+
+    return run_report(directory).read_bytes()

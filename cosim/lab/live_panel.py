@@ -8,9 +8,9 @@ from nicegui import ui
 
 from cosim.interactive.controls import controls_of
 from cosim.interactive.draft import Draft, DraftError
+from cosim.lab.lab_services import ANSWER_S, LabServices
 from cosim.lab.live_run import MOST_LINES, LiveRun
-from cosim.lab.page.lab_services import ANSWER_S, LabServices
-from cosim.lab.page.run_verdict_card import show_verdict
+from cosim.lab.runs_panel import show_verdict
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 from noack.runtime.run_registry import find, request_change

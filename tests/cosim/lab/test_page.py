@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from tests.cosim.lab.page.lab_browser import TEXT, Page
+from tests.cosim.lab.lab_browser import TEXT, Page
 from tools.screenshot_recording import Browser
 
 

@@ -1,21 +1,28 @@
 """The page as a visitor sees it: settings at the left, what follows from them at the right."""
 
+import csv
+import io
 import json
+import re
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
+import numpy as np
 from nicegui import ui
 
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
-from cosim.lab.page.explore_panel import ExplorePanel
-from cosim.lab.page.file_menu import FileMenu
-from cosim.lab.page.lab_services import ANSWER_S, LabServices, PageCalls
-from cosim.lab.page.live_panel import LivePanel
-from cosim.lab.page.runs_panel import RunsPanel
-from cosim.lab.page.session import Session
-from cosim.lab.page.settings_panel import SettingsPanel
-from cosim.lab.page.tutorial_panel import Step, TutorialPanel
+from cosim.interactive.exploration import Exploration
+from cosim.interactive.exploration_figure import Shown
+from cosim.lab.explore_panel import ExplorePanel
+from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
+from cosim.lab.live_panel import LivePanel
+from cosim.lab.runs_panel import RunsPanel
+from cosim.lab.settings_panel import SettingsPanel
+from cosim.output.figure_format import FigureFormat
 from noack.core.errors import NoackError
+from noack.core.file_access import write_whole
 
 _STYLE = """
 .lab-body { display: grid; grid-template-columns: minmax(260px, 340px) minmax(0, 1fr); gap: 1rem; }
@@ -233,7 +240,7 @@ class _Page:
             return
         await self._open(draft)
 
-    async def _begin_step(self, step: Step) -> None:
+    async def _begin_step(self, step: "Step") -> None:
         draft = open_draft(step.scenario)
         for key, value in step.settings.items():
             draft = draft.with_value(key, value)
@@ -258,3 +265,183 @@ class _Page:
         self._dark.set_value(self._is_dark)
         self._settings.show_dark(dark=self._is_dark)
         await self._drawn()
+
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
+
+
+class FileMenu:
+    """The menu in the header."""
+
+    def __init__(self, services: LabServices, calls: PageCalls, session: Session) -> None:
+        self._services, self._calls, self._session = services, calls, session
+        opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
+        with opener, ui.menu():
+            ui.menu_item("save as scenario …", self._ask)
+            ui.menu_item("copy link to these settings", self._share)
+            ui.menu_item("data of the figure (CSV)", self._data)
+            for kind in (FigureFormat.SVG, FigureFormat.PDF):
+                ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
+        with ui.dialog() as self._dialog, ui.card():
+            ui.label(f"Save in {services.folder}")
+            self._name = ui.input("file name", value="my_loop.toml", validation={
+                "a name like my_loop.toml": lambda text: bool(_NAME.fullmatch(text))
+            }).classes("w-64")  # fmt: skip
+            self._replace = ui.checkbox("replace a file of this name")
+            with ui.row():
+                ui.button("save", on_click=self._save)
+                ui.button("cancel", on_click=self._dialog.close).props("flat")
+
+    def _ask(self) -> None:
+        self._dialog.open()
+
+    def _save(self) -> None:
+        if not _NAME.fullmatch(self._name.value):
+            return
+        path = self._services.folder / self._name.value
+        if path.exists() and not self._replace.value:
+            ui.notify(f"{path.name} exists; tick the box to replace it", type="warning")
+            return
+        try:
+            write_whole(path, self._session.draft.text.encode())
+        except NoackError as error:
+            ui.notify(str(error), type="negative")
+            return
+        self._dialog.close()
+        ui.notify(f"saved as {path.name}; noack run {path.name}", type="positive")
+
+    async def _share(self) -> None:
+        address = await ui.run_javascript("location.href", timeout=ANSWER_S)
+        ui.clipboard.write(address)
+        ui.notify("copied; it opens as long as this page runs", type="positive")
+
+    def _data(self) -> None:
+        if self._session.run is not None:
+            ui.download(csv_of(self._session.run).encode(), "exploration.csv", "text/csv")
+
+    async def _figure(self, kind: FigureFormat) -> None:
+        shown = self._session.shown()
+        if shown is not None:
+            content = await self._calls.compute(figure_file, shown, kind)
+            ui.download(content, f"exploration.{kind}")
+
+
+def csv_of(run: Exploration) -> str:
+    """Return the curves of a run as CSV."""
+    n = run.x.shape[1]
+    heads = ["t_s", *(f"{name}_{i + 1}" for name in ("x", "x_s", "x_c") for i in range(n))]
+    columns = [run.t_s[:, None], run.x, run.x_s, run.x_c]
+    for name, one in (("e_s_norm", run.e_s_norm), ("e_c_norm", run.e_c_norm),
+                      ("threshold", run.threshold)):  # fmt: skip
+        if one is not None:
+            heads.append(name)
+            columns.append(one[:, None])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(heads)
+    writer.writerows(np.hstack(columns).tolist())
+    return text.getvalue()
+
+
+def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
+    """Return the figure as a file's content; called in the worker process."""
+    from cosim.interactive.exploration_figure import exploration_figure
+    from cosim.output.figure_drawing import draw
+    from cosim.output.figure_files import file_content
+
+    return file_content(draw(exploration_figure(shown)), kind)
+
+
+class Step(NamedTuple):
+    """A step: what to read, which settings it begins with, what to drag."""
+
+    title: str
+    text: str
+    scenario: str
+    settings: dict[str, Any]
+    drag: str
+
+
+STEPS = (
+    Step(
+        "What is an event?",
+        "The sensor runs a model x_s of the plant and knows the plant's state x. It transmits only "
+        "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel "
+        "of the figure is a transmission.",
+        "lane_following", {"network.loss": {"model": "lossless"}},
+        "Drag β: a larger threshold gives fewer events and larger errors.",
+    ),
+    Step(
+        "What does a loss do?",
+        "The controller runs the same model x_c, but it learns only from packets that arrive. "
+        "Nobody acknowledges anything, so the sensor does not know what was lost. A cross is a "
+        "lost packet; after it ‖e_c‖ stays large until the next packet arrives.",
+        "lane_following", {"network.loss": {"model": "bernoulli", "probability": 0.5}},
+        "Drag the loss probability from 0 to 1.",
+    ),
+    Step(
+        "What is guaranteed?",
+        "The network loses at most M − 1 packets in a row. Then the certificate bounds every run: "
+        "‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these "
+        "bounds; they hold for every loss pattern, not only for this one.",
+        "lane_weighted", {},
+        "Drag M − 1: the bound grows, the run changes little.",
+    ),
+    Step(
+        "What can go wrong?",
+        "An event trigger answers losses with more transmissions, so it is hard to break. A clock "
+        "does not: here the sensor transmits every 0.1 s, whatever happens, and the controller "
+        "holds what it received. The margin below the figure is the largest M for which no loss "
+        "pattern makes the loop unstable.",
+        "unstable_pendulum",
+        {
+            "mode": "zoh", "trigger": {"policy": "periodic", "period_s": 0.1},
+            "network.loss": {"model": "worst_case"}, "network.mansd": 0,
+        },
+        "Drag M − 1 upwards until the loop diverges; then change the mode to model-based.",
+    ),
+    Step(
+        "Your own plant under 80 % loss",
+        "Replace the matrices under “all settings (TOML)” with those of your plant: [model] has A, "
+        "B and the gain. Then run it live: five processes exchange real UDP packets, and the "
+        "claims are judged while they run.",
+        "double_integrator",
+        {"network.loss": {"model": "bernoulli", "probability": 0.8}},
+        "Drag M − 1, then press “run live”.",
+    ),
+)  # fmt: skip
+
+Begin = Callable[[Step], Awaitable[None]]
+
+
+class TutorialPanel:
+    """The text of one step at a time; the figure is beside it."""
+
+    def __init__(self, begin: Begin) -> None:
+        self._begin, self._place = begin, 0
+        with ui.card().classes("w-full"):
+            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+            self._text = ui.label()
+            self._drag = ui.label().classes("font-bold")
+            with ui.row():
+                ui.button("show it", on_click=self._start)
+                self._back = ui.button("back", on_click=lambda: self._go(-1)).props("flat")
+                self._next = ui.button("next", on_click=lambda: self._go(1)).props("flat")
+            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
+        self._show()
+
+    def _show(self) -> None:
+        step = STEPS[self._place]
+        self._title.set_text(f"{self._place + 1} of {len(STEPS)}: {step.title}")
+        self._text.set_text(step.text)
+        self._drag.set_text(step.drag)
+        self._back.set_visibility(self._place > 0)
+        self._next.set_visibility(self._place < len(STEPS) - 1)
+
+    async def _go(self, by: int) -> None:
+        self._place += by
+        self._show()
+        await self._start()
+
+    async def _start(self) -> None:
+        await self._begin(STEPS[self._place])

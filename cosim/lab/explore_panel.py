@@ -5,10 +5,10 @@ from typing import Any
 
 from nicegui import ui
 
-from cosim.interactive.figure_curves import Shown
+from cosim.interactive.exploration_figure import Shown, exploration_figure
 from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
-from cosim.lab.chart_options import HEIGHT, data_options, figure_options
-from cosim.lab.page.session import Session
+from cosim.lab.chart import HEIGHT, data_options, figure_options
+from cosim.lab.lab_services import Session
 from noack.core.number_format import number
 
 _DRAWN_S = 10.0
@@ -45,7 +45,7 @@ class ExplorePanel:
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.warning or session.note
-        shown = session.shown(dark=dark)
+        shown = session.shown()
         self._mark_stale(shown is None)
         if shown is None and self._chart is not None:
             note += ". Below: the settings before"
@@ -55,7 +55,7 @@ class ExplorePanel:
         if shown is None:
             return
         self._choose_state(session)
-        await self._show_figure(shown)
+        await self._show_figure(shown, dark=dark)
         if not self._area.is_deleted:
             self._show_facts(session)
 
@@ -67,20 +67,21 @@ class ExplorePanel:
             self._summary.set_visibility(not stale)
             self._verdict.set_visibility(not stale)
 
-    async def _show_figure(self, shown: Shown) -> None:
-        run = shown.run
-        shape = (shown.state, run.state_names, run.scenario.horizon_s, shown.dark,
+    async def _show_figure(self, shown: Shown, *, dark: bool) -> None:
+        run, figure = shown.run, exploration_figure(shown)
+        shape = (shown.state, run.state_names, run.scenario.horizon_s, dark,
                  shown.reference is None)  # fmt: skip
         if self._chart is None or shape != self._shape:
             self._shape = shape
             self._area.clear()
             with self._area:
-                self._chart = ui.echart(figure_options(shown)).classes("w-full").props("role=img")
+                self._chart = ui.echart(figure_options(figure, dark=dark)).classes("w-full")
+                self._chart.props("role=img")
                 self._chart.style(f"height: {HEIGHT}px")
             return
         try:
             # Awaited, so that a slow browser is not sent more than it draws.
-            await self._chart.run_chart_method("setOption", data_options(shown), timeout=_DRAWN_S)
+            await self._chart.run_chart_method("setOption", data_options(figure), timeout=_DRAWN_S)
         except TimeoutError:
             self._shape = ()
 
