@@ -247,7 +247,7 @@ class Run:
         Raises:
             NoackError: the path has another ending, or a file cannot be written.
         """
-        from cosim.output.export.export_formats import export_run
+        from cosim.output.export import export_run
 
         self.summary  # noqa: B018  # of a temporary run, it is computed now
         return export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)

@@ -280,7 +280,7 @@ def _plant_sliders(scenario: Scenario, base: Scenario) -> list[Slider]:
         return []
     value = max(found.values())
     return [
-        Slider("plant.uncertainty", "model error: the plant's box, × the scenario's",
+        Slider("plant.uncertainty", "model error, as a multiple of the scenario's uncertainty",
                round(value, 3), 0.0, max(_MOST_MODEL_ERROR, value), 0.1, scaled=tuple(found)),
     ]  # fmt: skip
 

@@ -36,7 +36,8 @@ _MOST_EVENT_POINTS = 600
 _MOST_EVENTS = 3000
 """A run with more events is drawn up to there, so that dragging stays quick."""
 _SHORT = 0.5
-"""Events accumulate if their second half takes less than this share of the time of the first."""
+"""Inter-event times shrink to 0 if the second half of the events takes less than this share of the
+time of the first."""
 
 EXACT, SAMPLED = "exact", "sampled"
 
@@ -132,7 +133,8 @@ def _cut(run: ContinuousRun) -> str:
     second_s = run.reached_s - first_s
     if second_s > _SHORT * first_s:
         return f"{ended}; the rest is not drawn"
-    return f"the events accumulate: {ended}, half of them in the last {number(second_s, 2)} s"
+    shrink = f"{ended}, half of them in the last {number(second_s, 2)} s"
+    return f"Zeno-like behaviour: inter-event times shrink to 0 ({shrink})"
 
 
 @np.errstate(all="ignore")  # a run may diverge

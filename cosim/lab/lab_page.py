@@ -381,8 +381,8 @@ STEPS = (
     ),
     Step(
         "What is guaranteed?",
-        "The network loses at most M − 1 packets in a row. Then the certificate bounds every run: "
-        "‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these "
+        "The network loses at most M − 1 consecutive packets. Then the certificate bounds every "
+        "run: ‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these "
         "bounds; they hold for every loss pattern, not only for this one.",
         "lane_weighted", {},
         "Drag M − 1: the bound grows, the run changes little.",

@@ -1,14 +1,18 @@
-"""The certificates of a scenario, as tables and in words."""
+"""What is certified for a scenario, as tables and in words.
+
+:func:`print_certificates` prints the constants, the limits of the schedule, the assumptions and, if
+losses are not limited, what holds for random ones; :func:`print_margin` prints the margin of a
+time-triggered loop.
+"""
 
 from collections.abc import Iterator
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from cosim.analysis.margin_search import MarginResult
 from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
-from cosim.output.result_tables import ResultTable
+from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.number_format import duration, number
 from noack.theory.assumptions import assumptions
@@ -21,14 +25,16 @@ from noack.theory.unlimited_losses import UnlimitedLosses
 
 def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
-    _print_constants(console, found)
+    constants, *limits = certificate_tables(found)
+    console.print(terminal_table(constants))
+    _print_notes(console, found)
     if any(found.setpoint or ()):
         console.print(
             "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state.[/]"
         )
-    if any(certificate.constants for _, certificate in found):
-        _print_limits(console, found)
+    for table in limits:
+        console.print(terminal_table(table))
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
@@ -78,11 +84,12 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
-def constant_table(found: Certificates) -> tuple[str, list[str], list[tuple[str, ...]]]:
-    """Return title, headings and rows of the table of constants."""
+def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
+    """Yield the certified constants, and the largest certified times of the schedule."""
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    guarantee = next(iter(found))[1].conditions.guarantee  # its longest burst counts all rules
+    certificates = [certificate for _, certificate in found]
+    guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
     title = (
         f"{found.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
@@ -90,31 +97,32 @@ def constant_table(found: Certificates) -> tuple[str, list[str], list[tuple[str,
     headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in found)]
     printed = found.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
-    certificates, rate = [one for _, one in found], trigger.threshold_decay_per_s
     rows = [
         (label, *values, *([of_theorem] if printed else []))
-        for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate)
+        for label, values, of_theorem in constant_rows(
+            certificates, found.theorem_2, trigger.threshold_decay_per_s
+        )
     ]
-    return title, headings, rows
+    yield ResultTable("certificates", title, headings, rows)
+    if any(certificate.constants for certificate in certificates):
+        caption = (
+            f"{found.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
+            "the certificate is lost"
+        )
+        limits = [(scope, *map(_limit, one)) for scope, one in found.limits_by_scope.items()]
+        yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
 
 
-def _print_constants(console: Console, found: Certificates) -> None:
-    title, headings, rows = constant_table(found)
-    table = Table(title=title)
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading else "left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+def _print_notes(console: Console, found: Certificates) -> None:
+    """Explain the rows of the constants, and say why certificates are void."""
     certificates = [one for _, one in found]
     if any(one.constants for one in certificates):
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-            "scenario's plant. box: every plant of the uncertainty box. updates outstanding: "
-            "maximum number of updates lost or in flight. no update missing: while the controller "
-            "has every update, which sharpens the bound of x from an event on. inter-event time: "
-            "minimum.[/]"
+            "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
+            "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
+            "while every update has arrived. inter-event time: minimum.[/]"
         )
     if any(one.persistent_constants for one in certificates):
         console.print(
@@ -140,34 +148,10 @@ def _print_constants(console: Console, found: Certificates) -> None:
 LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
 
 
-def limit_rows(found: Certificates) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of the table of limits."""
-    for scope, limits in found.limits_by_scope.items():
-        yield scope, *map(_limit, limits)
-
-
-def _print_limits(console: Console, found: Certificates) -> None:
-    table = Table(title="schedule: largest certified value of each quantity, the others unchanged")
-    for heading in LIMIT_HEADINGS:
-        table.add_column(heading, justify="right" if heading else "left")
-    for row in limit_rows(found):
-        table.add_row(*row)
-    console.print(table)
-
-
 def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
     return "any" if value_s >= MOST_S else duration(value_s)
-
-
-def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
-    """Yield the certified constants, and the largest certified times of the schedule."""
-    title, headings, rows = constant_table(found)
-    yield ResultTable("certificates", title, headings, rows)
-    if any(certificate.constants for _, certificate in found):
-        caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
-        yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])
 
 
 _MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
@@ -197,12 +181,9 @@ def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
 
 def print_margin(console: Console, margin: MarginResult) -> None:
     """Print the bounds for each M, and the verdicts."""
-    table = Table(title=margin_title(margin))
-    for heading in MARGIN_HEADINGS:
-        table.add_column(heading, justify="left" if heading == "verdict" else "right")
-    for *cells, verdict in margin_rows(margin):
-        table.add_row(*cells, f"[{_MARGIN_STYLES[verdict]}]{verdict}[/]")
-    console.print(table)
+    (table,) = margin_tables(margin)
+    last = len(MARGIN_HEADINGS) - 1
+    console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
     console.print(margin.verdict, soft_wrap=True, highlight=False)
     if margin.period is not None:
         text = f"for {margin.guarantee}: {margin.period.text}"
@@ -238,18 +219,18 @@ def print_unlimited(
         shown := [one for one in likely if one.probability > _RARE]
         + [one for one in found.bursts if one not in likely][:1]
     ):
-        table = Table(
-            title="without the guarantee: a run's longest burst of losses, and the bounds that "
-            f"hold as long as none is longer; runs of {found.horizon_s:g} s"
-        )
-        for heading in ("longest burst", "P(longer burst)", "events", "Δ", "X"):
-            table.add_column(heading, justify="right")
-        for one in shown:
-            table.add_row(
-                f"{one.most}", f"≤ {number(1 - one.probability, 3)}", f"≤ {one.events}",
-                number(one.delta, 4), number(one.state, 4),
-            )  # fmt: skip
-        console.print(table)
+        table = ResultTable(
+            "bursts",
+            "without the guarantee: a run's longest burst of losses, and the bounds that "
+            f"hold as long as none is longer; runs of {found.horizon_s:g} s",
+            ("longest burst", "P(longer burst)", "events", "Δ", "X"),
+            [
+                (f"{one.most}", f"≤ {number(1 - one.probability, 3)}", f"≤ {one.events}",
+                 number(one.delta, 4), number(one.state, 4))
+                for one in shown
+            ],
+        )  # fmt: skip
+        console.print(terminal_table(table, left=()))
     for sentence in sentences(found):
         console.print(sentence, markup=False, highlight=False)
 
@@ -271,7 +252,7 @@ def sentences(found: UnlimitedLosses) -> Iterator[str]:
         order = _MOMENT[len(found.moments) + 1]
         yield f"Without the guarantee no {order} is certified: {found.void}."
     if found.sure_rate_per_s is not None:
-        yield f"x decays almost surely, at every rate below {found.sure_rate_per_s:.3g} /s."
+        yield f"x decays almost surely: decay rate {found.sure_rate_per_s:.3g} /s."
     if found.paper_rate_per_s is not None:
         at = ", ".join(
             f"{_MOMENT[order]} at most {value:.4g}"

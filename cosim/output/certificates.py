@@ -1,4 +1,4 @@
-"""All certificates of a scenario, as one object and as JSON."""
+"""All certificates of a scenario: as one object, as JSON, and as rows of a table."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -284,12 +284,12 @@ def constant_rows(
         yield "certificate", ["void"] * len(certificates), NONE
         return
     yield "decay rate, 1/s", constant("rate_per_s"), number(theorem_rate, 4)
-    yield "updates outstanding", constant("missing_events"), NONE
+    yield "undelivered updates", constant("missing_events"), NONE
     unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
     yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
     yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
-    yield "· no update missing", constant("received_input_error"), NONE
+    yield "· none undelivered", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
     yield "inter-event time, s", row(lambda c: c.inter_event_s), spacing_2
     yield "loop gain (< 1)", constant("loop_gain"), NONE

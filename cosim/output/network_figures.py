@@ -89,13 +89,11 @@ def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescrip
             f"{in_flight.max}. Below, the shares of {len(names)} loops in the bytes that the "
             "network forwarded.",
         ),
-        FigureDescription(
-            name="loops",
-            rows=_norm_rows(over_time, names, stayed),
-            caption="Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the "
-            f"plant's state, in each of {len(over_time.middles_s)} intervals. {curves}{diverged}",
-            description=f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at "
-            f"most {number(largest)}.",
+        norms_figure(over_time, names, stayed).captioned(
+            "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
+            f"state, in each of {len(over_time.middles_s)} intervals. {curves}{diverged}",
+            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
+            f"{number(largest)}.",
         ),
         error_map(over_time, names, stayed).captioned(
             "Largest ‖e_c‖ of each loop in each interval; no colour before its first "
@@ -126,7 +124,9 @@ def _link_rows(
     )  # fmt: skip
 
 
-def _norm_rows(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> list[Row]:
+def norms_figure(
+    over_time: LoopsOverTime, names: Sequence[str], stayed: Bools
+) -> FigureDescription:
     """Describe ‖e_c‖ and ‖x‖ of all loops; the range of the axes is for those that stayed."""
     panels = []
     for title, values in (
@@ -135,7 +135,7 @@ def _norm_rows(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) ->
         about = _known(values, stayed).ravel()
         axis = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
         panels.append((title, _curves(over_time.middles_s, values, names), axis))
-    return _rows(over_time, *panels)
+    return FigureDescription(name="loops", rows=_rows(over_time, *panels))
 
 
 def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -> list[Row]:

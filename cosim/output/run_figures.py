@@ -109,7 +109,7 @@ def _thinned(record: RunRecord) -> _Thinned:
 
 
 def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
-    """Return the samples without the controller's state and error where it knows no state."""
+    """Return the samples without the controller's state and error before its first update."""
     known = run.since_delivery(record.scenario)
     return run._replace(
         x_c=np.where(known[:, None], run.x_c, np.nan),

@@ -6,9 +6,15 @@ from typing import Annotated
 import typer
 
 from cosim.cli import command as cli
-from cosim.output.export.export_formats import ExportFormat
+from cosim.output.export import FORMATS
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
+
+
+def _known(name: str) -> str:
+    if name not in FORMATS:
+        raise typer.BadParameter(f"'{name}' is not one of {', '.join(FORMATS)}")
+    return name
 
 
 @cli.command(cli.RUNS, 96, [
@@ -20,7 +26,14 @@ def export(
     run_dir: cli.RunArgument = None,
     *,
     file_format: Annotated[
-        ExportFormat, typer.Option("--format", help="Format of the file, or of the folder's files.")
+        str,
+        typer.Option(
+            "--format",
+            parser=_known,
+            metavar="|".join(FORMATS),
+            autocompletion=lambda: [*FORMATS],
+            help="Format of the file, or of the folder's files.",
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -39,12 +52,12 @@ def export(
     """Export a run for other programs: its tables, its summary and its certificates."""
     from cosim.live.finalize import reopen
     from cosim.live.progress import PatientConsole
-    from cosim.output.export.export_formats import export_run
+    from cosim.output.export import export_run, export_suffix
 
     chosen = chosen_run(run_dir, runs)
     reopen(chosen)
     name = chosen.resolve().name if loop is None else loop
-    path = out or Path(f"{name}{file_format.suffix}")
+    path = out or Path(f"{name}{export_suffix(file_format)}")
     with PatientConsole(stderr=True).status("exporting"):
         written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
     if json:

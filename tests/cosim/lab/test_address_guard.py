@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
-from cosim.lab.lab_server import AddressGuard, LabOptions
 from cosim.lab import lab_server
+from cosim.lab.lab_server import AddressGuard, LabOptions
 
 SECRET, OPENING = "s" * 43, "o" * 43
 
@@ -79,7 +79,7 @@ def test_the_address_on_a_command_line_is_for_processes_of_this_user(
 ) -> None:
     """Every user can read command lines."""
     asked = []
-    monkeypatch.setattr(address_guard, "socket_user", lambda *of: asked.append(of) or user)
+    monkeypatch.setattr(lab_server, "socket_user", lambda *of: asked.append(of) or user)
     first, _ = answer("http", f"/{OPENING}/", host="127.0.0.1:8765")
     assert asked == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
     if user == os.getuid():

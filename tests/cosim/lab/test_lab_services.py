@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.lab import lab_services
+from cosim.lab.lab_services import LabServices, PageCalls
 from tests.integration import conftest as live
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from cosim.interactive.draft import open_draft
 from cosim.interactive.scenario_guarantee import VOID, Margin
-from cosim.lab.lab_services import PageCalls, Session
 from cosim.lab import lab_services as under_test
+from cosim.lab.lab_services import PageCalls, Session
 
 
 class Inline:

@@ -15,9 +15,8 @@ from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import FidelityPart
 from cosim.cli import app
 from cosim.live.finalize import reopen
-from cosim.output.remarks import remarks
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import print_outcome, verdict
+from cosim.output.run_verdict import print_outcome, remarks, verdict
 from tests.cosim.summaries import with_values
 
 RED = "\x1b[1;31m"

@@ -15,17 +15,18 @@ from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live import finalize as concluding
-from cosim.output.report import figure_files, report_page
-from cosim.output.report.figure_files import inline
-from cosim.output.report.figure_style import settings
-from cosim.output.report.report_page import page, write_report
-from cosim.output.report.run_figures import BOUNDED, pictures
+from cosim.output import figure_files, report_page
+from cosim.output.figure_drawing import draw
+from cosim.output.figure_files import markup_of
+from cosim.output.figure_style import settings
+from cosim.output.report_page import Report, page, write_report
+from cosim.output.run_figures import BOUNDED, run_figures
 from cosim.record.run_directory import REPORT_FILE
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
-from tests.cosim.output.report.conftest import HOSTILE, make_record, scenario_of
+from tests.cosim.output.conftest import HOSTILE, make_record, scenario_of
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import alone, summary_of
 
@@ -92,7 +93,7 @@ def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSum
 
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
-    html = page(record.scenario, summary_of(record, **more), [], "", {})
+    html = page(Report(summary_of(record, **more), record.scenario, 0))
     found = Page(html)
     check(found, html)
     return found.text
@@ -155,7 +156,7 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
 
 
 def test_the_report_of_a_simulated_run_has_no_lateness(record: RunRecord) -> None:
-    assert list(pictures(record, timed=False)) == FIGURES
+    assert list(run_figures(record, timed=False)) == FIGURES
     text = shown(record, kind="simulated", lateness_us={}, latency_us=None)
     assert "simulated run" in text
     assert "lateness" not in text
@@ -260,11 +261,11 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_every_run_gets_a_report(case: str, content: dict[str, Any]) -> None:
     record = CASES[case](content)
-    drawn = [draw() for draw in pictures(record).values()]
+    drawn = [describe() for describe in run_figures(record).values()]
     assert [one.name for one in drawn] == FIGURES + TIMED
     with settings():
         for one in drawn:
-            one.figure.draw_without_rendering()
+            draw(one).draw_without_rendering()
     shown(record)
 
 
@@ -287,8 +288,8 @@ def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:
         ("c", "inter_event", t_s, t_s, "printed"),
     ]
     found = {
-        name: [label for label, *_ in "abc" if label in labels_of(draw().figure)]
-        for name, draw in pictures(record, envelopes).items()
+        name: [label for label, *_ in "abc" if label in labels_of(draw(describe()))]
+        for name, describe in run_figures(record, envelopes).items()
     }
     assert {name: labels for name, labels in found.items() if labels} == dict(
         zip(BOUNDED, (["a"], ["b"], ["c"]), strict=True)
@@ -303,9 +304,9 @@ def labels_of(figure: Figure) -> list[str]:
 def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
     figure = Figure(figsize=(2, 1))
     figure.add_axes((0, 0, 1, 1))
-    assert not Page(inline(figure, "small", 'named "so"')).attributes("img")
+    assert not Page(markup_of(figure, "small", 'named "so"')).attributes("img")
     monkeypatch.setattr(figure_files, "_HEAVY_CHARACTERS", 10)
-    (image,) = Page(inline(figure, "large", 'named "so"')).attributes("img")
+    (image,) = Page(markup_of(figure, "large", 'named "so"')).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")
 
@@ -313,7 +314,7 @@ def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_report_that_cannot_be_written_gives_one_line(
     record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report_page, "pictures", lambda *_, **options: {})
+    monkeypatch.setattr(report_page, "run_figures", lambda *_, **options: {})
     (tmp_path / REPORT_FILE).mkdir()
     with pytest.raises(MachineError, match=r"report\.html: cannot be written"):
         written(record, tmp_path)

@@ -12,10 +12,19 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.output.figure_format import figure_files
-from cosim.output.report.figure_files import save_figure, save_figures
-from cosim.output.report.figure_style import characters_of_paper_fonts, settings
+from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, one_panel
+from cosim.output.figure_files import (
+    characters_of_paper_fonts,
+    file_content,
+    save_figures,
+)
+from cosim.output.figure_format import FigureFormat, figure_files
+from cosim.output.figure_style import settings
 from noack.core.errors import CallerError
+
+
+def saved(figure: Figure, path: Path) -> None:
+    path.write_bytes(file_content(figure, FigureFormat(path.suffix[1:])))
 
 
 def figure_of(title: str) -> Figure:
@@ -29,10 +38,10 @@ def figure_of(title: str) -> Figure:
 
 def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Path) -> None:
     figure = figure_of("title")
-    save_figure(figure, tmp_path / "before.svg")
+    saved(figure, tmp_path / "before.svg")
     before = dict(mpl.rcParams)
-    save_figure(figure, tmp_path / "a.pdf")
-    save_figure(figure, tmp_path / "after.svg")
+    saved(figure, tmp_path / "a.pdf")
+    saved(figure, tmp_path / "after.svg")
     assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
     assert dict(mpl.rcParams) == before
     assert {text.get_fontfamily()[0] for text in figure.findobj(Text)} == {"sans-serif"}
@@ -44,27 +53,29 @@ def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Pa
 def test_computer_modern_has_other_characters_at_the_place_of_some(tmp_path: Path) -> None:
     figure = figure_of("lane_following <$x_s$>")
     figure.axes[0].set_xticks([1.0, 2.0], ["a_b", "c|d"])
-    save_figure(figure, tmp_path / "before.svg")
+    saved(figure, tmp_path / "before.svg")
     with characters_of_paper_fonts(figure):
         figure.draw_without_rendering()
         texts = {text.get_text() for text in figure.findobj(Text)}
         assert {r"a$\_$b", "c$|$d"} <= texts
-    save_figure(figure, tmp_path / "after.svg")
+    saved(figure, tmp_path / "after.svg")
     assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
     for text, written in (("a_b $x_c$ {1}", r"a$\_$b $x_c$ $\{$1$\}$"), (r"5 \$_", r"5 \$$\_$")):
         figure.axes[0].set_title(text, loc="left")
         with characters_of_paper_fonts(figure):
             assert figure.axes[0].get_title("left") == written
-    save_figure(figure, tmp_path / "a.pdf")
+    saved(figure, tmp_path / "a.pdf")
     assert b"Cmtt10" in (tmp_path / "a.pdf").read_bytes()
 
 
 def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
-    def drawn() -> Figure:
-        raise AssertionError
+    def drawn(name: str) -> FigureDescription:
+        x = np.arange(3.0)
+        line = Line(x=x, y=x, colour=(0, 0, 0))
+        return one_panel(name, Panel(items=[line], x=Axis(), y=Axis()), 1.0)
 
-    assert save_figures(((name, drawn()) for name in "a"), tmp_path / "p.html", None) == []
-    two = ((name, figure_of(name)) for name in "ab")
+    assert save_figures(map(drawn, "ab"), tmp_path / "p.html", None) == []
+    two = map(drawn, "ab")
     found = save_figures(two, tmp_path / "p.html", figure_files("pdf"))
     assert found == [tmp_path / "p-figures/a.pdf", tmp_path / "p-figures/b.pdf"]
 

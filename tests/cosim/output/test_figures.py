@@ -15,18 +15,18 @@ from PIL import ImageColor
 
 import noack
 from cosim.analysis.quantile_sketch import QuantileSketch
-from cosim.output import palette
-from cosim.output.report import signal_figures
-from cosim.output.report.axes import Bound, BoundKind
-from cosim.output.report.clock_figure import ClockErrors, clock_figure
-from cosim.output.report.figure_files import inline, save_figure
-from cosim.output.report.figure_layout import figure_width
-from cosim.output.report.figure_style import printed, settings
+from cosim.output import palette, signal_figures
+from cosim.output.figure_description import Bound, BoundKind, FigureDescription
+from cosim.output.figure_drawing import draw
+from cosim.output.figure_files import inline, save_figure
+from cosim.output.figure_style import figure_width, rgb, settings
+from cosim.output.page_kit import PAGES
+from cosim.output.signal_figures import ClockErrors, clock_figure
 from noack.core.errors import CallerError
-from tests.cosim.output.report.conftest import HOSTILE
+from tests.cosim.output.conftest import HOSTILE
 from tests.cosim.output.test_palette import BACKGROUNDS, luminance
 
-CONTROLLER = printed(palette.CONTROLLER)
+CONTROLLER = rgb(palette.CONTROLLER)
 SIZES = {"empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
 UNITS = re.compile(r"\[(s|wall µs)\]$")
 UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
@@ -40,7 +40,7 @@ def values(case: str, k: int, columns: int | None = None) -> np.ndarray:
     return y if columns is None else y.reshape(k, columns)
 
 
-def drawn_for(case: str) -> dict[str, Figure]:
+def described(case: str) -> dict[str, FigureDescription]:
     """Every figure, on data of the same kind."""
     k = SIZES[case]
     n = 10 if case == "ten" else 4
@@ -48,11 +48,11 @@ def drawn_for(case: str) -> dict[str, Figure]:
     e = k // 50
     event_s, lost = np.arange(e) * 0.1, np.arange(e) % 3 > 0
     bound = [
-        Bound(label, t_s, 5 * np.exp(-t_s))
+        Bound(label=label, x=t_s, y=5 * np.exp(-t_s))
         for label in ("certified", "certified for every plant of the uncertainty box")
     ]
     return {
-        "paper": signal_figures.paper_figure(
+        "paper": signal_figures.states_figure(
             mode="zoh",
             t_s=t_s,
             x=values(case, k, n),
@@ -90,6 +90,10 @@ def drawn_for(case: str) -> dict[str, Figure]:
     }
 
 
+def drawn_for(case: str) -> dict[str, Figure]:
+    return {name: draw(figure) for name, figure in described(case).items()}
+
+
 @pytest.fixture(scope="module", params=SIZES)
 def drawn(request: pytest.FixtureRequest) -> dict[str, Figure]:
     return drawn_for(request.param)
@@ -107,7 +111,7 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
 
 def test_every_figure_can_be_saved(tmp_path: Path) -> None:
     """Warnings are errors here: no log of zero, no limits that coincide."""
-    for name, figure in drawn_for("not finite").items():
+    for name, figure in described("not finite").items():
         save_figure(figure, tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
@@ -161,11 +165,11 @@ def test_a_long_run_is_drawn_with_its_peaks_and_few_points(tmp_path: Path) -> No
     t_s = np.arange(k) * 0.002
     x = np.column_stack([spike(k), -spike(k)])
     none, no = np.zeros(0), np.zeros(0, bool)
-    figure = signal_figures.paper_figure(
+    figure = signal_figures.states_figure(
         mode="model", t_s=t_s, x=x, x_s=x, x_c=x, state_names=["a", "b"],
         broadcast_s=none, dropped=no, received_s=none, forced=no,
     )  # fmt: skip
-    for axes, extreme in zip(figure.axes, (7.0, -7.0), strict=False):
+    for axes, extreme in zip(draw(figure).axes, (7.0, -7.0), strict=False):
         for line in axes.lines:
             assert extreme in line.get_ydata()
             assert len(line.get_ydata()) <= 2400
@@ -181,11 +185,11 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     broadcast_s = np.array([0.0, 1.0, 1.5, 3.0, 3.25])
     dropped = np.array([False, True, False, True, False])
     t_s, x = np.linspace(0, 4, 10), np.zeros((10, 1))
-    figure = signal_figures.paper_figure(
+    figure = signal_figures.states_figure(
         mode="model", t_s=t_s, x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=broadcast_s,
         dropped=dropped, received_s=broadcast_s[~dropped], forced=np.array([True, False, True]),
     )  # fmt: skip
-    _, above, below = figure.axes
+    _, above, below = draw(figure).axes
     assert labels(above) == ["sent", "sent, lost"]
     assert labels(below) == ["received", "received, forced", "lost"]
     found = {
@@ -196,7 +200,7 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     }
     assert found["D"] == {3.25: 1.75}  # the first event, at 0, has no interval
     assert found["o"] == {1.5: 1.5}  # the received update that was not forced
-    sent, lost = above.lines[1], above.lines[2]
+    sent, lost = above.lines[1], above.lines[3]
     assert sent.get_xdata().tolist() == [1.5, 3.25]
     assert lost.get_ydata().tolist() == [1.0, 1.5]
 
@@ -204,11 +208,11 @@ def test_intervals_and_fates_are_drawn_at_their_times() -> None:
 @pytest.mark.parametrize(("mode", "head"), [("model", "MB-ET"), ("zoh", "ZOH-ET")])
 def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> None:
     x, none, no = np.zeros((3, 1)), np.zeros(0), np.zeros(0, bool)
-    figure = signal_figures.paper_figure(
+    figure = signal_figures.states_figure(
         mode=mode, t_s=np.arange(3.0), x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=none,
         dropped=no, received_s=none, forced=no, title="one draw out of 1,000",
     )  # fmt: skip
-    assert [text.get_text() for text in figure.texts] == [f"{head}: one draw out of 1,000"]
+    assert [text.get_text() for text in draw(figure).texts] == [f"{head}: one draw out of 1,000"]
 
 
 def test_the_controllers_state_is_drawn_from_its_first_update_on() -> None:
@@ -226,15 +230,17 @@ def test_signal_names_are_drawn_literally() -> None:
     """Not parsed as mathematics, and not hidden for a leading underscore."""
     names = [HOSTILE, "_hidden", "a$b$c", "日本", ""]
     figure = signal_figures.input_figure(np.arange(3.0), np.zeros((3, 5)), names)
-    assert len(labels(figure.axes[0])) == 5
-    text = inline(figure, "input", HOSTILE)
+    assert len(labels(draw(figure).axes[0])) == 5
+    text = inline(figure.captioned(HOSTILE))
     assert "<script" not in text
 
 
 def test_bounds_are_dashed_in_the_colour_of_their_kind_and_measured_lines_are_solid() -> None:
     t_s = np.arange(1.0, 5.0)
     kinds: list[BoundKind] = ["identity", "certified", "printed", "certified", "certified"]
-    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
+    bound = [
+        Bound(label=f"bound {i}", x=t_s, y=3.0 + t_s + i, kind=kind) for i, kind in enumerate(kinds)
+    ]
     own = {
         "identity": palette.IDENTITY, "certified": palette.CERTIFIED, "printed": palette.PRINTED,
     }  # fmt: skip
@@ -242,18 +248,18 @@ def test_bounds_are_dashed_in_the_colour_of_their_kind_and_measured_lines_are_so
         (signal_figures.error_figure(t_s, t_s, t_s, t_s, bound), 3),
         (signal_figures.state_norm_figure(t_s, t_s, bound), 1),
     ):
-        (axes,) = drawn.axes
+        (axes,) = draw(drawn).axes
         assert [line.get_linestyle() for line in axes.lines] == ["-"] * measured + ["--"] * 5
         assert labels(axes)[measured:] == [one.label for one in bound]
         lines = axes.lines[measured:]
-        assert [line.get_color() for line in lines] == [printed(own[kind]) for kind in kinds]
+        assert [line.get_color() for line in lines] == [rgb(own[kind]) for kind in kinds]
         assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 5
 
 
 def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
     t_s = np.arange(8.0)
     e_c = np.array([1.0, 2.0, 0.0, 0.5, np.nan, 1.0, 0.0, 0.0])
-    (axes,) = signal_figures.error_figure(t_s, e_c + 1, e_c + 1, e_c).axes
+    (axes,) = draw(signal_figures.error_figure(t_s, e_c + 1, e_c + 1, e_c)).axes
     drawn = axes.lines[0].get_ydata()
     assert np.array_equal(np.isnan(drawn), np.isnan(e_c))
     assert (drawn[e_c == 0] < axes.get_ylim()[0]).all()
@@ -263,16 +269,19 @@ def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
 def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
     t_s = np.arange(1.0, 5.0)
     names = ("for the scenario's plant", "for every plant of the uncertainty box")
-    bound = [Bound(f"certified {name}", t_s, 3.0 + t_s) for name in names]
-    bound.append(Bound("bound from (I1)", t_s, 2.0 + t_s, "identity"))
-    (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+    bound = [Bound(label=f"certified {name}", x=t_s, y=3.0 + t_s) for name in names]
+    bound.append(Bound(label="bound from (I1)", x=t_s, y=2.0 + t_s, kind="identity"))
+    (axes,) = draw(signal_figures.error_figure(t_s, t_s, t_s, t_s, bound)).axes
     assert axes.get_legend()._ncols == 2
     # In a paper its rows are filled one by one, and take little of the height of the axes.
-    kinds = ("for the scenario's plant", "for the missing events", names[1])
-    bound = [*(Bound(f"certified {kind}", t_s, 3.0 + t_s) for kind in kinds), bound[-1]]
+    kinds = ("for the scenario's plant", names[1])
+    bound = [
+        *(Bound(label=f"certified {kind}", x=t_s, y=3.0 + t_s) for kind in kinds),
+        Bound(label="bound, given x at the last event", x=t_s, y=3.0 + t_s), bound[-1],
+    ]  # fmt: skip
     for width_in, share in ((3.5, 0.4), (7.16, 0.3)):
         with figure_width(width_in), settings():
-            (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+            (axes,) = draw(signal_figures.error_figure(t_s, t_s, t_s, t_s, bound)).axes
             axes.figure.draw_without_rendering()  # type: ignore[union-attr]
             rows = [one.get_window_extent() for one in legends(axes)]
             assert max(row.y1 for row in rows) - axes.bbox.y1 <= share * axes.bbox.height
@@ -288,7 +297,7 @@ def test_short_labels_of_axes_are_on_one_line_in_a_column() -> None:
 
 def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
     late_us = np.random.default_rng(1).lognormal(3, 1, 5000)
-    (axes,) = signal_figures.lateness_figure({"plant": QuantileSketch.of([late_us])}).axes
+    (axes,) = draw(signal_figures.lateness_figure({"plant": QuantileSketch.of([late_us])})).axes
     (line,) = axes.lines
     found_us, share = line.get_xdata(), line.get_ydata()
     assert found_us[-1] == late_us.max()
@@ -313,7 +322,7 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
 
 def test_another_file_extension_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg, \.png, \.pdf"):
-        save_figure(Figure(), tmp_path / "figure.eps")
+        save_figure(FigureDescription(name="none", rows=[]), tmp_path / "figure.eps")
 
 
 def test_drawing_does_not_change_matplotlibs_settings() -> None:
@@ -328,7 +337,7 @@ def contrast(one: str, other: str) -> float:
 
 
 def test_the_palette_is_tested_on_the_backgrounds_of_the_page() -> None:
-    css = Path(signal_figures.__file__).with_name("report.css").read_text()
+    css = (PAGES / "report.css").read_text()
     found = {ImageColor.getrgb(colour) for colour in re.findall(r"--paper: (#\w+)", css)}
     assert found <= set(BACKGROUNDS.values())
 
@@ -336,7 +345,7 @@ def test_the_palette_is_tested_on_the_backgrounds_of_the_page() -> None:
 @pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
 def test_text_has_enough_contrast(paper: str) -> None:
     """4.5 to 1, WCAG's minimum for text."""
-    css = Path(signal_figures.__file__).with_name("report.css").read_text()
+    css = (PAGES / "report.css").read_text()
     (block,) = [block for block in css.split(":root") if f"--paper: {paper}" in block][:1]
     shade = re.search(r"--shade: (#\w+)", block)
     assert shade
@@ -351,7 +360,7 @@ def test_matplotlib_is_not_imported_before_it_is_needed() -> None:
         "import sys, cosim.cli, cosim.live.finalize, cosim.output.run_tables, cosim.live.recorder, "
         "plant_server.__main__, sensor_node.__main__, controller_node.__main__, netem.__main__\n"
         "assert not {'matplotlib', 'jinja2'} & sys.modules.keys()\n"
-        "import cosim.output.report.report_page\n"
+        "import cosim.output.report_page\n"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -3,14 +3,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.output.report.clock_figure import ClockErrors, clock_errors
-from cosim.output.report.run_figures import pictures
+from cosim.output.figure_drawing import draw
+from cosim.output.run_figures import clock_errors, run_figures
 from cosim.output.run_tables import key_numbers, short_numbers
+from cosim.output.signal_figures import ClockErrors
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, clock_table
-from tests.cosim.output.report.conftest import scenario_of
-from tests.cosim.output.report.test_page import shown
+from tests.cosim.output.conftest import scenario_of
+from tests.cosim.output.test_page import shown
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import summary_of, with_values
 
@@ -46,10 +47,10 @@ def test_only_processes_with_another_clock_are_shown(clocked: RunRecord) -> None
 def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
     clocked: RunRecord,
 ) -> None:
-    found = pictures(clocked)["clocks"]()
+    found = run_figures(clocked)["clocks"]()
     assert "Largest: sensor 63.2 µs." in found.caption
     assert "the bound was lost (sensor)" in found.caption
-    curve, cross, limit = found.figure.axes[0].lines
+    curve, cross, limit = draw(found).axes[0].lines
     assert np.nanmax(curve.get_ydata()) == pytest.approx(SENSOR_NS * 1e-3)
     assert cross.get_xdata().tolist() == pytest.approx([FIRST_LOST * 0.05])
     assert set(limit.get_ydata()) == {ALLOWED_US}
@@ -64,7 +65,7 @@ def test_one_clock_has_no_figure(clocked: RunRecord) -> None:
     rows = clocked[table].copy()
     rows["error_ns"] = 0
     same = {name: clocked[name] for name in CLOCK_TABLES} | {table: rows}
-    assert "clocks" not in pictures(changed(clocked, same))
+    assert "clocks" not in run_figures(changed(clocked, same))
 
 
 def test_the_page_and_both_tables_have_the_number(clocked: RunRecord) -> None:
