@@ -1,4 +1,4 @@
-"""The certificates of a scenario, and its margin of losses."""
+"""Certificates, margins, measurements and campaigns, and the tables of all results as files."""
 
 import shutil
 import sys

@@ -1,4 +1,9 @@
-"""The scenario that is being edited: its text, its mistakes by key, and its address."""
+"""The scenario that is being edited: its text, its mistakes by key, and its address.
+
+A change of one value keeps the comments of the text: the changed text is parsed and compared with
+what is wanted. If the value is not found where it is looked for, the whole text is written anew,
+without comments.
+"""
 
 import copy
 import re

@@ -1,4 +1,7 @@
-"""The page as a visitor sees it: settings at the left, what follows from them at the right."""
+"""The page as a visitor sees it: settings at the left, what follows from them at the right.
+
+The page itself, then its menu of files and its tutorial.
+"""
 
 import csv
 import io
@@ -21,6 +24,7 @@ from cosim.lab.live_panel import LivePanel
 from cosim.lab.runs_panel import RunsPanel
 from cosim.lab.settings_panel import SettingsPanel
 from cosim.output.figure_format import FigureFormat
+from cosim.output.glossary import TERMS
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 
@@ -39,6 +43,9 @@ _STYLE = """
 .lab-facts { grid-template-columns: repeat(auto-fit, minmax(260px, 1fr)); }
 .lab-rows { display: grid; grid-template-columns: auto auto; gap: 0 1rem; margin: 0; }
 .lab-rows dd { margin: 0; }
+.lab-words { margin: 0; }
+.lab-words dt { font-weight: bold; margin-top: .5rem; }
+.lab-words dd { margin: 0; }
 .lab-viewer { height: 70vh; border: 0; }
 .nicegui-error-popup { max-width: 30rem; border: 3px solid var(--q-negative); }
 .lab-figure { --ink: #1b1f24; --grid: #d9dde3; --paper: #ffffff; }
@@ -282,6 +289,13 @@ class FileMenu:
             ui.menu_item("data of the figure (CSV)", self._data)
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
                 ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
+            ui.menu_item("glossary", lambda: words.open())
+        with ui.dialog() as words, ui.card(), ui.element("dl").classes("lab-words"):
+            for term, meaning in TERMS:
+                with ui.element("dt"):
+                    ui.label(term)
+                with ui.element("dd"):
+                    ui.label(meaning)
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
             self._name = ui.input("file name", value="my_loop.toml", validation={

@@ -1,4 +1,12 @@
-"""Serves the page on loopback until it is interrupted."""
+"""Serves the page on loopback, to requests that know its secret and come from the page itself.
+
+Every user of the machine can connect to loopback, and so can every page that a browser shows. So
+everything is under a path that begins with a secret. A request with another host name (DNS
+rebinding) or from another origin is refused, also for a WebSocket.
+
+A browser is started with an address on its command line, which every user can read. So it gets
+another secret, which leads to the page for processes of this user only.
+"""
 
 import asyncio
 import os

@@ -1,4 +1,8 @@
-"""What all visitors of the page share: a worker process, the known scenarios, the live run."""
+"""What the page computes: the services that all visitors share, and the session of each.
+
+:class:`LabServices` has a worker process, the known scenarios and the live run; :class:`Session`
+has what one visitor explores, the edited scenario and what was computed of it.
+"""
 
 import asyncio
 import multiprocessing

@@ -1,4 +1,9 @@
-"""A live run that the page has started: its process, its progress, what was said about it."""
+"""A live run that the page has started, as a process of its own, which never disturbs the loop.
+
+:class:`LiveRun` is the page's side: the process, its progress, what it has reported. Run as a
+program, this module is the other side: it reads the scenario's text from standard input, until its
+end, and writes one JSON object per line on standard output: what happened, with its fields.
+"""
 
 import asyncio
 import json

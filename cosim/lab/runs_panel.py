@@ -1,4 +1,7 @@
-"""Recorded runs: key numbers, claims and figures; replay and fidelity on request."""
+"""Recorded runs: verdict, key numbers, claims and figures; replay and fidelity on request.
+
+The full report of a run is served below the page's address.
+"""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress

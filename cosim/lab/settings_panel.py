@@ -1,4 +1,7 @@
-"""The settings of the loop: choices, sliders, and the scenario's file beside them."""
+"""The settings of the loop: choices and sliders, the form of all keys, and the scenario's text.
+
+Groups of the form are built when they are opened; mistakes are shown at their fields.
+"""
 
 from collections.abc import Awaitable, Callable
 from typing import Any

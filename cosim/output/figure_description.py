@@ -1,6 +1,6 @@
 """What a figure shows, as plain data: rows of panels, their axes, and what is drawn in them.
 
-Report, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
+Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
 (:mod:`cosim.output.figure_drawing`), the lab page by its chart library (:mod:`cosim.lab.chart`).
 Arrays may have any length, including 0, and values that are not finite, which are gaps.
 """
@@ -18,6 +18,8 @@ from cosim.record.decimate import Reals
 from noack.core.linear_systems import Matrix
 
 TIME = "time t [s]"
+LARGEST = 1e150
+"""Larger values are not drawn."""
 
 Dash = tuple[float, ...]
 """Lengths of strokes and gaps, in widths of the line; empty: a solid line."""
@@ -267,9 +269,20 @@ def series_colour(i: int) -> Colour:
     return palette.SERIES[i % len(palette.SERIES)]
 
 
+def finite(values: Reals, *, positive: bool = False) -> Reals:
+    """Return values with NaN for infinite and huge ones, and, if ``positive``, those not > 0."""
+    values = np.asarray(values, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        shown = np.abs(values) < LARGEST
+        if positive:
+            shown &= values > 0
+    return np.where(shown, values, np.nan)
+
+
 def histogram(values: Reals, bins: int = 30) -> tuple[Reals, Reals]:
     """Return edges (bins + 1,) of a constant ratio, and the counts of positive values."""
-    seen = values[np.isfinite(values) & (values > 0)]
+    seen = finite(values, positive=True)
+    seen = seen[np.isfinite(seen)]
     if not len(seen):
         return np.ones(1), np.zeros(0)
     low, high = math.log10(seen.min()), math.log10(seen.max())

@@ -26,6 +26,7 @@ from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from cosim.output import palette
 from cosim.output.figure_description import (
+    LARGEST,
     Axis,
     Band,
     Bars,
@@ -41,6 +42,7 @@ from cosim.output.figure_description import (
     Row,
     Rule,
     Spans,
+    finite,
 )
 from cosim.output.figure_style import PAPER, NotebookFigure, layout, rgb, styled
 from cosim.record.decimate import Reals, decimate
@@ -66,7 +68,6 @@ _IN_SHORT = (
 )
 """What the legends of papers leave out of the labels of bounds."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
-_LARGEST = 1e150
 _CROWDED = 6.0
 """Ratio of the ends of a logarithmic axis from which it has room for few numbers in a paper."""
 _NARROWEST_CELL_IN = 0.42
@@ -235,6 +236,8 @@ def _axes(figure: Figure, box_in: _Box, panel: Panel, **shared: Any) -> Axes:
     for which, axis in (("x", panel.x), ("y", panel.y)):
         if axis.logarithmic:
             logarithmic(axes, which)  # type: ignore[arg-type]
+        if None not in axis.ends:
+            _set_ends(axes, which, axis)  # type: ignore[arg-type]
         if not axis.grid:
             axes.grid(visible=False, axis=which)  # type: ignore[arg-type]
     return axes
@@ -479,16 +482,6 @@ def _colour_bar(
 # Axes
 
 
-def finite(values: Reals, *, positive: bool = False) -> Reals:
-    """Return values with NaN for infinite and huge ones, and, if ``positive``, those not > 0."""
-    values = np.asarray(values, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        shown = np.abs(values) < _LARGEST
-        if positive:
-            shown &= values > 0
-    return np.where(shown, values, np.nan)
-
-
 def _for_log_axis(values: Reals) -> Reals:
     """Return values for a curve on a logarithmic axis.
 
@@ -497,7 +490,7 @@ def _for_log_axis(values: Reals) -> Reals:
     """
     shown = finite(values, positive=True)
     if np.isfinite(shown).any():
-        shown[np.asarray(values) == 0] = 1 / _LARGEST
+        shown[np.asarray(values) == 0] = 1 / LARGEST
     return shown
 
 
@@ -516,8 +509,12 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
         _limit_log_axis(axes, described.about, described.decades)
     elif described.about is not None:
         _limit_axis(axes, described.about)
-    if described.ends != (None, None):
-        (axes.set_xlim if which == "x" else axes.set_ylim)(*described.ends)
+    if described.ends.count(None) == 1:
+        _set_ends(axes, which, described)
+
+
+def _set_ends(axes: Axes, which: Literal["x", "y"], described: Axis) -> None:
+    (axes.set_xlim if which == "x" else axes.set_ylim)(*described.ends)
 
 
 def _limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
@@ -526,7 +523,7 @@ def _limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
     if not np.isfinite(measured).any():
         return
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines])
-    values = values[values > 1 / _LARGEST]  # without zeros
+    values = values[values > 1 / LARGEST]  # without zeros
     decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
     low, high = max(values.min(), decade / 10**decades), min(values.max(), decade * 10**decades)
     margin = max((high / low) ** 0.05, 1.1)

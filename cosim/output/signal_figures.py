@@ -28,6 +28,7 @@ from cosim.output.figure_description import (
     Panel,
     Row,
     Rule,
+    finite,
     histogram,
     one_panel,
     plain,
@@ -95,7 +96,7 @@ def states_figure(
     columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
     height_in = 1.45 if drawn <= 2 * columns else 1.15
     sent, received = _intervals(broadcast_s), _intervals(received_s)
-    highest = 1.05 * max(np.nanmax(np.append(one, 0.0)) for one in (sent, received)) or None
+    highest = 1.05 * max(np.nanmax(np.append(finite(one), 0.0)) for one in (sent, received)) or None
     interval = Axis(label="interval [s]", ends=(0.0, highest))
     head = "MB-ET" if mode == "model" else "ZOH-ET"
     note = f" ({drawn} of {n} states)" if drawn < n else ""
@@ -355,7 +356,7 @@ def _later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
     # of shares, and linearly spaced ones, which resolve the median.
     rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
     rank = np.unique(rank.round().astype(np.intp))[::-1]
-    return np.maximum(values.largest(rank), _SHORTEST_US), rank / k
+    return np.maximum(finite(values.largest(rank)), _SHORTEST_US), rank / k
 
 
 class ClockErrors(NamedTuple):

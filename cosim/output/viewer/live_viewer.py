@@ -1,7 +1,17 @@
-"""Serves one recording over HTTP on loopback, with a page that shows it, or to a window.
+"""Shows a recording: in a window if there is a display, else in a browser on loopback.
+
+A viewer and the recorder share only the recording's file. A separate process (this module run as a
+program) reads the file while it grows and serves it over HTTP, to each viewer at its own rate. A
+viewer that stalls delays only its own download: the recorder never waits, the file is complete, and
+no data are dropped.
 
 Every user of the machine can connect. Therefore all content is under a path that begins with a
-secret; other paths do not exist. A growing file is served to each viewer at that viewer's rate.
+secret; other paths do not exist.
+
+A finished run opens at the time of the largest ‖e_c‖. Neither a layout in a recording nor the
+address of a recording can set rerun's time cursor; only requests to a running viewer can. The web
+viewer accepts a protobuf message ``ViewerControlRequest``, the window the requests of rerun's
+client.
 """
 
 import contextlib
@@ -417,10 +427,6 @@ def _main() -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(_main())
-
-
 _RETRY_S = 0.25
 _LOAD_S = 60.0
 _TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
@@ -503,3 +509,7 @@ def _number(field: int, value: int) -> bytes:
 def _varint(value: int) -> bytes:
     low, rest = value & 0x7F, value >> 7
     return bytes([low | 0x80]) + _varint(rest) if rest else bytes([low])
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

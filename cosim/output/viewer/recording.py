@@ -1,4 +1,9 @@
-"""A rerun recording as a file that is written while a run goes on."""
+"""The recording of a run for the viewer, as a rerun file that is written while the run goes on.
+
+:class:`RecordingFile` writes the file, :class:`RunView` the signals, events, packets and log of a
+loop, :class:`LoopView` those of one of several loops. The recording is only for viewing: the run's
+data are in the Parquet files, and only similar versions of rerun can read a recording.
+"""
 
 import os
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,9 @@
-"""rerun's own program, started as a child process."""
+"""rerun's own program as a child process, and the web viewer that it contains.
+
+The program serves the web viewer's files on a port of its own. Any user of the machine could listen
+on that port once the program has ended. Therefore the kernel selects the port, and an answer is
+used only if it comes from a process of this user.
+"""
 
 import contextlib
 import ctypes
