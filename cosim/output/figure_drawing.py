@@ -65,6 +65,7 @@ drawn smaller."""
 _IN_SHORT = (
     ("certified for every plant of the uncertainty ", "certified: "),
     ("certified for the scenario's ", "certified: "),
+    ("bound, given ", "given "),
 )
 """What the legends of papers leave out of the labels of bounds."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")

@@ -50,9 +50,9 @@ from cosim.output.palette import (
 from cosim.output.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Picture, Shape, label, lines, panel
-from cosim.output.viewer.recording import LOG
 
 ABOUT = "about"
+LOG = "log"
 ERROR = "error/norm"
 ERROR_LOG10 = "error/log10"
 SIZE_LOG10 = "size/log10"

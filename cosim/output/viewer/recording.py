@@ -16,7 +16,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.blueprint import COLOUR_KEY, ColourKey
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
@@ -31,8 +30,6 @@ Floats = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
 APPLICATION_ID = "noack"
-LOG = "log"
-"""Entity of the run's log."""
 
 
 class ViewError(MachineError):
@@ -110,7 +107,7 @@ class RecordingFile:
         """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
         line = f"{t_ns / 1e9:8.3f} s  {text}"
         columns = rr.TextLog.columns(text=[line], level=[level])
-        self.send_columns(LOG, np.array([t_ns], dtype=np.int64), columns)
+        self.send_columns(bp.LOG, np.array([t_ns], dtype=np.int64), columns)
 
     def flush(self) -> None:
         """Pass buffered data to the operating system."""
@@ -251,7 +248,11 @@ class RunView(RecordingFile):
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
         static: dict[str, Any] = {bp.ABOUT: rr.TextDocument(about, media_type="text/markdown")}
         static |= bp.styles(state_names, input_names, processes)
-        drawings = ((PICTURE, picture), (DIAGRAM, diagram), (COLOUR_KEY, ColourKey(input_names)))
+        drawings = (
+            (PICTURE, picture),
+            (DIAGRAM, diagram),
+            (bp.COLOUR_KEY, bp.ColourKey(input_names)),
+        )
         for parent, drawing in drawings:
             shapes = {} if drawing is None else drawing.scenery()
             static |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}

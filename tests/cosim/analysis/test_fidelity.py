@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cosim.output.fidelity_table import summary_rows
+from cosim.output.run_verdict import summary_rows
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
