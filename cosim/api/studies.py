@@ -22,8 +22,8 @@ from noack.config.resolution import resolve
 from noack.core.errors import CallerError
 from noack.core.python_process import cores
 from noack.core.row_display import Rows, as_html, as_text
-from noack.theory.joint_spectral_radius import ACCURACY
-from noack.traces.shipped_traces import find_trace
+from noack.theory.margins.joint_spectral_radius import ACCURACY
+from noack.traces.trace_formats import find_trace
 
 
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:

@@ -15,12 +15,11 @@ from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, pla
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.number_format import duration, number
-from noack.theory.assumptions import assumptions
-from noack.theory.certified_bounds import BOX
-from noack.theory.envelope_formula import envelope_formula
-from noack.theory.network_limits import MOST_S
-from noack.theory.scenario_certificates import outside_box
-from noack.theory.unlimited_losses import UnlimitedLosses
+from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.certified_bounds import envelope_formula
+from noack.theory.certificates.conditions import BOX
+from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
+from noack.theory.random_losses.moments import UnlimitedLosses
 
 
 def print_certificates(console: Console, found: Certificates) -> None:

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claims_by_part import claims_of
 from cosim.analysis.quantile_sketch import QuantileSketch
 from cosim.analysis.timing_statistics import latency_us, lateness_parts
 from cosim.output import signal_figures
@@ -73,7 +73,7 @@ def run_figures(
 def envelopes(record: RunRecord) -> Sequence[Envelope]:
     """Return the certified bounds of a loop, to be drawn with the quantities that they bound."""
     try:
-        return RunClaims(record).envelopes()
+        return claims_of(record).envelopes()
     except Exception:  # the figures are useful without them
         return []
 

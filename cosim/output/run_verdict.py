@@ -51,7 +51,7 @@ from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
 from noack.core.errors import ExitStatus
 from noack.core.number_format import NONE, percent
 from noack.runtime.life_cycle import HORIZON
-from noack.theory.assumptions import Assumption, AssumptionStatus
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _CLAIM_STYLES = {

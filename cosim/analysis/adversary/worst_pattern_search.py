@@ -31,10 +31,10 @@ from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 
 NODES = 500_000
 BEAM = 512

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cosim.output.run_verdict import summary_rows
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
 from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
+from cosim.output.run_verdict import summary_rows
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import Network, simulate

@@ -96,7 +96,7 @@ def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
     assert even.t_s[-1] == even.event_s[-1] == pytest.approx(5.998)
     assert dict(even.numbers)["run"] == even.cut
     accumulating = exploration.explore(noack.load("lane_following", {"trigger.alpha_per_s": 2.5}))
-    assert accumulating.cut.startswith("Zeno-like behaviour: inter-event times shrink to 0 (3000 events")
+    assert accumulating.cut.startswith("Zeno-like behaviour: inter-event times shrink to 0 (")
     assert accumulating.t_s[-1] < 20.0
 
 
