@@ -130,7 +130,7 @@ def short_numbers(summary: RunSummary) -> Numbers:
         *_lateness(loop),
         *_other_clocks(loop),
         *_replay_rows(loop.replay),
-        *([next(_fidelity_rows(loop.fidelity))] if compared else ()),
+        *([next(fidelity_rows(loop.fidelity))] if compared else ()),
     )
 
 
@@ -149,7 +149,7 @@ def key_numbers(summary: RunSummary) -> Numbers:
         *_estimation(loop.estimation),
         *_disturbances(loop.disturbances),
         *_replay_rows(loop.replay),
-        *_fidelity_rows(loop.fidelity),
+        *fidelity_rows(loop.fidelity),
     )
 
 
@@ -307,7 +307,8 @@ def _disturbances(found: Sequence[DisturbancePart]) -> Iterator[tuple[str, str]]
         yield f"disturbance at the {one.at}: RMS, maximum", sizes
 
 
-def _fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
+def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
+    """Yield the rows of a run's fidelity: its difference from the ideal loop, effect by effect."""
     if fidelity is None:
         return
     if isinstance(fidelity, NoFidelityPart):

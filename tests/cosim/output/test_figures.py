@@ -274,11 +274,9 @@ def test_a_legend_has_as_few_rows_as_its_width_permits() -> None:
     (axes,) = draw(signal_figures.error_figure(t_s, t_s, t_s, t_s, bound)).axes
     assert axes.get_legend()._ncols == 2
     # In a paper its rows are filled one by one, and take little of the height of the axes.
-    kinds = ("for the scenario's plant", names[1])
-    bound = [
-        *(Bound(label=f"certified {kind}", x=t_s, y=3.0 + t_s) for kind in kinds),
-        Bound(label="bound, given x at the last event", x=t_s, y=3.0 + t_s), bound[-1],
-    ]  # fmt: skip
+    given = "bound, given the updates missing now"
+    kinds = (f"certified {names[0]}", given, f"certified {names[1]}")
+    bound = [*(Bound(label=kind, x=t_s, y=3.0 + t_s) for kind in kinds), bound[-1]]
     for width_in, share in ((3.5, 0.4), (7.16, 0.3)):
         with figure_width(width_in), settings():
             (axes,) = draw(signal_figures.error_figure(t_s, t_s, t_s, t_s, bound)).axes
