@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from ipywidgets import Widget
     from matplotlib.figure import Figure
 
-    from cosim.interactive.draft_results import DraftResults
     from cosim.interactive.ensemble import Ensemble
     from cosim.interactive.exploration import Exploration
+    from cosim.interactive.exploration_figure import DraftResults
     from cosim.interactive.scenario_guarantee import Guarantee, Margin
     from noack.config.scenario import Scenario
 
@@ -187,7 +187,7 @@ def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explor
             several loops.
     """
     from cosim.interactive.draft import draft_of, open_draft
-    from cosim.interactive.draft_results import DraftResults
+    from cosim.interactive.exploration_figure import DraftResults
 
     scenario = load(source)  # its messages name the source
     is_name = isinstance(source, str | PathLike)

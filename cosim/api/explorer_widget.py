@@ -14,8 +14,13 @@ import ipywidgets as widgets
 
 from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft
-from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, DraftResults
-from cosim.interactive.exploration_figure import exploration_figure
+from cosim.interactive.exploration_figure import (
+    CERTIFICATE,
+    ENSEMBLE,
+    MARGIN,
+    DraftResults,
+    exploration_figure,
+)
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_style import settings
 from noack.core.errors import NoackError

@@ -1,16 +1,18 @@
 """The figure of an explored run: a state with its two models, errors, ‖x‖, and transmissions.
 
 All items always exist, perhaps without points, so that the lab page can replace their data only.
+:class:`DraftResults` computes what the figure shows, when it is first asked for.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from cosim.interactive.ensemble import Ensemble
-from cosim.interactive.exploration import Exploration
-from cosim.interactive.scenario_guarantee import Guarantee
+from cosim.interactive.draft import Draft
+from cosim.interactive.ensemble import Ensemble, explore_ensemble
+from cosim.interactive.exploration import Exploration, run_of, why_not_exact
+from cosim.interactive.scenario_guarantee import Guarantee, Margin, certify, margin_of, warning
 from cosim.output.figure_description import (
     DASHED,
     DOTTED,
@@ -24,6 +26,8 @@ from cosim.output.figure_description import (
     time_axis,
 )
 from cosim.output.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 
 BAND, KEPT = "90 % of draws", "kept settings"
@@ -190,3 +194,81 @@ def _positive(values: Vector, floor: float) -> Vector:
     """Return values for a logarithmic axis: not below a floor; NaN if that is 0."""
     with np.errstate(all="ignore"):
         return np.where(values > floor, values, floor if floor > 0 else np.nan)
+
+
+T = TypeVar("T")
+
+RUN, CERTIFICATE, ENSEMBLE, MARGIN = "run", "certificate", "ensemble", "margin"
+
+
+class DraftResults:
+    """The draft and its results; each change of the draft begins anew.
+
+    Raises:
+        NoackError: the scenario is wrong, or has several loops.
+    """
+
+    def __init__(self, draft: Draft) -> None:
+        self.listeners: list[Callable[[], None]] = []
+        """Called after each change of the draft."""
+        self.take(draft)
+
+    def take(self, draft: Draft) -> None:
+        """Take another draft; if it is wrong, the old one stays.
+
+        Raises:
+            NoackError: the scenario is wrong, or has several loops.
+        """
+        if draft.scenario.loops:
+            raise CallerError("loops: only one loop can be explored; noack.simulate takes several")
+        self.draft = draft
+        self._found: dict[str, object] = {}
+        for listener in self.listeners:
+            listener()
+
+    @property
+    def known(self) -> frozenset[str]:
+        """Which results are computed: RUN, CERTIFICATE, ENSEMBLE, MARGIN."""
+        return frozenset(self._found)
+
+    @property
+    def run(self) -> Exploration:
+        """The run."""
+        return self._once(RUN, run_of, Exploration)
+
+    @property
+    def certificate(self) -> Guarantee:
+        """What is guaranteed."""
+        return self._once(CERTIFICATE, certify, Guarantee)
+
+    @property
+    def ensemble(self) -> Ensemble | None:
+        """Bands over many draws; None without exact simulation."""
+        if why_not_exact(self.draft.scenario) is not None:
+            return None
+        return self._once(ENSEMBLE, explore_ensemble, Ensemble)
+
+    @property
+    def margin(self) -> Margin:
+        """For which M the loop is stable; this may take seconds."""
+        return self._once(MARGIN, margin_of, Margin)
+
+    @property
+    def warning(self) -> str:
+        """In words, by what is computed: whether the loop is unstable, and why."""
+        certificate = self.certificate if CERTIFICATE in self.known else None
+        return warning(self.run, certificate, self.margin if MARGIN in self.known else None)
+
+    def shown(self, state: int) -> Shown:
+        """Return what a figure shows of the results that are computed."""
+        return Shown(
+            self.run, state, self.ensemble if ENSEMBLE in self.known else None,
+            self.certificate if CERTIFICATE in self.known else None,
+        )  # fmt: skip
+
+    def _once(self, name: str, compute: Callable[[Scenario], T], kind: type[T]) -> T:
+        if name not in self._found:
+            self._found[name] = compute(self.draft.scenario)
+        found = self._found[name]
+        assert isinstance(found, kind)
+        return found

@@ -9,9 +9,20 @@ from typing import Any
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
 
-from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
+from cosim.interactive.controls import (
+    Choice,
+    Field,
+    FieldKind,
+    Group,
+    Slider,
+    by_field,
+    chosen,
+    controls_of,
+    dragged,
+    filled,
+    form_of,
+)
 from cosim.interactive.draft import Draft, DraftError, Mistake
-from cosim.interactive.form_fields import Field, FieldKind, Group, by_field, filled, form_of
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 

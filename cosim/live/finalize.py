@@ -308,7 +308,7 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 def _write_recording(
     run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None
 ) -> None:
-    from cosim.output.viewer.run_view import write_view  # imports rerun
+    from cosim.output.viewer.run_recording import write_view  # imports rerun
 
     write_view(run, summary, run_dir, loop)
 

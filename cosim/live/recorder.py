@@ -21,8 +21,8 @@ from noack.runtime.process_life import RunProcess
 
 if TYPE_CHECKING:
     from cosim.output.viewer.live_viewer import LiveView
-    from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
+    from cosim.output.viewer.run_recording import NetworkRecording
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
@@ -93,7 +93,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | NetworkRecording":
     scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
-    from cosim.output.viewer.run_view import open_view
+    from cosim.output.viewer.run_recording import open_view
 
     return open_view(scenario, Path(run_dir), run_id, live_view)
 

@@ -30,9 +30,9 @@ from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding
-    from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
     from cosim.output.viewer.run_feed import LoopFeed, NetworkFeed
+    from cosim.output.viewer.run_recording import NetworkRecording
 
 _POLL_FOR_S = 0.2
 _WAITING_BATCHES = 4096
