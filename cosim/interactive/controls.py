@@ -21,10 +21,10 @@ from pydantic import BaseModel
 
 from cosim.interactive.draft import Draft, DraftError, Mistake, value_text
 from noack.config import toml_file
-from noack.config.feature_kinds import POLICIES
 from noack.config.runtime_parameters import trigger_parameters
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import value_of
+from noack.config.sections import POLICIES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import NoackError
 

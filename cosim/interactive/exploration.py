@@ -18,9 +18,13 @@ from cosim.record.align import align_tables
 from cosim.record.data_frames import events, samples
 from cosim.record.decimate import decimate_all
 from cosim.record.run_record import load_record
-from cosim.simulation.continuous.continuous_loop import LoopState
-from cosim.simulation.continuous.continuous_report import run_continuous, summary
-from cosim.simulation.continuous.continuous_run import ContinuousRun, TooManyEventsError
+from cosim.simulation.continuous import (
+    ContinuousRun,
+    LoopState,
+    TooManyEventsError,
+    run_continuous,
+    summary,
+)
 from noack.config.resolution import loop_of, policy_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

@@ -18,8 +18,8 @@ from cosim.record.run_record import (
     write_tables,
 )
 from cosim.record.spool_merge import by_loop, merged, spool_segments
-from noack.config.loops import loop_names
 from noack.config.resolution import has_loop, run_tables
+from noack.config.scenario import loop_names
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder

@@ -12,8 +12,7 @@ from cosim.record.process_lives import RowCounts
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
-from noack.config.loops import loops_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import GENERATION, Start
 from noack.protocol.record_tables import (

@@ -53,9 +53,8 @@ from cosim.record.decimate import Reals, is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
-from noack.config.loops import loop_names, phases_ns
 from noack.config.resolution import loop_of, resolved_loops
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.topology import LOOP_ROLES
 

@@ -18,8 +18,7 @@ from cosim.output.figure_description import (
     series_colour,
 )
 from cosim.output.signal_figures import states_figure
-from cosim.simulation.continuous.continuous_run import ContinuousRun
-from cosim.simulation.continuous.network_fates import timeless
+from cosim.simulation.continuous import ContinuousRun, timeless
 from cosim.studies.paper.draw_measures import MODES, Mode
 from cosim.studies.paper.paper_results import Results
 from netem.channel import UPDATE_LINK

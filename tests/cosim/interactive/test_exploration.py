@@ -11,7 +11,7 @@ from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import BAND, Shown, exploration_figure
 from cosim.lab.chart import data_options
 from cosim.output.figure_description import Line
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.resolution import resolve
 from noack.core.errors import CallerError
