@@ -289,8 +289,8 @@ class FileMenu:
             ui.menu_item("data of the figure (CSV)", self._data)
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
                 ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
-            ui.menu_item("glossary", lambda: words.open())
-        with ui.dialog() as words, ui.card(), ui.element("dl").classes("lab-words"):
+            ui.menu_item("glossary", self._open_words)
+        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
             for term, meaning in TERMS:
                 with ui.element("dt"):
                     ui.label(term)
@@ -305,6 +305,9 @@ class FileMenu:
             with ui.row():
                 ui.button("save", on_click=self._save)
                 ui.button("cancel", on_click=self._dialog.close).props("flat")
+
+    def _open_words(self) -> None:
+        self._words.open()
 
     def _ask(self) -> None:
         self._dialog.open()
