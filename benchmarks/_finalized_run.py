@@ -16,12 +16,12 @@ from typing import Any
 
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.live import finalize
-from cosim.output.viewer import run_view
+from cosim.output.viewer import run_recording
 
 REPLAY = "replay"
 _PHASES = (
     ("spool and Parquet", finalize, "finish_record"),
-    ("recording", run_view, "write_view"),
+    ("recording", run_recording, "write_view"),
     ("summary", finalize, "summarise"),
     ("fidelity", finalize, "fidelity_for_summary"),
     ("conditions", RunClaims, "violations"),

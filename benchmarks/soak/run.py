@@ -16,7 +16,7 @@ from benchmarks._runs import PLAIN_TERMINAL, PROGRESS
 from benchmarks.soak.figure import memory_figure
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
-from cosim.output.report.figure_files import save_figure
+from cosim.output.figure_files import save_figure
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from cosim.record.run_record import load_record
 from noack.config.scenario import Scenario

@@ -6,14 +6,8 @@ function imports these modules when it is first called.
 
 from importlib.metadata import version
 
-from cosim.api.campaigns import CampaignResult as CampaignResult
-from cosim.api.campaigns import campaign as campaign
-from cosim.api.certificates import certify as certify
-from cosim.api.certificates import margin as margin
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
-from cosim.api.measurements import measure as measure
-from cosim.api.result_files import save_tables as save_tables
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run
@@ -23,8 +17,14 @@ from cosim.api.runs import simulate as simulate
 from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import with_settings as with_settings
+from cosim.api.studies import CampaignResult as CampaignResult
+from cosim.api.studies import campaign as campaign
+from cosim.api.studies import certify as certify
+from cosim.api.studies import margin as margin
+from cosim.api.studies import measure as measure
+from cosim.api.studies import save_tables as save_tables
 from cosim.measurement.network_measurement import Measurement as Measurement
-from cosim.output.all_certificates import Certificates as Certificates
+from cosim.output.certificates import Certificates as Certificates
 from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError
 

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from ipywidgets import Widget
     from matplotlib.figure import Figure
 
-    from cosim.interactive.draft_results import DraftResults
     from cosim.interactive.ensemble import Ensemble
     from cosim.interactive.exploration import Exploration
+    from cosim.interactive.exploration_figure import DraftResults
     from cosim.interactive.scenario_guarantee import Guarantee, Margin
     from noack.config.scenario import Scenario
 
@@ -106,9 +106,10 @@ class Explorer:
             NoackError: there is no such state.
         """
         from cosim.interactive.exploration_figure import exploration_figure
+        from cosim.output.figure_drawing import draw
 
         _ = self.certificate
-        return exploration_figure(self._results.shown(self._state(state)))
+        return draw(exploration_figure(self._results.shown(self._state(state))))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from.
@@ -186,7 +187,7 @@ def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explor
             several loops.
     """
     from cosim.interactive.draft import draft_of, open_draft
-    from cosim.interactive.draft_results import DraftResults
+    from cosim.interactive.exploration_figure import DraftResults
 
     scenario = load(source)  # its messages name the source
     is_name = isinstance(source, str | PathLike)

@@ -14,9 +14,15 @@ import ipywidgets as widgets
 
 from cosim.interactive.controls import Choice, Slider, chosen, controls_of, dragged
 from cosim.interactive.draft import Draft
-from cosim.interactive.draft_results import CERTIFICATE, ENSEMBLE, MARGIN, DraftResults
-from cosim.interactive.exploration_figure import exploration_figure
-from cosim.output.report.figure_style import settings
+from cosim.interactive.exploration_figure import (
+    CERTIFICATE,
+    ENSEMBLE,
+    MARGIN,
+    DraftResults,
+    exploration_figure,
+)
+from cosim.output.figure_drawing import draw
+from cosim.output.figure_style import settings
 from noack.core.errors import NoackError
 from noack.core.number_format import as_html
 
@@ -174,7 +180,7 @@ class ExplorerWidget:
 def _png(results: DraftResults, state: int) -> bytes:
     buffer = io.BytesIO()
     with settings():
-        figure = exploration_figure(results.shown(state))
+        figure = draw(exploration_figure(results.shown(state)))
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
     return buffer.getvalue()
 

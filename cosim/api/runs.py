@@ -6,10 +6,10 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load
 from cosim.record.run_directory import (
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from cosim.analysis.replay import Replay
     from cosim.analysis.run_summary import Outcome
     from cosim.analysis.summary_model import Claim, RunSummary
-    from cosim.output.report.run_figures import RunFigure
+    from cosim.output.figure_description import FigureDescription
     from cosim.record.run_record import RecordedRun, RunRecord
     from cosim.studies.comparison.run_comparison import RunComparison
     from cosim.studies.reproduction.run_repetition import Repetition
@@ -58,7 +58,7 @@ class Run:
         loop: str | None = None,
     ) -> None:
         self.directory, self._loop = directory, loop
-        self._conclude = finalize
+        self._finalize = finalize
         if temporary is not None:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
 
@@ -109,8 +109,8 @@ class Run:
 
         That of a run of several loops has them as [[loops]].
         """
-        is_one = self._loop is not None or len(self._run.loops) == 1
-        return self._record.scenario if is_one else self._run.scenario
+        shared = self._loop is None and self._run.names[1:]
+        return self._run.scenario if shared else self._record.scenario
 
     @property
     def tables(self) -> tuple[str, ...]:
@@ -182,12 +182,13 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        from cosim.output.report.run_figures import BOUNDED
+        from cosim.output.figure_drawing import draw
+        from cosim.output.run_figures import BOUNDED
 
-        known = self._pictures(bounded=figure in BOUNDED)
+        known = self._figures(bounded=figure in BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
-        return known[figure]().figure
+        return draw(known[figure]())
 
     def save_figures(
         self,
@@ -197,10 +198,9 @@ class Run:
         """Write all figures of the report into ``report-figures`` in the run directory.
 
         Args:
-            format: svg, png, pdf or pgf; pdf and pgf have the fonts of LaTeX, which need not be
-                installed.
+            format: svg, png or pdf; a PDF has the fonts of LaTeX, which need not be installed.
             width: ``"column"`` (3.5 in), ``"page"`` (7.16 in), or inches; by default a column for
-                pdf and pgf, and 10 in for svg and png.
+                pdf, and 10 in for svg and png.
 
         Returns:
             The paths.
@@ -208,16 +208,12 @@ class Run:
         Raises:
             NoackError: there is no such format or width, or a file cannot be written.
         """
+        from cosim.output.figure_files import save_figures
         from cosim.output.figure_format import figure_files
-        from cosim.output.report.figure_files import save_figures
 
-        files = figure_files(format, width)
-
-        def drawn() -> "Iterator[tuple[str, Figure]]":
-            for name, draw in self._pictures(bounded=True).items():
-                yield name, draw().figure
-
-        return save_figures(drawn(), self.directory / file_of_loop(REPORT_FILE, self._loop), files)
+        page = self.directory / file_of_loop(REPORT_FILE, self._loop)
+        figures = (describe() for describe in self._figures(bounded=True).values())
+        return save_figures(figures, page, figure_files(format, width))
 
     def save_tables(self, folder: Folder) -> list[Path]:
         """Write the tables of the summary: :func:`noack.save_tables` of this run.
@@ -225,7 +221,7 @@ class Run:
         Raises:
             NoackError: a file cannot be written.
         """
-        from cosim.api.result_files import save_tables
+        from cosim.api.studies import save_tables
 
         return save_tables(self, folder)
 
@@ -251,7 +247,7 @@ class Run:
         Raises:
             NoackError: the path has another ending, or a file cannot be written.
         """
-        from cosim.output.export.export_formats import export_run
+        from cosim.output.export import export_run
 
         self.summary  # noqa: B018  # of a temporary run, it is computed now
         return export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
@@ -291,20 +287,15 @@ class Run:
 
         return compute_fidelity(self._record)
 
-    def _pictures(self, *, bounded: bool) -> "Mapping[str, Callable[[], RunFigure]]":
-        """Return functions that draw the figures, by name; ``bounded`` with certified bounds."""
-        if self._loop is None and len(self._run.loops) > 1:
-            from cosim.output.report.network_figures import network_pictures
+    def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
+        """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
+        from cosim.output.run_figures import page_figures
 
-            drawn = network_pictures(self._run, self.summary)
-            return {name: partial(drawn.__getitem__, name) for name in drawn}
-        from cosim.output.report.run_figures import pictures
-
-        return pictures(self._record, self._envelopes if bounded else ())
+        return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 
     @cached_property
     def _outcome(self) -> "Outcome":
-        return self._conclude()
+        return self._finalize()
 
     @cached_property
     def _run(self) -> "RecordedRun":
@@ -316,21 +307,16 @@ class Run:
     def _record(self) -> "RunRecord":
         return self._run.loop(self._loop)
 
-    @cached_property
-    def _envelopes(self) -> list[Any]:
-        from cosim.analysis.claims.claims_by_part import claims_of
+    def _facts(self) -> list[tuple[str, str]]:
+        from cosim.output.run_tables import run_facts
 
-        return claims_of(self._record).envelopes()
+        return run_facts(self.summary, self.directory)
 
     def __repr__(self) -> str:
-        from cosim.api.run_facts import run_facts
-
-        return as_text(run_facts(self))
+        return as_text(self._facts())
 
     def _repr_html_(self) -> str:
-        from cosim.api.run_facts import run_facts
-
-        return as_html(run_facts(self))
+        return as_html(self._facts())
 
 
 def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:

@@ -178,7 +178,7 @@ FormatOption = Annotated[
     FigureFormat | None,
     typer.Option(
         "--format",
-        help="Write each figure as a file, too; pdf and pgf have the fonts of LaTeX.",
+        help="Write each figure as a file, too; a PDF has the fonts of LaTeX.",
     ),
 ]
 WidthOption = Annotated[
@@ -187,7 +187,7 @@ WidthOption = Annotated[
         "--width",
         metavar="column|page|INCHES",
         help="Width of figures in files: column (3.5 in), page (7.16 in), or inches; by default "
-        "column for pdf and pgf, 10 in for svg and png.",
+        "column for pdf, 10 in for svg and png.",
     ),
 ]
 TablesOption = Annotated[

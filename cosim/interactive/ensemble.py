@@ -64,7 +64,7 @@ class Ensemble:
         """Key numbers: label and value."""
         low, middle, high = self.transmissions
         sent = f"{low:.0f} to {high:.0f}, median {middle:.0f}" if math.isfinite(low) else "–"
-        left_out = (("draws whose events accumulate, not in the bands", f"{self.failed}"),)
+        left_out = (("draws with Zeno-like behaviour, not in the bands", f"{self.failed}"),)
         return (
             (f"transmissions in 90 % of {self.draws} draws", sent),
             ("draws that diverge", f"{self.diverged} of {self.draws}"),

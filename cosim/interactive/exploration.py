@@ -4,11 +4,20 @@ The run is exact, in continuous time, where the exact simulation covers the scen
 milliseconds. Otherwise the machines run in virtual time, which takes about a second.
 """
 
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
+from cosim.live.finalize import finalize
+from cosim.live.simulated_run import simulate_run
+from cosim.record.align import align_tables
+from cosim.record.data_frames import events, samples
+from cosim.record.decimate import decimate_all
+from cosim.record.run_record import load_record
 from cosim.simulation.continuous import (
     ContinuousRun,
     LoopState,
@@ -31,7 +40,8 @@ _MOST_EVENT_POINTS = 600
 _MOST_EVENTS = 3000
 """A run with more events is drawn up to there, so that dragging stays quick."""
 _SHORT = 0.5
-"""Events accumulate if their second half takes less than this share of the time of the first."""
+"""Inter-event times shrink to 0 if the second half of the events takes less than this share of the
+time of the first."""
 
 EXACT, SAMPLED = "exact", "sampled"
 
@@ -127,7 +137,8 @@ def _cut(run: ContinuousRun) -> str:
     second_s = run.reached_s - first_s
     if second_s > _SHORT * first_s:
         return f"{ended}; the rest is not drawn"
-    return f"the events accumulate: {ended}, half of them in the last {number(second_s, 2)} s"
+    shrink = f"{ended}, half of them in the last {number(second_s, 2)} s"
+    return f"Zeno-like behaviour: inter-event times shrink to 0 ({shrink})"
 
 
 @np.errstate(all="ignore")  # a run may diverge
@@ -189,3 +200,52 @@ def key_numbers(facts: dict[str, object], cut: str = "") -> Numbers:
         ("‖x‖ at the start", text("initial_state_norm")),
         ("‖x‖ at the end", text("final_state_norm")),
     )
+
+
+_COLUMNS = 600
+"""Width of the drawn figure; no peak is lost at this width."""
+
+
+def run_of(scenario: Scenario) -> Exploration:
+    """Run a scenario exactly if the exact simulation covers it, else in virtual time.
+
+    Raises:
+        NoackError: the scenario is wrong, or has several loops.
+    """
+    return explore(scenario) if why_not_exact(scenario) is None else simulate_sampled(scenario)
+
+
+def simulate_sampled(scenario: Scenario) -> Exploration:
+    """Run a scenario in virtual time, which takes about a second; decimate its samples.
+
+    Raises:
+        NoackError: the scenario is wrong, or has several loops.
+    """
+    with tempfile.TemporaryDirectory(prefix="noack-") as folder:
+        ending = simulate_run(scenario, Path(folder))
+        outcome = finalize(ending, report=False, view=False)
+        record, (loop,) = load_record(outcome.run_dir), outcome.summary.loops
+        sampled, sent, resolved = samples(record), events(record), record.scenario
+        known = align_tables(record).since_delivery(resolved)
+    n = len(resolved.model.state_names or ()) or resolved.model.dimensions[0]
+    t_s = _column(sampled, "t_s")
+    x, x_s, x_c = (_states(sampled, name, n) for name in ("x", "x_s", "x_c"))
+    e_s_norm, e_c_norm = _column(sampled, "e_s_norm"), _column(sampled, "e_c_norm")
+    x_c, e_c_norm = np.where(known[:, None], x_c, np.nan), np.where(known, e_c_norm, np.nan)
+    curves = np.column_stack([x, x_s, x_c, e_s_norm, e_c_norm])
+    kept = decimate_all(t_s, curves, _COLUMNS)
+    threshold = threshold_at(resolved, t_s[kept])
+    return Exploration(
+        resolved, SAMPLED, t_s[kept], x[kept], x_s[kept], x_c[kept], e_s_norm[kept],
+        e_c_norm[kept], threshold, _column(sent, "t_s"),
+        sent["received"].to_numpy(zero_copy_only=False).astype(np.bool_),
+        loop.diverged_at_s, key_numbers(loop.to_json()),
+    )  # fmt: skip
+
+
+def _column(table: pa.Table, name: str) -> Vector:
+    return np.asarray(table[name].to_numpy(), dtype=np.float64)
+
+
+def _states(table: pa.Table, name: str, n: int) -> Matrix:
+    return np.column_stack([_column(table, f"{name}_{i}") for i in range(1, n + 1)])

@@ -6,7 +6,7 @@ import numpy as np
 
 from cosim.analysis.margin_search import find_margin
 from cosim.interactive.exploration import Exploration
-from cosim.output.certificate_rows import constant_rows
+from cosim.output.certificates import constant_rows
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

@@ -1,4 +1,5 @@
 """``noack lab``: a page in the browser for trying settings, running live and opening runs.
 
-The folder ``page`` draws what :mod:`cosim.interactive` computes; its framework is an extra.
+``lab_server`` serves ``lab_page``, which has a panel in each of the other files; ``chart`` draws
+the figure of :mod:`cosim.interactive`. The framework, NiceGUI, is an extra.
 """

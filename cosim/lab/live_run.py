@@ -1,15 +1,24 @@
-"""A live run that the page has started: its process, its progress, what was said about it."""
+"""A live run that the page has started, as a process of its own, which never disturbs the loop.
+
+:class:`LiveRun` is the page's side: the process, its progress, what it has reported. Run as a
+program, this module is the other side: it reads the scenario's text from standard input, until its
+end, and writes one JSON object per line on standard output: what happened, with its fields.
+"""
 
 import asyncio
 import json
 import os
 import re
 import signal
+import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cosim.interactive.draft import Draft
+from cosim.live.launcher import Watcher, launch
+from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
 
@@ -55,7 +64,7 @@ class LiveRun:
         """
         environment = {key: value for key, value in os.environ.items() if key not in _DISPLAYS}
         self._process = await asyncio.create_subprocess_exec(
-            *python_command("-m", "cosim.lab.live_child", folder.absolute(), runs.absolute()),
+            *python_command("-m", "cosim.lab.live_run", folder.absolute(), runs.absolute()),
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
             stdin=asyncio.subprocess.PIPE, env=environment, start_new_session=True,
         )  # fmt: skip
@@ -172,3 +181,40 @@ def _title(pid: int) -> str:
     with suppress(OSError):
         return (_CMDLINE / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
     return ""
+
+
+def main() -> int:
+    """Run a scenario; the arguments are the folder of the files that it names, and of the runs."""
+    folder, runs = map(Path, sys.argv[1:3])
+    watcher = Watcher(
+        started=lambda run_dir: _say("started", run_dir=str(run_dir)),
+        failed=lambda why, t_s, by_hand: _say("failed", why=why, t_s=t_s),
+        restarted=lambda role, t_s: _say("restarted", role=role, t_s=t_s),
+        progress=lambda report: _say("progress", **report),
+    )
+    try:
+        draft = Draft("scenario", folder, "", sys.stdin.buffer.read().decode())
+        ending = launch(draft.scenario, runs, live=True, watcher=watcher)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
+        _say("finalising", reason=ending.reason)
+        from cosim.live.finalize import finalize
+        from cosim.output.run_verdict import verdict
+
+        outcome = finalize(ending, report=False)
+    except NoackError as error:
+        _say("error", text=str(error))
+        return error.exit_status
+    _say(
+        "ended", run_dir=str(outcome.run_dir), reason=outcome.reason,
+        ok=outcome.status is ExitStatus.OK, verdict=verdict(outcome.summary),
+    )  # fmt: skip
+    return outcome.status
+
+
+def _say(what: str, **fields: Any) -> None:
+    with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
+        print(json.dumps({"what": what, **fields}), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

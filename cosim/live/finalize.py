@@ -308,12 +308,12 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 def _write_recording(
     run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None
 ) -> None:
-    from cosim.output.viewer.run_view import write_view  # imports rerun
+    from cosim.output.viewer.run_recording import write_view  # imports rerun
 
     write_view(run, summary, run_dir, loop)
 
 
 def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
-    from cosim.output.report.report_page import write_report  # imports matplotlib
+    from cosim.output.report_page import write_report  # imports matplotlib
 
     return write_report(run, summary, run_dir, loop)

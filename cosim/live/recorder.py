@@ -49,9 +49,9 @@ from noack.runtime.telemetry import first_row
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.live_viewer import LiveView
-    from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
     from cosim.output.viewer.run_feed import LoopFeed, NetworkFeed
+    from cosim.output.viewer.run_recording import NetworkRecording
 
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the tokens of all running processes."""
@@ -468,7 +468,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | NetworkRecording":
     scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
-    from cosim.output.viewer.run_view import open_view
+    from cosim.output.viewer.run_recording import open_view
 
     return open_view(scenario, Path(run_dir), run_id, live_view)
 

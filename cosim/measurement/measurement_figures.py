@@ -1,170 +1,148 @@
 """The figures of a measurement: bursts, delays, correlation, (m, K)."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from cosim.measurement.burst_statistics import most_losses
 from cosim.measurement.confidence_interval import LEVEL
 from cosim.measurement.network_measurement import Measurement
 from cosim.output import palette
-from cosim.output.report import axes as draw
-from cosim.output.report.figure_style import printed, styled
+from cosim.output.figure_description import (
+    Axis,
+    Bars,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Rule,
+    Spans,
+    one_panel,
+    time_axis,
+)
 from noack.core.number_format import duration
 
-_BURSTS, _OUTAGES, _DELAYS = map(printed, (palette.SENSOR, palette.CONTROLLER, palette.PLANT))
-_LOST, _LIMIT = map(printed, (palette.LOST, palette.CERTIFIED))
+_BURSTS, _OUTAGES, _DELAYS = palette.SENSOR, palette.CONTROLLER, palette.PLANT
+_LOST, _LIMIT = palette.LOST, palette.CERTIFIED
 _HEIGHT_IN = 2.4
 _WINDOWS = 40
 _LONGEST_WINDOW = 1000
 
 
-class MeasurementFigure(NamedTuple):
-    """A figure with its caption."""
-
-    name: str
-    figure: Figure
-    caption: str
-    description: str
-    """Text alternative of the figure."""
-
-
-def measurement_figures(found: Measurement) -> Iterator[MeasurementFigure]:
+def measurement_figures(found: Measurement) -> Iterator[FigureDescription]:
     """Yield the figures of a measurement."""
     deadline_s = found.options.deadline_s
     limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
-    yield MeasurementFigure(
-        "bursts", _histogram(found),
-        "Number of loss bursts by length. A burst is a number of consecutive effective losses: "
-        "packets that were lost, out of order, or later than the deadline.",
-        f"Bars: {len(found.bursts.length)} loss bursts, the longest of {found.bursts.longest} "
-        "packets.",
-    )  # fmt: skip
-    yield MeasurementFigure(
-        "delays", _delays(found),
-        "Delay of each received packet, at its sending time; crosses at the top: lost packets. "
-        f"Shaded: outages.{limit}",
+    yield one_panel("bursts", _histogram(found), _HEIGHT_IN).captioned(
+        "Number of loss bursts by length. A burst is a number of consecutive effective "
+        "losses: packets that were lost, out of order, or later than the deadline.",
+        f"Bars: {len(found.bursts.length)} loss bursts, the longest of "
+        f"{found.bursts.longest} packets.",
+    )
+    yield one_panel("delays", _delays(found), _HEIGHT_IN).captioned(
+        "Delay of each received packet, at its sending time; crosses at the top: lost "
+        f"packets. Shaded: outages.{limit}",
         f"Points: the delays of {found.delays.received} packets over {found.observed_s:.1f} s.",
-    )  # fmt: skip
-    yield MeasurementFigure(
-        "correlation", _correlation(found),
-        "Correlation of the delays (of their normal scores) and of the effective losses of two "
-        f"packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
+    )
+    yield one_panel("correlation", _correlation(found), _HEIGHT_IN).captioned(
+        "Correlation of the delays (of their normal scores) and of the effective losses of "
+        f"two packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
         "correlations of independent delays.",
         "Curves: correlation of delays and of losses over the distance in packets.",
-    )  # fmt: skip
-    yield MeasurementFigure(
-        "windows", _windows(found),
-        "(m, K): the largest number m of effective losses in any K consecutive packets. Dashed: "
-        "all K packets lost.",
+    )
+    yield one_panel("windows", _windows(found), _HEIGHT_IN).captioned(
+        "(m, K): the largest number m of effective losses in any K consecutive packets. "
+        "Dashed: all K packets lost.",
         "Curve: most losses over the length of the window.",
-    )  # fmt: skip
+    )
 
 
-@styled
-def _histogram(found: Measurement) -> Figure:
-    shown_as = ("loss bursts", "outages") if found.is_outage.any() else ()
-    figure, (axes,) = draw.single(_HEIGHT_IN, shown_as)
-    groups = ((found.bursts.only(~found.is_outage), _BURSTS), (
-        found.bursts.only(found.is_outage), _OUTAGES))  # fmt: skip
+def _histogram(found: Measurement) -> Panel:
+    outages = found.is_outage
     longest = found.bursts.longest
     # Bins of one length, or, if the lengths differ much, of a constant ratio.
     wide = longest > _WINDOWS
-    edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round()) if wide else (
-        np.arange(1, longest + 2))  # fmt: skip
-    shown: list[draw.Shown] = []
-    for label, (bursts, colour) in zip(("loss bursts", "outages"), groups, strict=True):
-        if len(bursts.length):
-            counts, _ = np.histogram(bursts.length, edges)
-            bars = axes.bar(
-                edges[:-1] - 0.5, counts, np.diff(edges), align="edge", color=colour, alpha=0.85
-            )
-            shown.append((bars.patches[0], label))
+    edges = np.arange(1.0, longest + 2)
     if wide:
-        draw.logarithmic(axes, "x")
-    else:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(title="Loss bursts", xlabel="consecutive effective losses", ylabel="bursts")
-    draw.legend(axes, shown if shown_as else ())
-    draw.finish(axes)
-    return figure
+        edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round())
+    items = []
+    for label, bursts, colour in (
+        ("loss bursts", found.bursts.only(~outages), _BURSTS),
+        ("outages", found.bursts.only(outages), _OUTAGES),
+    ):
+        counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
+        items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour,
+                          opacity=0.85))  # fmt: skip
+    return Panel(
+        title="Loss bursts",
+        items=items,
+        x=Axis(label="consecutive effective losses", logarithmic=wide, whole=not wide),
+        y=Axis(label="bursts", whole=True),
+        legend=None if outages.any() else (),
+    )
 
 
-@styled
-def _delays(found: Measurement) -> Figure:
-    figure, (axes,) = draw.single(_HEIGHT_IN, ())
+def _delays(found: Measurement) -> Panel:
     trace = found.trace
     sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
     values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
-    if (~lost).any():
-        draw.logarithmic(axes, "y")
-        draw.line(
-            axes, sent_s, values, color=_DELAYS, linewidth=0.8, marker=".", markersize=2.5,
-            label="delay",
-        )  # fmt: skip
-    for begin_s, duration_s in zip(*found.bursts.only(found.is_outage).times_s(trace), strict=True):
-        axes.axvspan(begin_s, begin_s + duration_s, color=_OUTAGES, alpha=0.2, linewidth=0)
+    begin_s, duration_s = found.bursts.only(found.is_outage).times_s(trace)
+    items: list[Item] = [
+        Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
+        Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),
+        Marks(x=sent_s[lost], y=np.zeros(int(lost.sum())), marker="x", size=3.5, colour=_LOST,
+              at_top=True, reduced=False),
+    ]  # fmt: skip
     if found.options.deadline_s is not None:
-        axes.axhline(found.options.deadline_s, color=_LIMIT, linestyle=(0, (6, 2.5)))
-    if lost.any():
-        top = np.full(int(lost.sum()), 0.97)
-        axes.plot(
-            sent_s[lost], top, linestyle="none", marker="x", markersize=3.5, color=_LOST,
-            transform=axes.get_xaxis_transform(),
-        )  # fmt: skip
-    axes.set(title="Delay over time", xlabel="sending time [s]", ylabel="delay [s]")
-    draw.finish(axes, sent_s)
-    return figure
+        items.append(Rule(at=found.options.deadline_s, colour=_LIMIT))
+    return Panel(
+        title="Delay over time",
+        items=items,
+        x=time_axis(sent_s, label="sending time [s]"),
+        y=Axis(label="delay [s]", logarithmic=bool((~lost).any())),
+    )
 
 
-@styled
-def _correlation(found: Measurement) -> Figure:
-    labels = ("delays", "effective losses")
-    figure, (axes,) = draw.single(_HEIGHT_IN, labels)
-    delays, shown = found.delays, []
-    if delays.lags:
-        shown += _curve(axes, delays.lags, delays.correlation, "delays", _BURSTS)
-    lags, losses = found.loss_correlation
-    if lags:
-        shown += _curve(axes, lags, losses, "effective losses", _LOST)
-    for white in (delays.white, -delays.white):
-        axes.axhline(white, color=_LIMIT, linestyle=(0, (6, 2.5)), linewidth=1.0)
-    if shown:
-        draw.logarithmic(axes, "x")
-    axes.set(title="Correlation", xlabel="distance in packets", ylabel="correlation")
-    draw.legend(axes, shown)
-    draw.finish(axes)
-    return figure
+def _correlation(found: Measurement) -> Panel:
+    delays, (lags, losses) = found.delays, found.loss_correlation
+    items = [
+        _curve(x, y, label, colour)
+        for x, y, label, colour in (
+            (delays.lags, delays.correlation, "delays", _BURSTS),
+            (lags, losses, "effective losses", _LOST),
+        )
+        if x
+    ]
+    limits = [Rule(at=at, colour=_LIMIT, width=1.0) for at in (delays.white, -delays.white)]
+    return Panel(
+        title="Correlation",
+        items=[*items, *limits],
+        x=Axis(label="distance in packets", logarithmic=bool(items)),
+        y=Axis(label="correlation"),
+    )
 
 
-@styled
-def _windows(found: Measurement) -> Figure:
-    has_outages = bool(found.is_outage.any())
-    labels = ("all packets", "without outages") if has_outages else ()
-    figure, (axes,) = draw.single(_HEIGHT_IN, labels)
+def _windows(found: Measurement) -> Panel:
     longest = max(min(_LONGEST_WINDOW, len(found.trace)), 1)
     windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
     every = most_losses(found.bursts, windows)
-    shown = _curve(axes, [*every], [*every.values()], "all packets", _OUTAGES)
-    if has_outages:
+    items = [_curve([*every], [*every.values()], "all packets", _OUTAGES)]
+    if found.is_outage.any():
         usual = most_losses(found.bursts, windows, found.is_outage)
-        shown += _curve(axes, [*usual], [*usual.values()], "without outages", _BURSTS)
-    axes.plot(windows, windows, color=_LIMIT, linestyle=(0, (6, 2.5)))
-    draw.logarithmic(axes, "x")
-    if any(every.values()):
-        draw.logarithmic(axes, "y")
-        axes.set_ylim(0.8, 1.4 * max(every.values()))
-    axes.set(title="Most losses in a window", xlabel="window K in packets", ylabel="losses m")
-    draw.legend(axes, shown if has_outages else ())
-    draw.finish(axes)
-    return figure
+        items.append(_curve([*usual], [*usual.values()], "without outages", _BURSTS))
+    all_lost = np.array(windows, np.float64)
+    most = max(every.values())
+    ends = (0.8, 1.4 * most) if most else (None, None)
+    return Panel(
+        title="Most losses in a window",
+        items=[*items, Line(x=all_lost, y=all_lost, colour=_LIMIT, dash=(6, 2.5))],
+        x=Axis(label="window K in packets", logarithmic=True),
+        y=Axis(label="losses m", logarithmic=most > 0, ends=ends),
+        legend=None if found.is_outage.any() else (),
+    )
 
 
-def _curve(axes: Axes, x: object, y: object, label: str, colour: object) -> list[draw.Shown]:
-    (line,) = axes.plot(x, y, color=colour, marker=".", markersize=4)  # type: ignore[arg-type]
-    return [(line, label)]
+def _curve(x: Sequence[float], y: Sequence[float], label: str, colour: palette.Colour) -> Line:
+    return Line(x=np.asarray(x, np.float64), y=np.asarray(y, np.float64), label=label,
+                colour=colour, marker=".", size=4)  # fmt: skip

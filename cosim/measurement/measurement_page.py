@@ -6,9 +6,9 @@ from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.measurement_figures import measurement_figures
 from cosim.measurement.measurement_tables import measurement_tables, void_remarks
 from cosim.measurement.network_measurement import Measurement
+from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
-from cosim.output.report.figure_files import save_figures
-from cosim.output.report.report_page import templates
+from cosim.output.page_kit import templates
 from noack.core.file_access import require_suffix, write_whole
 
 
@@ -33,5 +33,4 @@ def write_page(
         tables=list(measurement_tables(found, void)),
         figures=figures,
     )
-    named = ((one.name, one.figure) for one in measurement_figures(found))
-    return [write_whole(path, html), *save_figures(named, path, figure_files)]
+    return [write_whole(path, html), *save_figures(figures, path, figure_files)]

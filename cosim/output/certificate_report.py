@@ -1,33 +1,39 @@
-"""The certificates of a scenario, as tables and in words."""
+"""What is certified for a scenario, as tables and in words.
+
+:func:`print_certificates` prints the constants, the limits of the schedule, the assumptions and, if
+losses are not limited, what holds for random ones; :func:`print_margin` prints the margin of a
+time-triggered loop.
+"""
 
 from collections.abc import Iterator
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
-from cosim.output.all_certificates import SCHEDULE, Certificates
-from cosim.output.assumptions_table import print_assumptions
-from cosim.output.certificate_rows import constant_rows, plants_of
-from cosim.output.result_tables import ResultTable
-from cosim.output.unlimited_losses_report import print_unlimited
-from noack.core.number_format import duration
+from cosim.analysis.margin_search import MarginResult
+from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
+from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.output.run_verdict import print_assumptions
+from noack.core.number_format import duration, number
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX
 from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
+from noack.theory.random_losses.moments import UnlimitedLosses
 
 
 def print_certificates(console: Console, found: Certificates) -> None:
     """Print the tables."""
-    _print_constants(console, found)
+    constants, *limits = certificate_tables(found)
+    console.print(terminal_table(constants))
+    _print_notes(console, found)
     if any(found.setpoint or ()):
         console.print(
             "[dim]x is the distance from the set-point, x − x_r. If the plant does not rest there, "
             "A x_r + B u_r is a disturbance: a step at the state.[/]"
         )
-    if any(certificate.constants for _, certificate in found):
-        _print_limits(console, found)
+    for table in limits:
+        console.print(terminal_table(table))
     if (outside := outside_box(found.scenario)) is not None:
         console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
     console.print("assumptions of the certificates for the schedule:")
@@ -77,11 +83,12 @@ def _stability_in_words(found: Certificates) -> Iterator[str]:
     yield f"Exactly, but without lateness: {text}; noack margin finds the limits."
 
 
-def constant_table(found: Certificates) -> tuple[str, list[str], list[tuple[str, ...]]]:
-    """Return title, headings and rows of the table of constants."""
+def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
+    """Yield the certified constants, and the largest certified times of the schedule."""
     trigger = found.scenario.trigger
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
-    guarantee = next(iter(found))[1].conditions.guarantee  # its longest burst counts all rules
+    certificates = [certificate for _, certificate in found]
+    guarantee = certificates[0].conditions.guarantee  # its longest burst counts all rules
     title = (
         f"{found.scenario.name}: certified bounds, "
         f"{guarantee.meaning}; event: {trigger.description}; norm {norm}"
@@ -89,37 +96,38 @@ def constant_table(found: Certificates) -> tuple[str, list[str], list[tuple[str,
     headings = ["", *(f"{under},\n{plants_of(certificate)}" for under, certificate in found)]
     printed = found.theorem_2 is not None
     headings += ["paper's\nTheorem 2"] if printed else []
-    certificates, rate = [one for _, one in found], trigger.threshold_decay_per_s
     rows = [
         (label, *values, *([of_theorem] if printed else []))
-        for label, values, of_theorem in constant_rows(certificates, found.theorem_2, rate)
+        for label, values, of_theorem in constant_rows(
+            certificates, found.theorem_2, trigger.threshold_decay_per_s
+        )
     ]
-    return title, headings, rows
+    yield ResultTable("certificates", title, headings, rows)
+    if any(certificate.constants for certificate in certificates):
+        caption = (
+            f"{found.scenario.name}: how far each setting of the {SCHEDULE} can go alone before "
+            "the certificate is lost"
+        )
+        limits = [(scope, *map(_limit, one)) for scope, one in found.limits_by_scope.items()]
+        yield ResultTable("limits", caption, LIMIT_HEADINGS, limits)
 
 
-def _print_constants(console: Console, found: Certificates) -> None:
-    title, headings, rows = constant_table(found)
-    table = Table(title=title)
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading else "left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+def _print_notes(console: Console, found: Certificates) -> None:
+    """Explain the rows of the constants, and say why certificates are void."""
     certificates = [one for _, one in found]
     if any(one.constants for one in certificates):
         console.print(
             "[dim]Each bound of a norm is multiplied by e^(−rate·t). paper: no sampling, no delay, "
             "no hold. schedule: the scenario's rates, plus the lateness that it allows. plant: the "
-            "scenario's plant. box: every plant of the uncertainty box. updates outstanding: "
-            "maximum number of updates lost or in flight. no update missing: while the controller "
-            "has every update, which sharpens the bound of x from an event on. inter-event time: "
-            "minimum.[/]"
+            "scenario's plant. box: every plant of the uncertainty box. undelivered updates: "
+            "updates not yet delivered (lost or in flight), maximum. none undelivered: the bound "
+            "while every update has arrived. inter-event time: minimum.[/]"
         )
     if any(one.persistent_constants for one in certificates):
         console.print(
             "[dim]The rows with + are added: they are the bounds from disturbances, noise, and the "
-            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ and "
-            "x_c − x̂.[/]"
+            "threshold's constant or floor. With noise or an observer, e_s and e_c are x_s − x̂ "
+            "and x_c − x̂.[/]"
         )
     if any(one.other for one in certificates):
         console.print(
@@ -139,31 +147,122 @@ def _print_constants(console: Console, found: Certificates) -> None:
 LIMIT_HEADINGS = ("", "sampling period", "delay of updates", "age of inputs")
 
 
-def limit_rows(found: Certificates) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of the table of limits."""
-    for scope, limits in found.limits_by_scope.items():
-        yield scope, *map(_limit, limits)
-
-
-def _print_limits(console: Console, found: Certificates) -> None:
-    table = Table(title="schedule: largest certified value of each quantity, the others unchanged")
-    for heading in LIMIT_HEADINGS:
-        table.add_column(heading, justify="right" if heading else "left")
-    for row in limit_rows(found):
-        table.add_row(*row)
-    console.print(table)
-
-
 def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
     return "any" if value_s >= MOST_S else duration(value_s)
 
 
-def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
-    """Yield the certified constants, and the largest certified times of the schedule."""
-    title, headings, rows = constant_table(found)
-    yield ResultTable("certificates", title, headings, rows)
-    if any(certificate.constants for _, certificate in found):
-        caption = f"{found.scenario.name}: largest certified values of the {SCHEDULE}"
-        yield ResultTable("limits", caption, LIMIT_HEADINGS, [*limit_rows(found)])
+_MARGIN_STYLES = {"stable": "green", "destabilised": "red", "undecided": "yellow"}
+
+
+MARGIN_HEADINGS = ("M", "maximum consecutive losses (M − 1)", "at least", "at most", "verdict")
+
+
+def margin_title(margin: MarginResult) -> str:
+    """Return the title of the table of the bounds."""
+    delay = f", updates delayed by {margin.delay_s:g} s" if margin.delay_s else ""
+    mode = "model-based" if margin.mode == "model" else "zero-order hold"
+    times = f"with an update every {margin.period_s:g} s"
+    if not margin.is_periodic:
+        times = f"with updates {margin.shortest_s:g} to {margin.period_s:g} s apart"
+    return (
+        f"{margin.scenario}: growth of the worst loss pattern per {margin.period_s:g} s, "
+        f"{times}, {mode}{delay}"
+    )
+
+
+def margin_rows(margin: MarginResult) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of the bounds."""
+    for m, found in margin.caps:
+        yield str(m), str(m - 1), f"{found.lower:.9f}", f"{found.upper:.9f}", found.verdict
+
+
+def print_margin(console: Console, margin: MarginResult) -> None:
+    """Print the bounds for each M, and the verdicts."""
+    (table,) = margin_tables(margin)
+    last = len(MARGIN_HEADINGS) - 1
+    console.print(terminal_table(table, left=[last], styles=_MARGIN_STYLES))
+    console.print(margin.verdict, soft_wrap=True, highlight=False)
+    if margin.period is not None:
+        text = f"for {margin.guarantee}: {margin.period.text}"
+        console.print(text, soft_wrap=True, highlight=False)
+    console.print(margin.random_text, soft_wrap=True, highlight=False, markup=False)
+    note = "D delivered, L lost, repeated. Below 1: every pattern is stable."
+    if not margin.is_periodic:
+        note += " In brackets: the time to the next update."
+    console.print(f"[dim]{note}[/]")
+
+
+def margin_tables(margin: MarginResult) -> Iterator[ResultTable]:
+    """Yield the bounds of the growth for each M."""
+    rows = [*margin_rows(margin)]
+    yield ResultTable("margin", margin_title(margin), MARGIN_HEADINGS, rows)
+
+
+_RARE = 1e-4
+"""Rows are shown from this probability on, up to the first one that is exceeded less often."""
+_MOMENT = {1: "mean", 2: "root mean square"}
+
+
+def print_unlimited(
+    console: Console, found: UnlimitedLosses | None, unpredictable: str | None
+) -> None:
+    """Print what holds although the network does not limit the losses."""
+    if unpredictable is not None:
+        console.print(f"[yellow]no statement without the guarantee:[/] {unpredictable}")
+    if found is None:
+        return
+    likely = [one for one in found.bursts if one.probability < 1 - _RARE]
+    if (
+        shown := [one for one in likely if one.probability > _RARE]
+        + [one for one in found.bursts if one not in likely][:1]
+    ):
+        table = ResultTable(
+            "bursts",
+            "without the guarantee: a run's longest burst of losses, and the bounds that "
+            f"hold as long as none is longer; runs of {found.horizon_s:g} s",
+            ("longest burst", "P(longer burst)", "events", "Δ", "X"),
+            [
+                (f"{one.most}", f"≤ {number(1 - one.probability, 3)}", f"≤ {one.events}",
+                 number(one.delta, 4), number(one.state, 4))
+                for one in shown
+            ],
+        )  # fmt: skip
+        console.print(terminal_table(table, left=()))
+    for sentence in sentences(found):
+        console.print(sentence, markup=False, highlight=False)
+
+
+def sentences(found: UnlimitedLosses) -> Iterator[str]:
+    """Yield what is certified about moments, and almost surely."""
+    p = f"{found.largest_probability:.4g}"
+    losses = f"independent losses with probability {p}"
+    if not found.is_independent:
+        losses = f"losses with probability at most {p} given any past"
+    for one in found.moments:
+        decay = f" e^(−{one.rate_per_s:.3g}t)" if one.rate_per_s else ""
+        yield (
+            f"Without the guarantee, {losses}: at every time t, the {_MOMENT[one.order]} of ‖x‖ is "
+            f"at most {one.state:.4g}{decay}, that of ‖e_c‖ at most "
+            f"{one.controller_error:.4g}{decay}."
+        )
+    if found.void is not None:
+        order = _MOMENT[len(found.moments) + 1]
+        yield f"Without the guarantee no {order} is certified: {found.void}."
+    if found.sure_rate_per_s is not None:
+        yield f"x decays almost surely: decay rate {found.sure_rate_per_s:.3g} /s."
+    if found.paper_rate_per_s is not None:
+        at = ", ".join(
+            f"{_MOMENT[order]} at most {value:.4g}"
+            for order, value in enumerate(found.at_events, start=1)
+        )
+        yield (
+            f"Under the paper's conditions ‖e_c‖ e^(αt)/β at events has a {at}, and x decays "
+            f"almost surely, at every rate below {found.paper_rate_per_s:.3g} /s."
+        )
+    if found.moments or found.bursts:
+        yield (
+            "These are statements about many runs: one run cannot violate a mean. The "
+            "probabilities are bounds; a campaign shows the frequencies."
+        )

@@ -13,12 +13,11 @@ _NARROWEST_IN, _WIDEST_IN = 3.0, 20.0
 
 
 class FigureFormat(StrEnum):
-    """Formats of figures; pdf and pgf have the fonts of LaTeX."""
+    """Formats of figures; a PDF has the fonts of LaTeX."""
 
     SVG = "svg"
     PNG = "png"
     PDF = "pdf"
-    PGF = "pgf"
 
 
 class FigureFiles(NamedTuple):
@@ -47,14 +46,14 @@ def figure_width_in(kind: FigureFormat, width: str | float | None) -> float:
     """Return the width of a figure in inches.
 
     Args:
-        kind: its format; by default the figures of LaTeX are as wide as a column.
+        kind: its format; by default a PDF is as wide as a column.
         width: ``column``, ``page`` or inches; None for the default.
 
     Raises:
         CallerError: there is no such width.
     """
     if width is None:
-        return WIDTHS_IN["column"] if kind in (FigureFormat.PDF, FigureFormat.PGF) else SCREEN_IN
+        return WIDTHS_IN["column"] if kind is FigureFormat.PDF else SCREEN_IN
     if width in WIDTHS_IN:
         return WIDTHS_IN[str(width)]
     try:

@@ -1,49 +1,104 @@
-"""Tables of a run: key numbers, timing, claims."""
+"""Tables of a run, as rows of text: of its network and loops, and of one loop in detail.
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+The terminal (:mod:`cosim.output.run_verdict`), the report and the files of ``--tables`` show them.
+"""
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+from cosim.analysis.fidelity import is_against
 from cosim.analysis.model_comparison import linearisation_rows
 from cosim.analysis.summary_model import (
     ChangePart,
     Claim,
+    DeadlinesPart,
     DisturbancePart,
     EstimationPart,
     FidelityPart,
     FlowPart,
     LoopSummary,
+    NoFidelityPart,
     Quantiles,
     ReplayPart,
     RestartPart,
     RunSummary,
     WatchdogPart,
 )
-from cosim.output.assumptions_table import print_assumptions
-from cosim.output.fidelity_table import summary_rows
+from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.tc_words import settings_of
-from noack.core.number_format import NONE, duration, number, ratio, seconds, whole
+from noack.core.errors import ExitStatus
+from noack.core.number_format import NONE, duration, number, percent, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
 Claims = Sequence[Claim]
 TIMING_HEADINGS = ("p50", "p99", "p99.9", "max", "count", "missed")
+HEADINGS = (
+    "loop", "sent", "lost", "burst", "forced", "share, %", "delay, s", "‖e_c‖", "claims held",
+)  # fmt: skip
+"""Of the table of the loops."""
+CAPTION = (
+    "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
+    "forwarded bytes; delay and ‖e_c‖: largest"
+)
+_FEW = 3
 
 
-def print_details(console: Console, summary: RunSummary) -> None:
-    """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
-    (loop,) = summary.loops
-    console.print(number_table(run_title(summary), key_numbers(summary)))
-    if loop.lateness_us:  # none in virtual time
-        console.print(_timing_table(loop))
-        _print_realtime(console, loop.realtime)
-    console.print("the paper's assumptions for this scenario:")
-    print_assumptions(console, loop.assumptions)
-    print_claims(console, loop.claims)
+def summary_tables(summary: RunSummary) -> Iterator[ResultTable]:
+    """Yield the tables of a run: network and loops, or those of its only loop."""
+    if shares_network(summary):
+        title = f"{summary.scenario}, M − 1 = {summary.mansd}"
+        yield ResultTable("network", f"network of {title}", KEY_VALUE, network_rows(summary))
+        rows = [loop_row(loop) for loop in summary.loops]
+        yield ResultTable("loops", f"loops of {title}", HEADINGS, rows)
+        return
+    (loop,), title = summary.loops, run_title(summary)
+    yield ResultTable("numbers", title, KEY_VALUE, key_numbers(summary))
+    if claims := loop.claims:
+        headings, rows = claim_headings(claims), [*claim_rows(claims)]
+        yield ResultTable("claims", f"claims: {title}", headings, rows)
+    if loop.lateness_us:
+        caption = f"timing in µs of wall time: {title}"
+        yield ResultTable("timing", caption, ("", *TIMING_HEADINGS), [*timing_rows(loop)])
+
+
+def shares_network(summary: RunSummary) -> bool:
+    """Whether several loops share the network; the page of one alone is that of the loop."""
+    return len(summary.loops) > 1
+
+
+def mode_words(mode: str) -> str:
+    """Return what the controller does between updates."""
+    return "model-based" if mode == "model" else "zero-order hold"
+
+
+def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
+    """Return what a run was, how it ended, and its results, in a few lines."""
+    loop, shared = summary.loops[0], shares_network(summary)
+    mode = f"{len(summary.loops)} loops" if shared else mode_words(loop.mode)
+    verdicts = Counter(str(claim.verdict) for one in summary.loops for claim in one.claims)
+    norms = (loop.initial_state_norm, loop.final_state_norm)
+    of_loop = [
+        (
+            "events",
+            f"{loop.events}; {loop.deliveries} received, {loop.drops} lost, "
+            f"longest loss burst {loop.longest_loss_burst}",
+        ),
+        ("‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)),
+    ]
+    return [
+        ("run", f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"),
+        ("ended", f"at {summary.reached_s:g} s of {summary.horizon_s:g} s: {summary.exit.reason}"),
+        *(network_rows(summary)[:_FEW] if shared else of_loop),
+        ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
+        ("directory", str(directory)),
+    ]  # fmt: skip
+
+
+# One loop
 
 
 def run_title(summary: RunSummary) -> str:
@@ -57,19 +112,8 @@ def title_of(
     scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = ""
 ) -> str:
     """Return the title of the tables of a run of one loop; ``kind`` is empty for a live run."""
-    name = "model-based" if mode == "model" else "zero-order hold"
     further = "".join(f", {one}" for one in (*constraints, kind) if one)
-    return f"{scenario}, {name}, M − 1 = {mansd}{further}"
-
-
-def number_table(title: str, rows: Numbers) -> Table:
-    """Return a run's numbers as a table."""
-    table = Table(title=escape(title))
-    table.add_column("quantity")
-    table.add_column("value", justify="right")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
+    return f"{scenario}, {mode_words(mode)}, M − 1 = {mansd}{further}"
 
 
 def short_numbers(summary: RunSummary) -> Numbers:
@@ -86,7 +130,7 @@ def short_numbers(summary: RunSummary) -> Numbers:
         *_lateness(loop),
         *_other_clocks(loop),
         *_replay_rows(loop.replay),
-        *([next(summary_rows(loop.fidelity))] if compared else ()),
+        *([next(fidelity_rows(loop.fidelity))] if compared else ()),
     )
 
 
@@ -105,7 +149,7 @@ def key_numbers(summary: RunSummary) -> Numbers:
         *_estimation(loop.estimation),
         *_disturbances(loop.disturbances),
         *_replay_rows(loop.replay),
-        *summary_rows(loop.fidelity),
+        *fidelity_rows(loop.fidelity),
     )
 
 
@@ -222,7 +266,7 @@ def changes_in(changes: Sequence[ChangePart]) -> Iterator[tuple[str, str]]:
         yield f"changed at {one.t_s:.3f} s", one.what
 
 
-def interval_of(claim: Claim) -> str:
+def interval_text(claim: Claim) -> str:
     """Return the interval of a claim; empty for the whole run."""
     from_s, until_s = claim.from_s, claim.until_s
     if from_s == 0 and until_s is None:
@@ -263,62 +307,40 @@ def _disturbances(found: Sequence[DisturbancePart]) -> Iterator[tuple[str, str]]
         yield f"disturbance at the {one.at}: RMS, maximum", sizes
 
 
-def print_claims(console: Console, claims: Claims) -> None:
-    """Print the claims about a loop and their verdicts."""
-    if not claims:
+def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
+    """Yield the rows of a run's fidelity: its difference from the ideal loop, effect by effect."""
+    if fidelity is None:
         return
-    table = Table(title="claims checked against this run")
-    for heading in claim_headings(claims):
-        table.add_column(heading, justify="right" if heading == "share used" else "left")
-    for (*cells, verdict), colour in claim_rows(claims):
-        table.add_row(*map(escape, cells), Text(verdict, colour))
-    console.print(table)
-    if any(claim.ratio is not None for claim in claims):
-        console.print(
-            "[dim]share used: largest share of the bound reached during the run; 100 % is normal "
-            "for a bound that is computed from the run itself. Sources: (I1) and certificates, "
-            "docs/theory.md; eq:... and theorems, the paper[/]"
-        )
-    sources: dict[tuple[str, str], list[str]] = {}
-    for claim in claims:
-        if claim.verdict != "held" and claim.why:
-            sources.setdefault((claim.verdict, claim.why), []).append(claim.source)
-    for (verdict, why), of in sources.items():
-        text = f"{verdict}: {'; '.join(dict.fromkeys(of))}: {why}"
-        console.print(text, highlight=False, markup=False)
-
-
-class ClaimRow(NamedTuple):
-    """A row of the table of claims."""
-
-    cells: tuple[str, ...]
-    colour: str
-    """Of the verdict."""
+    if isinstance(fidelity, NoFidelityPart):
+        yield "difference to the ideal loop", f"not compared: {fidelity.reason}"
+        return
+    scale = fidelity.rms_x_live
+    of_x = f" ({100 * fidelity.rms_x / scale:.2g} % of x)" if scale else ""
+    yield "difference to the ideal loop, RMS", f"{fidelity.rms_x:.3g}{of_x}"
+    for name, share in fidelity.shares.items():
+        if name != "residual":
+            against = " (partly cancels the other effects)" if is_against(share) else ""
+            yield f"  {name.replace('_', ' ')}", percent(share) + against
+    yield "  residual, RMS", f"{100 * fidelity.explained_relative:.2g} % of the difference"
 
 
 def claim_headings(claims: Claims) -> tuple[str, ...]:
     """Return the headings of the table of claims; the interval only if claims have one."""
-    interval = ["interval"] if any(map(interval_of, claims)) else []
+    interval = ["interval"] if any(map(interval_text, claims)) else []
     return "source", "claim", *interval, "share used", "verdict"
 
 
-def claim_rows(claims: Claims) -> Iterator[ClaimRow]:
+def claim_rows(claims: Claims) -> Iterator[tuple[str, ...]]:
     """Yield the rows of the table of claims."""
     has_interval = "interval" in claim_headings(claims)
     for claim in claims:
         since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
-        cells = (
+        yield (
             claim.source, claim.bound,
-            *([interval_of(claim)] if has_interval else []),
+            *([interval_text(claim)] if has_interval else []),
             NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %",
             claim.verdict + since,
         )  # fmt: skip
-        yield ClaimRow(cells, _CLAIM_COLOURS[claim.verdict])
-
-
-_CLAIM_COLOURS = {
-    "held": "green", "violated": "bold red", "void": "yellow", "not applicable": "dim",
-}  # fmt: skip
 
 
 def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
@@ -330,15 +352,6 @@ def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     elif (first := verdict.first_difference) is not None:
         word = f"differs: {first.table}, row {first.row}, {first.column}"
     yield "replay", word if verdict.complete else f"{word} (record incomplete)"
-
-
-def _timing_table(loop: LoopSummary) -> Table:
-    table = Table(title="timing in µs of wall time (missed: deadlines missed)")
-    for heading in ("", *TIMING_HEADINGS):
-        table.add_column(heading, justify="right" if heading else "left")
-    for row in timing_rows(loop):
-        table.add_row(*row)
-    return table
 
 
 def timing_rows(loop: LoopSummary) -> Iterator[tuple[str, ...]]:
@@ -355,15 +368,85 @@ def _quantiles(found: Quantiles) -> tuple[float | None, ...]:
     return found.p50, found.p99, found.p999, found.max
 
 
-def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
-    """Print one line for all processes with the same real-time settings."""
-    roles_by_settings: dict[str, list[str]] = {}
-    for role in sorted(realtime):
-        verdicts = realtime[role]
-        text = ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
-        if set(verdicts.values()) == {"applied"}:
-            text = "all applied"
-        roles_by_settings.setdefault(text, []).append(role)
-    for text, roles in roles_by_settings.items():
-        whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
-        console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
+# The network and all loops
+
+
+def badness(loop: LoopSummary) -> tuple[Any, ...]:
+    """Return a key that is larger for a worse loop."""
+    claims, error = _verdicts(loop), loop.sup_e_c_norm
+    return (
+        loop.exit.status != ExitStatus.OK, claims["violated"], claims["void"],
+        loop.longest_loss_burst, float("inf") if error is None else error,
+    )  # fmt: skip
+
+
+def _verdicts(loop: LoopSummary) -> Counter[str]:
+    return Counter(str(claim.verdict) for claim in loop.claims)
+
+
+def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    """Return the quantities of the network, and their values as text."""
+    network, flying = summary.network, summary.network.in_flight
+    sent, reached_s = network.datagrams, summary.reached_s or math.inf
+    lost = sum(network.drops_by_cause.values())
+    causes = "".join(
+        f", {n} {cause.replace('_', ' ')}" for cause, n in network.drops_by_cause.items()
+    )
+    rows = [
+        ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
+        ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
+        longest_burst(summary.mansd, summary.constraints, network.longest_loss_burst),
+        ("forced by the guarantee", str(network.forced_deliveries)),
+        ("in the network: mean, max", f"{flying.mean:.3g}, {flying.max} datagrams"),
+    ]
+    if network.rate_bps is not None and network.utilisation is not None:
+        used = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"
+        rows.append(("link used", used.replace(",", " ")))
+    loops = summary.loops
+    if flows := [one.actuations for one in loops if one.actuations is not None]:
+        sent, lost = (sum(getattr(one, key) for one in flows) for key in ("sent", "lost"))
+        rows.append(("actuations of all loops", f"{sent} ({sent / reached_s:.4g} /s)"))
+        burst = max(one.longest_loss_burst for one in flows)
+        rows.append(("  lost, longest loss burst", f"{lost} ({ratio(lost, sent)}), {burst}"))
+    if trips := [one.watchdog.trips for one in loops if one.watchdog.trips]:
+        rows.append(("watchdog acted", f"{sum(trips)} times, in {len(trips)} loops"))
+    if deadlines := summary.deadlines:
+        rows.append(("deadlines missed", _missed(deadlines)))
+        worst = max(deadlines, key=lambda role: deadlines[role].max_us or 0.0)
+        latest_s = 1e-6 * (deadlines[worst].max_us or 0.0)
+        rows.append(("  largest lateness", f"{duration(latest_s)} ({worst})"))
+    if (replay := network.replay) is not None:
+        exact = {True: "bit-exact", False: "differs", None: "not possible"}[replay.bit_exact]
+        rows.append(("replay of the network", exact))
+        count = sum(one.replay is not None and one.replay.bit_exact is True for one in loops)
+        rows.append(("replay of the loops", f"bit-exact: {count} of {len(loops)}"))
+        missing, lost = (
+            sum(getattr(one, key) for one in loops)
+            for key in ("missing_samples", "unintended_losses")
+        )
+        rows.append(("missing samples, unintended losses", f"{missing}, {lost}"))
+    return [*rows, *changes_in(summary.changes)]
+
+
+def _missed(deadlines: Mapping[str, DeadlinesPart]) -> str:
+    missed = [
+        f"{role} {one.late_steps} of {one.steps}"
+        for role, one in deadlines.items()
+        if one.late_steps
+    ]
+    return ", ".join(missed) or "none"
+
+
+def loop_row(loop: LoopSummary) -> tuple[str, ...]:
+    """Return what the table of the loops says of one, under ``HEADINGS``."""
+    claims = _verdicts(loop)
+    held = f"{claims['held']} of {sum(claims.values())}"
+    worse = [f"{claims['violated']} violated"] if claims["violated"] else []
+    if loop.exit.status == ExitStatus.FAILED:
+        worse = ["failed"]
+    return (
+        loop.name, str(loop.events), str(loop.drops),
+        str(loop.longest_loss_burst), str(loop.forced_deliveries),
+        number(100 * (loop.link_share or 0.0)), number(loop.delay_max_s),
+        number(loop.sup_e_c_norm), ", ".join([held, *worse]),
+    )  # fmt: skip

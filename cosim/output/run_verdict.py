@@ -1,4 +1,8 @@
-"""Terminal output at the end of a run: a verdict of three lines, tables, the run's files."""
+"""Terminal output about a run: a verdict of three lines, tables, remarks, the run's files.
+
+Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of the numbers), then
+:func:`print_outcome`, which prints both with the tables of :mod:`cosim.output.run_tables`.
+"""
 
 import shutil
 import sys
@@ -7,24 +11,63 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 from rich.text import Text
 
+from cosim.analysis.claims.observed_conditions import CAUSES
+from cosim.analysis.fidelity import Fidelity, SignalDifference
 from cosim.analysis.run_summary import Outcome
-from cosim.analysis.summary_model import Claim, ExitPart, FidelityPart, RunSummary
-from cosim.output.network_table import print_loops
-from cosim.output.remarks import remarks
-from cosim.output.run_tables import number_table, print_details, run_title, short_numbers
+from cosim.analysis.summary_model import (
+    AssumptionPart,
+    Claim,
+    ExitPart,
+    FidelityPart,
+    LoopSummary,
+    RunSummary,
+)
+from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
+from cosim.output.run_tables import (
+    CAPTION,
+    HEADINGS,
+    TIMING_HEADINGS,
+    Numbers,
+    away,
+    badness,
+    changes_in,
+    claim_headings,
+    claim_rows,
+    key_numbers,
+    loop_row,
+    network_rows,
+    run_title,
+    shares_network,
+    short_numbers,
+    timing_rows,
+)
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
 from noack.core.errors import ExitStatus
+from noack.core.number_format import NONE, percent
 from noack.runtime.life_cycle import HORIZON
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
-_CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
-"""Styles of verdicts other than "held", the worst first."""
+_CLAIM_STYLES = {
+    "held": GOOD, "violated": BAD, "void": DOUBTFUL, "not applicable": "dim",
+}  # fmt: skip
+_ASSUMPTION_STYLES: dict[str, str] = {
+    AssumptionStatus.HOLDS: "green",
+    AssumptionStatus.VIOLATED: "bold yellow",
+    AssumptionStatus.IDEALISED: "dim",
+    AssumptionStatus.NOT_NEEDED: "dim",
+    AssumptionStatus.ASSUMED: "cyan",
+}
 _NAMED = 3
 """Largest number of claims of a verdict that are named."""
+_MOST_LOOPS, _MOST_REASONS, _MOST_VIOLATIONS = 12, 3, 5
+_MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
 
 class VerdictLine(NamedTuple):
@@ -42,8 +85,8 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
         sum(getattr(one, key) for one in loops) for key in ("events", "deliveries")
     )
     ideal = None
-    if len(loops) == 1 and isinstance(found := loops[0].fidelity, FidelityPart):
-        ideal = found.events_ideal
+    if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
+        ideal = loops[0].fidelity.events_ideal
     return (
         ending_line(summary.exit, summary.reached_s, summary.horizon_s),
         transmission_line(events, delivered, ideal),
@@ -75,7 +118,7 @@ def _claims(claims: Sequence[Claim]) -> VerdictLine:
         return VerdictLine("claims: none", NEUTRAL)
     counts = Counter(str(claim.verdict) for claim in claims)
     parts, style = [f"claims: {counts['held']} of {len(claims)} held"], GOOD
-    for name, colour in _CLAIMS.items():
+    for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
         if counts[name]:
             style = colour if style == GOOD else style
             parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
@@ -92,6 +135,82 @@ def _reason(claims: Sequence[Claim], name: str) -> str:
     return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
 
 
+class Remark(NamedTuple):
+    """One sentence."""
+
+    text: str
+    severe: bool = False
+    """Whether a guarantee was broken."""
+
+
+def remarks(summary: RunSummary) -> Iterator[Remark]:
+    """Yield the remarks on one loop, the severe ones first; none if all went well."""
+    (loop,) = summary.loops
+    violations = loop.assumption_violations
+    for one in violations[:_MOST_VIOLATIONS]:
+        where = f"t = {one.t_s:.3f} s (reported by {one.process})"
+        severe = one.cause not in CAUSES  # the guarantee, or a change
+        yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
+    if len(violations) > _MOST_VIOLATIONS:
+        yield Remark(
+            f"{len(violations) - _MOST_VIOLATIONS} more violations of this kind", severe=True
+        )
+    if loop.replay is not None and loop.replay.bit_exact is False:
+        yield Remark("the replay of the run differs from its record", severe=True)
+    yield from map(Remark, _warnings(summary, loop))
+
+
+def _has_clocks(loop: LoopSummary) -> bool:
+    """Whether bounds of clocks' errors are recorded, as of a run on several hosts."""
+    return loop.conditions is not None and loop.conditions.clock_error_s is not None
+
+
+def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
+    for one in loop.assumptions:
+        if one.verdict == AssumptionStatus.VIOLATED:
+            yield f"assumption violated: {one.what} ({one.source}): {one.why}"
+    late = loop.lateness_us.get("plant")
+    if late and late.late_steps > _MOST_LATE * late.steps:
+        share = 100 * late.late_steps / late.steps
+        yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
+    first, last = loop.initial_state_norm, loop.final_state_norm
+    grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
+    if grew and loop.diverged_at_s is None:  # else it is the reason why the run ended
+        yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
+    if isinstance(loop.fidelity, FidelityPart) and not loop.fidelity.explained:
+        yield "sampling, delay and hold do not explain the difference to the ideal loop"
+    if loop.missing_samples:
+        where = ", ".join(f"{n} of {t}" for t, n in loop.missing_by_table.items())
+        yield f"{loop.missing_samples} samples are missing from the record: {where}"
+    if loop.unintended_losses:
+        where = ", ".join(f"{n} on {leg}" for leg, n in loop.unintended_losses_by_leg.items())
+        lost = f"{loop.unintended_losses} datagrams were lost elsewhere"
+        if _has_clocks(loop):
+            yield f"{lost} (kernel, or between the hosts; firewalls must pass the ports): {where}"
+        else:
+            yield f"{lost} (kernel): {where}"
+    for restart in loop.restarts:
+        yield f"{restart.process} was restarted, {away(restart)}; claims are void from then on"
+    for when, what in changes_in(loop.changes):
+        yield f"{when}: {what}"
+    for role, reasons in loop.rejected_datagrams.items():
+        counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
+        yield f"{role} rejected datagrams: {counts}"
+    # Claims are void because this machine was late.
+    causes = {one.cause for one in loop.assumption_violations} & {"delay", "hold"}
+    if causes and summary.kind == "live" and not loop.restarts:
+        what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
+        yield (
+            f"{what} was late, so some claims were not judged to the end. To allow more "
+            "lateness, raise certificate.late_periods."
+        )
+    if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
+        yield (
+            "the record is incomplete. A process that could not reach the recorder prints the "
+            "folder of the rest; add it: noack collect RUN_DIRECTORY HOST:FOLDER"
+        )
+
+
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) -> None:
     """Print the verdict, the key numbers, the remarks, and where to find more.
 
@@ -103,8 +222,8 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
     summary = outcome.summary
     for line in verdict(summary):
         console.print(Text(line.text, line.style), soft_wrap=True)
-    if len(summary.loops) > 1:
-        print_loops(console, summary, verbose=verbose)
+    if shares_network(summary):
+        _print_loops(console, summary, verbose=verbose)
     else:
         _print_loop(console, summary, verbose=verbose)
     for where in _where(outcome, verbose=verbose):
@@ -113,18 +232,176 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
 
 def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None:
     if verbose:
-        print_details(console, summary)
+        _print_details(console, summary)
     else:
-        console.print(number_table(run_title(summary), short_numbers(summary)))
+        print_numbers(console, run_title(summary), short_numbers(summary))
     for remark in remarks(summary):
         start = f"[{BAD}]" if remark.severe else "[bold yellow]warning:[/] "
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
 
 
+def print_numbers(console: Console, title: str, rows: Numbers) -> None:
+    """Print quantities and their values."""
+    console.print(terminal_table(ResultTable("numbers", title, KEY_VALUE, rows)))
+
+
+def _print_details(console: Console, summary: RunSummary) -> None:
+    """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
+    (loop,) = summary.loops
+    print_numbers(console, run_title(summary), key_numbers(summary))
+    if loop.lateness_us:  # none in virtual time
+        caption = "timing in µs of wall time (missed: deadlines missed)"
+        rows = [*timing_rows(loop)]
+        console.print(terminal_table(ResultTable("timing", caption, ("", *TIMING_HEADINGS), rows)))
+        _print_realtime(console, loop.realtime)
+    console.print("the paper's assumptions for this scenario:")
+    print_assumptions(console, loop.assumptions)
+    _print_claims(console, loop.claims)
+
+
+def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> None:
+    """Print the network and the loops; without ``verbose`` the worst only."""
+    for line in _void_lines(summary.loops):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    kind = "" if summary.kind == "live" else f", {summary.kind}"
+    further = "".join(f", {constraint}" for constraint in summary.constraints)
+    title = f"network of {summary.scenario}, M − 1 = {summary.mansd}{further}{kind}"
+    print_numbers(console, title, tuple(network_rows(summary)))
+    loops = sorted(summary.loops, key=badness, reverse=True)
+    shown = loops if verbose else loops[:_MOST_LOOPS]
+    if len(shown) == len(loops):
+        shown = summary.loops
+    table = Table(
+        title=f"{len(loops)} loops" + (", the worst first" if len(shown) < len(loops) else ""),
+        caption=CAPTION, box=SIMPLE_HEAD,
+        collapse_padding=True, pad_edge=False,
+    )  # fmt: skip
+    rows = [loop_row(loop) for loop in shown]
+    for i, heading in enumerate(HEADINGS):
+        cells = [heading, *(row[i] for row in rows)]
+        # Headings and claims may break between words; names and numbers have no spaces.
+        least = max(len(word) for cell in cells for word in cell.split())
+        table.add_column(heading, justify="right" if i else "left", min_width=least)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console.print(table)
+    if more := len(loops) - len(shown):
+        console.print(f"and {more} more loops: --verbose shows all")
+
+
+def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
+    """Return why claims are void, the most frequent reasons first, with the number of loops."""
+    void = [{one.why for one in loop.claims if one.verdict == "void"} for loop in loops]
+    reasons = Counter(why for whys in void for why in sorted(whys))
+    lines = [
+        f"void: {why}" + (f" ({count} loops)" if count > 1 else "")
+        for why, count in reasons.most_common(_MOST_REASONS)
+    ]
+    if more := len(reasons) - len(lines):
+        lines.append(f"and {more} more reasons: the summaries of the loops have them")
+    return lines
+
+
+def _print_claims(console: Console, claims: Sequence[Claim]) -> None:
+    """Print the claims about a loop and their verdicts."""
+    if not claims:
+        return
+    headings, rows = claim_headings(claims), [*claim_rows(claims)]
+    table = ResultTable("claims", "claims checked against this run", headings, rows)
+    left = [i for i, heading in enumerate(headings) if heading != "share used"]
+    console.print(terminal_table(table, left=left, styles=_CLAIM_STYLES))
+    if any(claim.ratio is not None for claim in claims):
+        console.print(
+            "[dim]share used: largest share of the bound reached during the run; a bound "
+            "computed from the run itself is reached by construction. Sources: (I1) and "
+            "certificates, docs/theory.md; eq:... and theorems, the paper[/]"
+        )
+    sources: dict[tuple[str, str], list[str]] = {}
+    for claim in claims:
+        if claim.verdict != "held" and claim.why:
+            sources.setdefault((claim.verdict, claim.why), []).append(claim.source)
+    for (verdict, why), of in sources.items():
+        text = f"{verdict}: {'; '.join(dict.fromkeys(of))}: {why}"
+        console.print(text, highlight=False, markup=False)
+
+
+def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
+    """Print one line for all processes with the same real-time settings."""
+    roles_by_settings: dict[str, list[str]] = {}
+    for role in sorted(realtime):
+        verdicts = realtime[role]
+        text = ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
+        if set(verdicts.values()) == {"applied"}:
+            text = "all applied"
+        roles_by_settings.setdefault(text, []).append(role)
+    for text, roles in roles_by_settings.items():
+        whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
+        console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
+
+
+def print_assumptions(console: Console, assumptions: Sequence[Assumption | AssumptionPart]) -> None:
+    """Print assumptions with their verdicts."""
+    table = Table.grid(padding=(0, 2))
+    for one in assumptions:
+        source = one.source if one.source.startswith("(") else f"({one.source})"
+        text = escape(f"{one.what} {source}: {one.why}")
+        table.add_row(Text(one.verdict, _ASSUMPTION_STYLES.get(one.verdict, "")), text)
+    console.print(table)
+
+
+def print_fidelity(console: Console, fidelity: Fidelity) -> None:
+    """Print the effects from the ideal loop to the run, and the verdict."""
+    headings = ("effect", "RMS", "max", "share", "events", "Δt, ms", "split at event")
+    stages = [
+        (
+            stage.name, *_sizes(stage.difference), percent(stage.share), str(stage.events),
+            _milliseconds(stage.max_event_difference_s), _event(stage.first_different_event),
+        )
+        for stage in fidelity.stages
+    ]  # fmt: skip
+    total = (
+        "total", *_sizes(fidelity.total), "100.0 %", str(fidelity.events_live),
+        _milliseconds(fidelity.max_event_difference_s), _event(fidelity.first_different_event),
+    )  # fmt: skip
+    ideal = ("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
+    caption = f"{fidelity.scenario}: difference in x to the ideal loop"
+    differences = [(one.name, one.difference) for one in fidelity.stages]
+    by_state = [
+        (name, *(f"{value:.2e}" for value in difference.rms_by_state))
+        for name, difference in [*differences, ("total", fidelity.total)]
+    ]
+    for table in (
+        ResultTable("effects", caption, headings, [ideal, *stages, total]),
+        ResultTable("by-state", "RMS by state", ("effect", *fidelity.state_names), by_state),
+    ):
+        console.print(terminal_table(table))
+    console.print(
+        "Each row adds one effect to the rows above. RMS, max: of the norm, in model units. Δt: "
+        "largest change of an event's time. split at event: number of the first event that moves "
+        "by more than ten measurement periods; from there on, the recorded losses fall on other "
+        "events. A negative share partly cancels the other effects.",
+        highlight=False,
+    )
+    colour = "green" if fidelity.explained else "bold red"
+    console.print(f"[{colour}]{escape(fidelity.verdict)}[/]", highlight=False)
+
+
+def _sizes(difference: SignalDifference) -> tuple[str, str]:
+    return f"{difference.rms:.2e}", f"{difference.max:.2e}"
+
+
+def _milliseconds(value_s: float | None) -> str:
+    return NONE if value_s is None else f"{1e3 * value_s:.1f}"
+
+
+def _event(number: int | None) -> str:
+    return NONE if number is None else f"{number}"
+
+
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     """Yield the files of a run, or one line with the commands that show them."""
     run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
-    if len(outcome.summary.loops) > 1:
+    if shares_network(outcome.summary):
         yield f"one loop: {_program()} summary {run_dir} --loop NAME"
     if not verbose:
         page = f"{report} and " if report.is_file() else ""

@@ -148,7 +148,7 @@ def compare(
         Path,
         typer.Option(
             "--out",
-            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf, .pgf).",
+            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).",
         ),
     ] = cli.DEFAULT_RUNS / "comparison.html",
     width: cli.WidthOption = None,

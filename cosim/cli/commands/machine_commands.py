@@ -89,7 +89,7 @@ def lab(
             "repository"
         )
     from cosim.interactive.draft import open_draft
-    from cosim.lab.page.lab_server import LabOptions, serve
+    from cosim.lab.lab_server import LabOptions, serve
     from noack.config.scenario_file import value_of
 
     draft = open_draft(scenario)

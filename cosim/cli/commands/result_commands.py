@@ -7,7 +7,7 @@ import typer
 
 from cosim.cli import command as cli
 from cosim.cli import completion
-from cosim.output.export.export_formats import ExportFormat
+from cosim.output.export import FORMATS
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import ExitStatus
 
@@ -33,7 +33,7 @@ def summary(
     """
     from cosim.analysis.run_summary import outcome_of_loop
     from cosim.live.finalize import reopen
-    from cosim.output.run_result_tables import summary_tables
+    from cosim.output.run_tables import summary_tables
     from cosim.output.run_verdict import print_outcome
 
     outcome = outcome_of_loop(reopen(chosen_run(run_dir, runs)), loop)
@@ -171,7 +171,7 @@ def fidelity(
         Path | None,
         typer.Option(
             "--out",
-            help="Write a figure of the differences over time (.svg, .png, .pdf, .pgf).",
+            help="Write a figure of the differences over time (.svg, .png, .pdf).",
         ),
     ] = None,
     width: cli.WidthOption = None,
@@ -180,21 +180,27 @@ def fidelity(
     """Compare a run with the ideal loop in continuous time, effect by effect."""
     from cosim.analysis.fidelity import compute_fidelity
     from cosim.live.progress import PatientConsole
-    from cosim.output.fidelity_table import print_fidelity
-    from cosim.output.report.figure_files import save_drawn
-    from cosim.output.report.signal_figures import fidelity_figure
+    from cosim.output.figure_files import save_figure
+    from cosim.output.run_verdict import print_fidelity
+    from cosim.output.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
         found = compute_fidelity(load_record(path, loop))
         if out is not None:
-            save_drawn(lambda: fidelity_figure(found), out, width)
+            save_figure(fidelity_figure(found), out, width)
     if json:
         cli.print_json(found.as_json())
     else:
         print_fidelity(cli.console(), found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED
+
+
+def _known_format(name: str) -> str:
+    if name not in FORMATS:
+        raise typer.BadParameter(f"'{name}' is not one of {', '.join(FORMATS)}")
+    return name
 
 
 @cli.command(cli.RUNS, 96, [
@@ -206,7 +212,14 @@ def export(
     run_dir: cli.RunArgument = None,
     *,
     file_format: Annotated[
-        ExportFormat, typer.Option("--format", help="Format of the file, or of the folder's files.")
+        str,
+        typer.Option(
+            "--format",
+            parser=_known_format,
+            metavar="|".join(FORMATS),
+            autocompletion=lambda: [*FORMATS],
+            help="Format of the file, or of the folder's files.",
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -225,12 +238,12 @@ def export(
     """Export a run for other programs: its tables, its summary and its certificates."""
     from cosim.live.finalize import reopen
     from cosim.live.progress import PatientConsole
-    from cosim.output.export.export_formats import export_run
+    from cosim.output.export import export_run, export_suffix
 
     chosen = chosen_run(run_dir, runs)
     reopen(chosen)
     name = chosen.resolve().name if loop is None else loop
-    path = out or Path(f"{name}{file_format.suffix}")
+    path = out or Path(f"{name}{export_suffix(file_format)}")
     with PatientConsole(stderr=True).status("exporting"):
         written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
     if json:

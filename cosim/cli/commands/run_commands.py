@@ -148,10 +148,9 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
         interval_rows,
         longest_burst,
         lost_row,
-        number_table,
         title_of,
     )
-    from cosim.output.run_verdict import ending_line, transmission_line
+    from cosim.output.run_verdict import ending_line, print_numbers, transmission_line
 
     ending = ending_line(ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"])
     for line in (ending, transmission_line(found["events"], found["deliveries"])):
@@ -169,7 +168,7 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
         ("‖x‖ at the end", number(found["final_state_norm"])),
     )
     title = title_of(found["scenario"], found["mode"], mansd, (), found["kind"])
-    console.print(number_table(title, rows))
+    print_numbers(console, title, rows)
     table = Table(title="events")
     for heading in ("event", "t, s", "inter-event time, s", "fate", "‖x‖", "‖e_c‖ before"):
         table.add_column(heading, justify="right")

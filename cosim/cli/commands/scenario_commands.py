@@ -82,7 +82,7 @@ def check(
 
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
-    from cosim.output.assumptions_table import print_assumptions
+    from cosim.output.run_verdict import print_assumptions
     from noack.config.link_load import require_capacity
     from noack.config.resolution import resolve
     from noack.config.scenario import loop_names

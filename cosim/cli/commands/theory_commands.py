@@ -44,8 +44,8 @@ def certify(
 
     Exit status 1: nothing can be certified.
     """
-    from cosim.output.all_certificates import certificates_of
     from cosim.output.certificate_report import certificate_tables, print_certificates
+    from cosim.output.certificates import certificates_of
 
     loaded = cli.load_scenario(scenario, settings)
     if weight == "chosen":
@@ -102,7 +102,7 @@ def margin(
     """
     from cosim.analysis.margin_search import find_margin
     from cosim.live.progress import PatientConsole
-    from cosim.output.margin_report import margin_tables, print_margin
+    from cosim.output.certificate_report import margin_tables, print_margin
     from noack.config.resolution import resolve
 
     if play and json:

@@ -1,1 +1,119 @@
-"""Exports of a run to the files of other programs; one format per file."""
+"""Exports of a run to the files of other programs.
+
+A format is a file ``NAME_export.py`` in this folder. It has ``SUFFIX``, the ending of its files
+(empty: a folder), and ``write(run, path, *, certificates)``, which returns the written files.
+"""
+
+import pkgutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
+from noack.core.errors import CallerError
+
+if TYPE_CHECKING:
+    from cosim.record.run_record import RunRecord
+
+_ENDING = "_export"
+FORMATS = tuple(
+    module.name.removesuffix(_ENDING)
+    for module in pkgutil.iter_modules(__path__)
+    if module.name.endswith(_ENDING)
+)
+"""Names of the formats; their files are imported when they are used."""
+
+
+@dataclass(frozen=True)
+class ExportedRun:
+    """A run, or one of the loops of a run."""
+
+    directory: Path
+    record: "RunRecord"
+    """Of the only loop, or of the network that the loops share."""
+    summary: dict[str, Any]
+    """The content of ``summary.json``, or its part about the loop."""
+    inner: "Sequence[ExportedRun]" = ()
+    """The loops that share the network."""
+    name: str = ""
+    """Of the loop; empty for the run itself."""
+    phase_ns: int = 0
+    """Time of the run at which the loop's own time begins."""
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """The content of ``environment.json``."""
+        kind = {"kind": self.record.kind}
+        return read_object(self.directory / ENVIRONMENT_FILE) | kind
+
+
+def export_run(
+    run_dir: Path,
+    path: Path,
+    kind: str | None = None,
+    *,
+    loop: str | None = None,
+    certificates: bool = True,
+) -> list[Path]:
+    """Export a run; return the written files.
+
+    Args:
+        run_dir: the run directory, which has a summary.
+        path: the file, or the folder.
+        kind: the format; by default that of the path's ending.
+        loop: name of the loop to export; by default the whole run.
+        certificates: whether a file of MATLAB has the certificates of each loop.
+
+    Raises:
+        CallerError: the ending is not that of a format, it is not a run directory, or the record is
+            damaged.
+        MachineError: a file cannot be written.
+    """
+    suffixes = {name: export_suffix(name) for name in FORMATS}
+    by_ending = {suffix: name for name, suffix in suffixes.items()}
+    chosen = by_ending.get(path.suffix) if kind is None else kind
+    if chosen is None or suffixes[chosen] not in ("", path.suffix):
+        *first, last = (suffix or "a folder" for suffix in suffixes.values())
+        expected = f"{', '.join(first)} or {last}" if kind is None else suffixes[kind]
+        raise CallerError(f"{path}: an export is written to {expected}")
+    run = _exported_run(run_dir, loop)
+    written: list[Path] = _module(chosen).write(run, path, certificates=certificates)
+    return written
+
+
+def export_suffix(kind: str) -> str:
+    """Return the ending of the files of a format; empty for a folder."""
+    return str(_module(kind).SUFFIX)
+
+
+def _module(kind: str) -> Any:
+    return import_module(f"{__name__}.{kind}{_ENDING}")
+
+
+def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
+    """Return a run directory, or one of its loops, for an export.
+
+    Raises:
+        CallerError: it is not a run directory, its record is damaged, or there is no such loop.
+    """
+    # Imported here: the command line needs the names of the formats only.
+    from cosim.analysis.summary_model import read_summary
+    from cosim.record.run_record import load_run
+    from noack.config.scenario import phases_ns
+
+    run, content = load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
+    if loop is not None or not run.names[1:]:
+        record = run.loop(loop)
+        summary = read_summary(content)
+        own = summary.of_loop(record.scenario.name).to_json() if summary else content
+        return ExportedRun(run_dir, record, own)
+    parts = dict(zip(run.names, content.get("loops", []), strict=False))
+    inner = [
+        ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)
+        for name, record, phase_ns in zip(
+            run.names, run.loops, phases_ns(run.scenario), strict=True
+        )
+    ]
+    return ExportedRun(run_dir, run.network, content, inner)

@@ -7,13 +7,15 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import csv
 
-from cosim.output.export.exported_run import ExportedRun
+from cosim.output.export import ExportedRun
 from cosim.record.data_frames import events, samples, with_seconds
 from cosim.record.table_files import arrow_table
 from noack.core.file_access import write_whole
 
+SUFFIX = ""
 
-def write_csv(run: ExportedRun, folder: Path) -> list[Path]:
+
+def write(run: ExportedRun, folder: Path, *, certificates: bool = True) -> list[Path]:
     """Write the tables of a run, its samples and its events; a loop has a folder of its name.
 
     Raises:
@@ -25,7 +27,7 @@ def write_csv(run: ExportedRun, folder: Path) -> list[Path]:
         csv.write_csv(_with_hex(table), buffer)
         written.append(write_whole(folder / f"{name}.csv", buffer.getvalue()))
     for loop in run.inner:
-        written += write_csv(loop, folder / loop.name)
+        written += write(loop, folder / loop.name)
     return written
 
 

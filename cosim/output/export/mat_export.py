@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from cosim.output.all_certificates import certificates_of
-from cosim.output.export.exported_run import ExportedRun
+from cosim.output.certificates import certificates_of
+from cosim.output.export import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.record_source import Rows
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, MachineError
 from noack.core.file_access import write_whole
 
+SUFFIX = ".mat"
 _LONGEST_NAME = 31  # of the format of version 5
 _INVALID = re.compile(r"\W", re.ASCII)
 
 
-def write_mat(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
+def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
     """Write a run: its tables, samples, events, summary, scenario and certificates, as structures.
 
     Raises:

@@ -12,34 +12,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import to_json
 
-from cosim.output.export.exported_run import ExportedRun
-from cosim.output.export.mcap_schemas import (
-    ERRORS,
-    ERRORS_SCHEMA,
-    LOG,
-    LOG_SCHEMA,
-    schema_of,
-    topic_of,
-)
+from cosim.output.export import ExportedRun
 from cosim.record.align import aligned_parts
 from cosim.record.record_source import Rows
 from cosim.record.run_directory import SCENARIO_FILE, SUMMARY_FILE
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
-from noack.protocol.record_tables import OWNER
+from noack.protocol.record_tables import COMMON, OWNER, TABLES
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
 _LEVELS = {"info": 2, "restart": 3, "warning": 3, "error": 4}
 """Numbers of the levels of foxglove.Log."""
+SUFFIX = ".mcap"
 _CHUNK_BYTES = 2**20
+ERRORS, LOG = "/loop/errors", "/log"
+_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_REAL: dict[str, Any] = {"type": ["number", "null"]}  # null: not finite
+_TABLES = {table.name: table for table in TABLES}
 Message = tuple[int, int, int, bytes]
 """Log time, publish time, sequence, and content."""
 
 
-def write_mcap(run: ExportedRun, path: Path) -> list[Path]:
+def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Path]:
     """Write a run as MCAP; the loops of a run of several have their names before their topics.
 
     Raises:
@@ -97,7 +94,7 @@ def _write_tables(writer: "Writer", run: ExportedRun, tables: list[str]) -> None
     """Write the rows of some tables in the order of their log time."""
     record = run.record
     channels = {
-        table: _channel(writer, run, topic_of(table), schema_of(table, record.tables[table]))
+        table: _channel(writer, run, _topic(table), _schema(table, record.tables[table]))
         for table in tables
     }
     for part in record.slices(*tables):
@@ -162,3 +159,73 @@ def _write_errors(writer: "Writer", run: ExportedRun) -> None:
             at_ns = t_ns + run.phase_ns
             writer.add_message(channel, at_ns, content, at_ns, number & 0xFFFF_FFFF)
             number += 1
+
+
+# Topics and schemas
+
+
+def _topic(table: str) -> str:
+    """Return the topic of a table's messages: ``plant_step`` is ``/plant/step``."""
+    owner = OWNER[table]
+    return f"/{owner}/{table.removeprefix(f'{owner}_')}"
+
+
+def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, Any]:
+    """Return the JSON Schema of a table's messages; a vector is an array.
+
+    Args:
+        table: name of the table.
+        rows: type of its rows in the run.
+    """
+    described = {column.name: column for column in (*COMMON, *_TABLES[table].columns)}
+    properties: dict[str, Any] = {}
+    for name in rows.names or ():
+        unit = described[name].unit
+        text = described[name].meaning + (f" [{unit}]" if unit else "")
+        properties[name] = {**_type(name, rows[name]), "description": text}
+    return _object(f"noack.{table}", _TABLES[table].row, properties)
+
+
+def _type(name: str, field: np.dtype[Any]) -> dict[str, Any]:
+    if field.kind == "V" and field.subdtype is None:
+        return {"type": "string"} if name == "change" else {"type": "string", "pattern": _HEX}
+    one = _REAL if field.base.kind == "f" else {"type": "integer"}
+    if not field.shape:
+        return dict(one)
+    size = field.shape[0]
+    return {"type": "array", "items": one, "minItems": size, "maxItems": size}
+
+
+_HEX = "^([0-9a-f]{2})*$"
+
+
+def _object(title: str, description: str, properties: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "$schema": _DIALECT, "title": title, "description": description, "type": "object",
+        "properties": properties, "required": [*properties],
+    }  # fmt: skip
+
+
+ERRORS_SCHEMA = _object(
+    "noack.errors",
+    "norms of the errors at a measurement",
+    {
+        "t_ns": {"type": "integer", "description": "time of the measurement [ns]"},
+        "e_s_norm": {**_REAL, "description": "‖W(x_s − x)‖ before a reset"},
+        "threshold": {**_REAL, "description": "value above which there is an event"},
+        "e_c_norm": {**_REAL, "description": "‖W(x_c − x)‖; null without controller records"},
+    },
+)
+_INTEGER, _TEXT = {"type": "integer"}, {"type": "string"}
+LOG_SCHEMA = _object(
+    "foxglove.Log",
+    "a line of the run's log",
+    {
+        "timestamp": {
+            "type": "object", "title": "time",
+            "properties": {"sec": dict(_INTEGER), "nsec": dict(_INTEGER)},
+        },
+        "level": dict(_INTEGER), "message": dict(_TEXT), "name": dict(_TEXT),
+        "file": dict(_TEXT), "line": dict(_INTEGER),
+    },
+)  # fmt: skip

@@ -4,22 +4,275 @@ A viewer and the recorder share only the recording's file. A separate process (t
 program) reads the file while it grows and serves it over HTTP, to each viewer at its own rate. A
 viewer that stalls delays only its own download: the recorder never waits, the file is complete, and
 no data are dropped.
+
+Every user of the machine can connect. Therefore all content is under a path that begins with a
+secret; other paths do not exist.
+
+A finished run opens at the time of the largest ‖e_c‖. Neither a layout in a recording nor the
+address of a recording can set rerun's time cursor; only requests to a running viewer can. The web
+viewer accepts a protobuf message ``ViewerControlRequest``, the window the requests of rerun's
+client.
 """
 
 import contextlib
 import os
+import re
+import secrets
 import signal
+import socketserver
 import subprocess
 import sys
+import tempfile
 import threading
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from http.client import HTTPException
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import FrameType
+from typing import IO, Any, Self
+from urllib.parse import parse_qs, quote
 
-from cosim.output.viewer.rerun_program import end_process
-from cosim.output.viewer.viewer_server import RecordingServer
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from cosim.analysis.over_time import worst_loop
+from cosim.analysis.summary_model import read_summary
+from cosim.output.viewer.pictures.picture import TIMELINE
+from cosim.output.viewer.rerun_program import (
+    HOST,
+    WebViewer,
+    end_process,
+    logged_port,
+    peer_user,
+    start_rerun,
+)
+from cosim.record.run_directory import (
+    RECORDING_FILE,
+    SUMMARY_FILE,
+    loop_of_file,
+    read_object,
+)
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError, ExitStatus, MachineError, PeerError
 from noack.core.process_limits import python_command
+
+RECORDING = "recording.rrd"
+
+_BLOCK = 1 << 18
+_POLL_S = 0.1
+_START_S = 10.0
+_DRAIN_S = 2.0
+_SECRET_BYTES = 32
+_PATH = re.compile(r"/([^/]+)/(.*)")
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+
+
+class RecordingServer:
+    """Serves one recording on a loopback port, and starts the viewers that request it.
+
+    The web viewer's page comes from the same port as the recording: one forwarded port is enough
+    to view it from another machine, and pages of other origins cannot read the recording.
+
+    Args:
+        path: the recording.
+        follow: at the end of the file, wait for more until ``finished`` is set.
+
+    Attributes:
+        address: address of the page; the recording is ``recording.rrd`` below it. Everyone who has
+            the address can read the recording.
+        window_address: the same for a window. It is on a command line, which every user can read;
+            therefore it is served to processes of this user only.
+        requested: set when a viewer has asked for the recording.
+        downloaded: set when a viewer has received all of it.
+
+    Raises:
+        MachineError: no port is available.
+    """
+
+    def __init__(self, path: Path, *, follow: bool) -> None:
+        self.path = path
+        self.web_viewer: WebViewer | None = None
+        self.finished = threading.Event()
+        self.requested = threading.Event()
+        self.downloaded = threading.Event()
+        self._downloads = 0
+        self._lock = threading.Lock()
+        self._secret, self._window_secret = (
+            secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2)
+        )  # fmt: skip
+        if not follow:
+            self.finished.set()
+        try:
+            self._http = _Server((HOST, 0), _Handler)
+        except OSError as error:
+            raise MachineError(f"cannot serve {path}: {error}") from None
+        self._http.recording = self
+        self.origin = f"http://{HOST}:{self._http.server_address[1]}"
+        self.address = f"{self.origin}/{self._secret}/"
+        self.window_address = f"{self.origin}/{self._window_secret}/"
+        threading.Thread(target=self._http.serve_forever, args=(0.2,), daemon=True).start()
+
+    def start_page(self) -> str:
+        """Start the web viewer and return the address at which it shows the recording.
+
+        Raises:
+            MachineError: the web viewer does not start.
+        """
+        self.web_viewer = WebViewer()
+        return self.address
+
+    def open_window(self) -> subprocess.Popen[bytes] | None:
+        """Open a window with the recording; return None if it closed before requesting it."""
+        arguments = ["--port", "auto", "--bind", HOST, self.window_address + RECORDING]
+        t_ns = opening_time_ns(self.path)
+        if t_ns is None:
+            window = start_rerun(arguments, start_new_session=True)
+        else:
+            output = tempfile.TemporaryFile()  # noqa: SIM115 - the thread closes it
+            window = start_rerun(arguments, output=output, start_new_session=True)
+            move = partial(move_window_to, t_ns, window, output)
+            threading.Thread(target=move, daemon=True).start()
+        deadline = time.monotonic() + _START_S
+        while not self.requested.wait(0.02) and time.monotonic() < deadline:
+            if window.poll() is not None:
+                return None
+        return window
+
+    def drain(self) -> None:
+        """Wait a moment for downloads in progress to reach the end of the file."""
+        deadline = time.monotonic() + _DRAIN_S
+        while self._downloads and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """Stop serving; windows stay open."""
+        if self.web_viewer is not None:
+            self.web_viewer.close()
+        self._http.shutdown()
+        self._http.server_close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def admits(self, secret: str, user: Callable[[], int | None]) -> bool:
+        """Whether a request under this secret is answered.
+
+        Args:
+            secret: first part of the path.
+            user: returns the user id of the requesting process.
+        """
+        if _same(secret, self._secret):
+            return True
+        return _same(secret, self._window_secret) and user() == os.getuid()
+
+    @contextlib.contextmanager
+    def download(self) -> Iterator[None]:
+        """Count a download in progress."""
+        self.requested.set()
+        with self._lock:
+            self._downloads += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._downloads -= 1
+
+
+def _same(secret: str, wanted: str) -> bool:
+    """Whether two secrets are equal, compared in constant time."""
+    return secrets.compare_digest(secret.encode(), wanted.encode())
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    block_on_close = False
+    recording: RecordingServer
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def do_GET(self) -> None:
+        """Answer with the page, one of its files, or the recording."""
+        recording = self.server.recording
+        path, _, query = self.path.partition("?")
+        found = _PATH.fullmatch(path)
+        if not (self.path.isascii() and self.path.isprintable()):
+            self.send_error(400)
+        elif not _OWN_HOST.fullmatch(self.headers.get("Host", "")):
+            self.send_error(403)  # DNS rebinding: a foreign name that resolves to loopback
+        elif found is None or not recording.admits(found[1], lambda: peer_user(self.connection)):
+            self.send_error(404)
+        elif (name := found[2]) == RECORDING:
+            self._send_recording(recording)
+        elif name == "" and "url" not in parse_qs(query):
+            self._send_to_recording(path, query)
+        else:
+            self._send_file(recording.web_viewer, name)
+
+    def handle(self) -> None:
+        """Serve one connection; the viewer or the web viewer's program may close it at any time."""
+        with contextlib.suppress(ConnectionError, TimeoutError, HTTPException):
+            super().handle()
+
+    def end_headers(self) -> None:
+        """Add a header that hides the page's address from other servers whose content it loads."""
+        self.send_header("Referrer-Policy", "no-referrer")
+        super().end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        """Log nothing."""
+
+    def _send_to_recording(self, path: str, query: str) -> None:
+        """Redirect the browser to the page with the recording's address as the browser sees it."""
+        address = quote(f"http://{self.headers['Host']}{path}{RECORDING}", safe="")
+        self.send_response(302)
+        self.send_header("Location", f"{path}?url={address}" + (f"&{query}" if query else ""))
+        self.end_headers()
+
+    def _send_recording(self, recording: RecordingServer) -> None:
+        try:
+            file = recording.path.open("rb")
+        except OSError:
+            self.send_error(404)
+            return
+        with file, recording.download():
+            self.send_response(200)
+            self.send_header("Content-Type", "application/octet-stream")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            while True:
+                # Checked before reading, so that data written before it was set are still sent.
+                finished = recording.finished.is_set()
+                if block := file.read(_BLOCK):
+                    self.wfile.write(block)
+                elif finished:
+                    break
+                else:
+                    recording.finished.wait(_POLL_S)
+            recording.downloaded.set()
+
+    def _send_file(self, web_viewer: WebViewer | None, name: str) -> None:
+        if web_viewer is None:
+            self.send_error(404)
+            return
+        try:
+            with web_viewer.file(name) as answer:
+                self.send_response(answer.status)
+                for header in ("Content-Type", "rerun-final-length"):
+                    if (value := answer.getheader(header)) is not None:
+                        self.send_header(header, value)
+                self.end_headers()
+                while block := answer.read(_BLOCK):
+                    self.wfile.write(block)
+                t_ns = opening_time_ns(self.server.recording.path) if name == "" else None
+                if t_ns is not None:
+                    self.wfile.write(script_to_open_at(t_ns))
+        except PeerError as error:
+            self.send_error(502, str(error))
+
 
 _MAGIC = b"RRF"
 _PATIENCE_S = 5.0
@@ -172,6 +425,90 @@ def _main() -> int:
         print(error, flush=True)
         return error.exit_status
     return 0
+
+
+_RETRY_S = 0.25
+_LOAD_S = 60.0
+_TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
+_SET_TIME_CURSOR, _TIMELINE, _TIME, _PLAY_STATE, _FIRST = 6, 2, 3, 5, 1
+"""Numbers of the message's fields; nested messages have only a first field."""
+_PAUSED = 1
+_SCRIPT = """<script>
+(function openAt() {{
+  const retry = () => setTimeout(openAt, {retry_ms});
+  if (window._handle === undefined) return retry();
+  window._handle.viewer_control(new Uint8Array({request})).catch(retry);
+}})();
+</script>
+"""
+
+
+def opening_time_ns(recording: Path) -> int | None:
+    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary.
+
+    In the recording of the run, it is that of the worst loop.
+    """
+    name = loop_of_file(recording.name, RECORDING_FILE)
+    summary = read_summary(read_object(recording.parent / SUMMARY_FILE))
+    if summary is None or name not in (None, *(one.name for one in summary.loops)):
+        return None
+    loops = {one.number: one for one in summary.loops if name in (None, one.name)}
+    loop = loops[worst_loop([*loops.values()]).number]
+    if loop.sup_e_c_at_s is None:
+        return None
+    begin_s = loop.phase_s if name is None else 0.0
+    return round((begin_s + loop.sup_e_c_at_s) * NS_PER_S)
+
+
+def script_to_open_at(t_ns: int) -> bytes:
+    """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
+    request = list(_request(t_ns))
+    return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
+
+
+def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]) -> None:
+    """Move the cursor of a window once the recording is loaded, unless the window closes before.
+
+    Args:
+        t_ns: time on the recording's timeline.
+        window: the viewer's process.
+        output: its log, which contains the address at which it accepts requests.
+    """
+    from rerun.experimental import ViewerClient
+
+    with output:
+        port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)
+    while port is not None and window.poll() is None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.set_time(TIMELINE, duration=t_ns / NS_PER_S, play_state="paused")
+        except OSError:  # it is still loading
+            time.sleep(_RETRY_S)
+        else:
+            return
+
+
+def _request(t_ns: int) -> bytes:
+    cursor = (
+        _message(_TIMELINE, _message(_FIRST, TIMELINE.encode()))
+        + _message(_TIME, _number(_FIRST, t_ns))
+        + _number(_PLAY_STATE, _PAUSED)
+    )
+    return _message(_SET_TIME_CURSOR, cursor)
+
+
+def _message(field: int, content: bytes) -> bytes:
+    """Return a length-delimited field in protobuf's encoding."""
+    return _varint(field << 3 | 2) + _varint(len(content)) + content
+
+
+def _number(field: int, value: int) -> bytes:
+    return _varint(field << 3) + _varint(value)
+
+
+def _varint(value: int) -> bytes:
+    low, rest = value & 0x7F, value >> 7
+    return bytes([low | 0x80]) + _varint(rest) if rest else bytes([low])
 
 
 if __name__ == "__main__":

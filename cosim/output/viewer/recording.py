@@ -1,25 +1,177 @@
-"""The recording of a run for the viewer: its signals, events, packets and log.
+"""The recording of a run for the viewer, as a rerun file that is written while the run goes on.
 
-The recording is only for viewing. The run's data are in the Parquet files; a recording can only be
-read by similar versions of rerun.
+:class:`RecordingFile` writes the file, :class:`RunView` the signals, events, packets and log of a
+loop, :class:`LoopView` those of one of several loops. The recording is only for viewing: the run's
+data are in the Parquet files, and only similar versions of rerun can read a recording.
 """
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
+import rerun.blueprint as rrb
 
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.colour_key import COLOUR_KEY, ColourKey
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.pictures.network_picture import DIAGRAM, NetworkDiagram
-from cosim.output.viewer.pictures.picture import PICTURE, Frames, Picture, joined
-from cosim.output.viewer.recording_file import Floats, Nanoseconds, RecordingFile
+from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S, NetworkDiagram
+from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
 from cosim.record.align import AlignedRun
+from cosim.record.environment import Kind
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.core.errors import MachineError, why
+from noack.core.file_access import open_growing
+
+Floats = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+
+APPLICATION_ID = "noack"
+
+
+class ViewError(MachineError):
+    """The recording could not be written; the message names the file and the cause."""
+
+
+class RecordingFile:
+    """Writes a ``.rrd`` file. Data are passed to the operating system as they arrive.
+
+    Hence the file can be shown while it grows, and read after a crash.
+
+    Args:
+        path: the file; replaced if it exists.
+        run_id: identity of the recording, unique among runs.
+        layout: layout of the viewer's panels.
+        indexed: end the file with an index of its chunks. Until then the index is kept in memory,
+            about 200 bytes per chunk. A recording of several hours has no index; readers must then
+                read all of it.
+
+    Raises:
+        ViewError: the file cannot be created.
+    """
+
+    def __init__(self, path: Path, run_id: str, layout: rrb.Blueprint, *, indexed: bool) -> None:
+        self.path = path
+        self._open = True
+        self._stream = rr.RecordingStream(APPLICATION_ID, recording_id=run_id)
+        try:
+            descriptor = open_growing(path)
+            try:  # by its descriptor, as rerun would follow a link
+                own = f"/dev/fd/{descriptor}"
+                self._stream.save(own, default_blueprint=layout, write_footer=indexed)
+            finally:
+                os.close(descriptor)
+        except (OSError, RuntimeError) as error:
+            reason = why(error) if isinstance(error, OSError) else str(error)
+            raise ViewError(f"{path}: cannot create the recording: {reason}") from None
+
+    def describe(self, title: str, static: dict[str, Any]) -> None:
+        """Set the recording's title and its static data, by entity."""
+        self._stream.send_recording_name(title)
+        self.add_static(static)
+
+    def add_static(self, static: dict[str, Any]) -> None:
+        """Add static data, by entity."""
+        for entity, shape in static.items():
+            self._stream.log(entity, shape, static=True)
+
+    def send(self, entity: str, t_ns: Nanoseconds, values: Floats) -> None:
+        """Add scalars (k,) or (k, series) at times (k,); a value that is not finite is a gap."""
+        if len(values):
+            finite = np.where(np.isfinite(values), values, np.nan)
+            self.send_columns(entity, t_ns, rr.Scalars.columns(scalars=finite))
+
+    def send_columns(
+        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        """Add columns of any components at times (k,).
+
+        Raises:
+            ViewError: the columns cannot be written.
+        """
+        times = rr.TimeColumn(TIMELINE, duration=np.asarray(t_ns).astype("timedelta64[ns]"))
+        try:
+            self._stream.send_columns(entity, [times], columns, strict=True)
+        except RuntimeError as error:
+            raise ViewError(f"{self.path}: cannot write the recording: {error}") from None
+
+    def send_stems(self, entity: str, t_ns: Nanoseconds, height: Floats) -> None:
+        """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
+        line = np.stack((np.zeros_like(height), height, np.full_like(height, np.nan)), axis=1)
+        self.send(entity, np.repeat(t_ns, 3), line.ravel())
+
+    def log(self, t_ns: int, level: str, text: str) -> None:
+        """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
+        line = f"{t_ns / 1e9:8.3f} s  {text}"
+        columns = rr.TextLog.columns(text=[line], level=[level])
+        self.send_columns(bp.LOG, np.array([t_ns], dtype=np.int64), columns)
+
+    def flush(self) -> None:
+        """Pass buffered data to the operating system."""
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise ViewError(f"{self.path}: cannot write the recording: {error}") from None
+
+    def close(self) -> None:
+        """Write the file's footer; a second call does nothing.
+
+        Raises:
+            ViewError: the file could not be written in full.
+        """
+        if not self._open:
+            return
+        self._open = False
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise ViewError(f"{self.path}: the recording is incomplete: {error}") from None
+        finally:
+            self._stream.disconnect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def about(scenario: Scenario, kind: Kind = "live") -> str:
+    """Return the viewer's text about a run, in Markdown."""
+    network = scenario.network
+    late = {
+        "live": "* **Lateness**: wall time between a deadline and the process's action.",
+        "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
+    }[kind]
+    hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
+    return f"""# {scenario.name}
+
+{scenario.description}
+
+Sensor and controller run **{hold}** between updates. The sensor transmits when
+{scenario.trigger.description}.
+The network ({network.loss.model.replace("_", "-")} loss) guarantees:
+{network.guarantee.meaning}.
+{scenario.protocol.summary}
+
+* A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
+* **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed
+  outline). Play the run to animate it.
+* **Packets**: each update in flight. A lost one falls; a forced delivery is a diamond. A flight
+  takes microseconds but is animated as {LEG_S:g} s per hop, so x_c jumps before the dot arrives.
+* **States**: the plant's x, the sensor's model x_s (reset {scenario.protocol.reset}), the
+  controller's model x_c (reset by each delivery). Where x_c differs from the other two, packets
+  were lost.
+* **Intervals**: time since the previous transmission, and since the previous delivery.
+* **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
+  (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds
+  while no process is later than the certificate allows (see the claims of the summary).
+{late}
+"""
+
 
 # The logarithm of an error that is reset to zero cannot be plotted: errors are cut off at this
 # fraction of the threshold, or at the smallest error of interest, if that is larger.
@@ -96,7 +248,11 @@ class RunView(RecordingFile):
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
         static: dict[str, Any] = {bp.ABOUT: rr.TextDocument(about, media_type="text/markdown")}
         static |= bp.styles(state_names, input_names, processes)
-        drawings = ((PICTURE, picture), (DIAGRAM, diagram), (COLOUR_KEY, ColourKey(input_names)))
+        drawings = (
+            (PICTURE, picture),
+            (DIAGRAM, diagram),
+            (bp.COLOUR_KEY, bp.ColourKey(input_names)),
+        )
         for parent, drawing in drawings:
             shapes = {} if drawing is None else drawing.scenery()
             static |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}

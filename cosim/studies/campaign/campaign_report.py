@@ -5,16 +5,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
-from markupsafe import Markup
 from pydantic_core import to_json
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
-from cosim.output.report.figure_files import inline, save_figures
-from cosim.output.report.report_page import templates
+from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
@@ -55,10 +54,7 @@ def write_report(
         write_whole(store.folder / PAGE, page(summary, store, base)),
         write_whole(store.folder / SUMMARY, document + b"\n"),
         store.folder / RUNS,
-        *save_figures(
-            ((name, figure) for name, figure, _ in figures(summary, store)),
-            store.folder / PAGE, figure_files,
-        ),
+        *save_figures(figures(summary, store), store.folder / PAGE, figure_files),
     ]  # fmt: skip
 
 
@@ -92,15 +88,12 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str
         verdict=_verdict(summary),
         tone="bad" if summary.breaches else "doubt" if remarks else "good",
         remarks=[*remarks, *_bursts(summary)],
-        figures=[
-            (name, Markup(inline(figure, name, caption)), caption)
-            for name, figure, caption in figures(summary, store)
-        ],
+        figures=list(figures(summary, store)),
         axes=[axis.called for axis in campaign.axes],
         metrics=[METRICS[name].heading for name in campaign.metrics.shown],
-        rows=_rows(summary),
+        rows=[(*row.labels, *row.cells) for row in _rows(summary)],
         reference=_reference(summary),
-        differences=_differences(summary, shares=True),
+        differences=[(*row.labels, *row.cells) for row in _differences(summary, shares=True)],
         campaign_toml=tomli_w.dumps(content, indent=2),
         scenario_toml=tomli_w.dumps(base, indent=2),
     )  # fmt: skip

@@ -5,19 +5,17 @@ from collections.abc import Mapping
 from functools import cache
 from hashlib import blake2b
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import expm
 
-import cosim
-import netem
-import noack
 from noack.core.core_library import SOURCES
 
 _PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
 """The last two, if they are installed, compile the equations of vehicles with tyres."""
-_CODE = (noack, netem, cosim)
+_CODE = ("noack", "netem", "cosim")
 _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
 
@@ -56,10 +54,10 @@ def _version(package: str) -> str:
 def _code() -> str:
     digest = blake2b(digest_size=8)
     for package in _CODE:
-        root = Path(str(package.__file__)).parent
+        root = Path(str(find_spec(package).origin)).parent  # type: ignore[union-attr]
         for path in sorted(root.rglob("*.py")):
             name = path.relative_to(root)
-            if package is not cosim or name.parts[0] not in _NO_CODE_OF_RUNS:
+            if package != "cosim" or name.parts[0] not in _NO_CODE_OF_RUNS:
                 digest.update(path.read_bytes())
     for module in ("random_draws.py", "sampled_draws.py"):
         digest.update(Path(__file__).with_name(module).read_bytes())

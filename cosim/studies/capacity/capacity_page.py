@@ -2,23 +2,21 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
-from matplotlib.figure import Figure
 from pydantic_core import to_json
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
+from cosim.output.figure_description import FigureDescription, Item, Marks, Rule, series_colour
+from cosim.output.figure_files import save_figure
 from cosim.output.figure_format import SCREEN_IN, FigureFiles, FigureFormat
-from cosim.output.report.figure_files import inline, save_figure
-from cosim.output.report.figure_layout import figure_width
-from cosim.output.report.figure_style import printed
-from cosim.output.report.report_page import templates
+from cosim.output.page_kit import templates
 from cosim.studies.campaign.campaign_figures import curve_figure
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.metrics import METRICS
@@ -95,10 +93,9 @@ def write(
         write_whole(folder / RESULTS, document + b"\n"),
     ]
     files = figure_files or FigureFiles(FigureFormat.SVG, SCREEN_IN)
-    with figure_width(files.width_in):
-        for name, figure, _ in figures(result):
-            written.append(folder / f"{name}.{files.kind}")
-            save_figure(figure, written[-1])
+    for figure in figures(result):
+        written.append(folder / f"{figure.name}.{files.kind}")
+        save_figure(figure, written[-1], files.width_in)
     return written
 
 
@@ -117,10 +114,7 @@ def page(result: CapacityResult) -> str:
         limits=[(name, _SENTENCES[name]) for name in LIMITS],
         rows=list(rows(result)),
         headings=HEADINGS,
-        figures=[
-            (name, Markup(inline(figure, name, caption)), caption)
-            for name, figure, caption in figures(result)
-        ],
+        figures=list(figures(result)),
         live=[live_row(one) for one in result.live],
     )  # fmt: skip
 
@@ -212,20 +206,20 @@ def comparisons(result: CapacityResult) -> Iterator[str]:
         )
 
 
-def figures(result: CapacityResult) -> Iterator[tuple[str, Figure, str]]:
-    """Draw the metric of each limit over the number of loops; yield name, figure, caption."""
+def figures(result: CapacityResult) -> Iterator[FigureDescription]:
+    """Describe the metric of each limit over the number of loops."""
     for disturbance in dict.fromkeys(one.disturbance for one in result.capacities):
         for limit, metric in LIMITS.items():
-            yield (
-                f"{limit}-{'common' if disturbance == COMMON else 'own'}",
+            yield replace(
                 _figure(result, limit, disturbance),
-                f"{METRICS[metric].title.capitalize()} over the number of loops; disturbance: "
-                f"{disturbance}. Means with 95 % confidence intervals"
+                name=f"{limit}-{'common' if disturbance == COMMON else 'own'}",
+                caption=f"{METRICS[metric].title.capitalize()} over the number of loops; "
+                f"disturbance: {disturbance}. Means with 95 % confidence intervals"
                 + ("; crosses are live runs." if _is_live(result, disturbance) else "."),
             )
 
 
-def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> Figure:
+def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> FigureDescription:
     counts, metric = result.plan.counts, LIMITS[limit]
     found = {
         (one.point.labels[POLICY], one.point.labels[LOOPS]): one.estimates[metric]
@@ -237,21 +231,16 @@ def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> Figure:
     figure = curve_figure(
         np.array(counts, dtype=np.float64), [*map(str, counts)], series, "number of loops", metric
     )
-    (axes,) = figure.axes
-    fitting = axes.axvline(
-        result.plan.periodic_loops, color=printed(palette.CERTIFIED), linestyle=(0, (6, 2))
-    )
-    fitting.set_zorder(0)
-    if limit != "cost":
-        axes.set_ylim(-0.02, 1.02)
-    if _is_live(result, disturbance):
-        for one in result.live:
-            colour = axes.lines[policies.index(one.policy)].get_color()
-            axes.plot(
-                [one.loops], [one.values[metric]], marker="x", markersize=9, markeredgewidth=2.2,
-                color=colour, linestyle="none", clip_on=False,
-            )  # fmt: skip
-    return figure
+    ((panel,),) = (row.panels for row in figure.rows)
+    fitting = Rule(at=result.plan.periodic_loops, colour=palette.CERTIFIED, vertical=True, order=0)
+    live: list[Item] = [
+        Marks(x=np.array([float(one.loops)]), y=np.array([one.values[metric]]), marker="x",
+              size=9, stroke=2.2, colour=series_colour(policies.index(one.policy)))
+        for one in (result.live if _is_live(result, disturbance) else ())
+    ]  # fmt: skip
+    y = panel.y if limit == "cost" else replace(panel.y, ends=(-0.02, 1.02))
+    panel = replace(panel, items=[fitting, *panel.items, *live], y=y)
+    return replace(figure, rows=[replace(figure.rows[0], panels=[panel])])
 
 
 def _is_live(result: CapacityResult, disturbance: str) -> bool:

@@ -106,9 +106,10 @@ class RunComparison:
 
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
+        from cosim.output.figure_drawing import draw
         from cosim.studies.comparison.overlay_figure import overlay_figure
 
-        return overlay_figure(self.runs)
+        return draw(overlay_figure(self.runs))
 
     def save(self, path: Path, width: str | float | None = None) -> None:
         """Write the overlay as a page (``.html``), or the figure alone (``.svg``, ``.pdf``, …).

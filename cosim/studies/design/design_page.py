@@ -1,22 +1,29 @@
 """The output of a design: one page (HTML) with figure and tables, and a table for a terminal."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from markupsafe import Markup
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from cosim.output import palette
+from cosim.output.figure_description import (
+    MARKERS,
+    Axis,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Rule,
+    one_panel,
+    plain,
+    series_colour,
+)
+from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
-from cosim.output.report.axes import finish, legend, logarithmic, plain, single
-from cosim.output.report.figure_files import inline, save_figures
-from cosim.output.report.figure_style import printed, styled
-from cosim.output.report.report_page import templates
+from cosim.output.page_kit import templates
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 from noack.core.file_access import write_whole
@@ -28,7 +35,6 @@ _CAPTION = (
     "the chosen candidate on new draws."
 )
 _HEIGHT_IN = 3.8
-_MARKERS = "os^Dv<>PX"
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 
@@ -41,8 +47,8 @@ def write_page(
     Raises:
         MachineError: they cannot be written.
     """
-    figures = ((name, draw(found)) for name, draw in (("trade-off", trade_off),))
-    return [write_whole(path, page(found)), *save_figures(figures, path, figure_files)]
+    figures = save_figures([trade_off(found)], path, figure_files)
+    return [write_whole(path, page(found)), *figures]
 
 
 def page(found: DesignResult) -> str:
@@ -62,56 +68,48 @@ def page(found: DesignResult) -> str:
         limits=lines,
         certified=[certified(name, value) for name, value in bounds.items()],
         conditions=found.conditions,
-        figure=Markup(inline(trade_off(found), "trade-off", _CAPTION)),
-        caption=_CAPTION,
+        figure=trade_off(found),
         headings=HEADINGS,
         rows=rows(found),
         scenario_toml=dumps(found.scenario),
     )  # fmt: skip
 
 
-@styled
-def trade_off(found: DesignResult) -> Figure:
-    """Draw all tried candidates, the trade-off curve, the limit and the chosen candidate."""
-    names = [f"W {family.name}" for family in found.space.families]
-    star_name = "the choice" if found.feasible else "the closest"
-    figure, (axes,) = single(_HEIGHT_IN, [*names, "trade-off", "limit", star_name], titled=False)
-    shown = []
-    for i, name in enumerate(names):
-        colour, marker = palette.SERIES[i % len(palette.SERIES)], _MARKERS[i % len(_MARKERS)]
-        style: dict[str, Any] = {"color": printed(colour), "linestyle": "none", "marker": marker}
+def trade_off(found: DesignResult) -> FigureDescription:
+    """Describe all tried candidates, the trade-off curve, the limit and the chosen candidate."""
+    items: list[Item] = []
+    for i, family in enumerate(found.space.families):
         own = [t.measured for t in found.trials if t.candidate.family == i]
         own = [m for m in own if np.isfinite(m.settling_s)]
-        sent, settling_s = [m.transmissions for m in own], [m.settling_s for m in own]
-        axes.plot(sent, settling_s, markersize=3.5, alpha=0.5, **style)
-        shown.append((Line2D([], [], **style), plain(name, 24)))
-    (front,) = axes.plot(
-        [t.measured.transmissions for t in found.front],
-        [t.measured.settling_s for t in found.front],
-        drawstyle="steps-post", color=printed(palette.NETWORK), linewidth=1.4,
-    )  # fmt: skip
-    limit = axes.axhline(
-        found.limits.settling_s, color=printed(palette.CERTIFIED), linestyle=(0, (6, 2))
-    )
-    best = found.fresh
-    if np.isfinite(best.settling_s):
-        high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
-        axes.errorbar(
-            [best.transmissions], [best.settling_s],
-            yerr=[[best.settling_s - best.settling_low_s], [high_s - best.settling_s]],
-            xerr=[best.halfwidth], color=printed(palette.LOST), marker="*", markersize=12,
+        items.append(
+            Marks(
+                x=np.array([m.transmissions for m in own]),
+                y=np.array([m.settling_s for m in own]), label=plain(f"W {family.name}", 24),
+                colour=series_colour(i), marker=MARKERS[i % len(MARKERS)], size=3.5, opacity=0.5,
+                reduced=False,
+            )
         )  # fmt: skip
-    star = Line2D([], [], color=printed(palette.LOST), marker="*", linestyle="none")
-    shown += [(front, "trade-off"), (limit, "limit"), (star, star_name)]
-    axes.set(
-        xlabel="transmissions (mean)",
-        ylabel=f"settling time, {100 * found.limits.quantile:g} % quantile [s]",
+    front, best = [trial.measured for trial in found.front], found.fresh
+    high_s = best.settling_high_s if np.isfinite(best.settling_high_s) else best.settling_s
+    items += [
+        Line(x=np.array([m.transmissions for m in front]),
+             y=np.array([m.settling_s for m in front]), label="trade-off", steps="post",
+             colour=palette.NETWORK, width=1.4),
+        Rule(at=found.limits.settling_s, colour=palette.CERTIFIED, label="limit"),
+        Marks(x=np.array([best.transmissions]), y=np.array([best.settling_s]), marker="*",
+              size=12, colour=palette.LOST,
+              label="the choice" if found.feasible else "the closest",
+              x_error=np.array([best.halfwidth]),
+              y_error=np.array([[best.settling_s - best.settling_low_s],
+                                [high_s - best.settling_s]])),
+    ]  # fmt: skip
+    settles = any(np.isfinite(trial.measured.settling_s) for trial in found.trials)
+    panel = Panel(
+        items=items,
+        x=Axis(label="transmissions (mean)", logarithmic=settles),
+        y=Axis(label=f"settling time, {100 * found.limits.quantile:g} % quantile [s]"),
     )
-    if any(np.isfinite(trial.measured.settling_s) for trial in found.trials):
-        logarithmic(axes, "x")
-    legend(axes, shown)
-    finish(axes)
-    return figure
+    return one_panel("trade-off", panel, _HEIGHT_IN).captioned(_CAPTION)
 
 
 def rows(found: DesignResult) -> list[tuple[str, ...]]:

@@ -1,18 +1,23 @@
 """The figures of the page: the paper's Fig. 2 and 3 for one draw, and all draws together."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from cosim.output import palette
-from cosim.output.report.axes import Shown, finish, layout, logarithmic
-from cosim.output.report.figure_style import INK, printed, styled
-from cosim.output.report.signal_figures import paper_figure
+from cosim.output.figure_description import (
+    Axis,
+    Bars,
+    FigureDescription,
+    Line,
+    Marks,
+    Panel,
+    Row,
+    series_colour,
+)
+from cosim.output.signal_figures import states_figure
 from cosim.simulation.continuous import ContinuousRun, timeless
 from cosim.studies.paper.draw_measures import MODES, Mode
 from cosim.studies.paper.paper_results import Results
@@ -32,21 +37,18 @@ _PANELS = (
     ("settled_5_s", "settling to 5 %", "time [s]", False),
     ("gap_min_s", "shortest interval", "time [s]", True),
 )
-_HEIGHT_IN = 5.3
-_COLOURS: Mapping[Mode, Any] = {
-    "model": printed(palette.SERIES[2]),
-    "zoh": printed(palette.SERIES[3]),
-}
-_DOT = printed(palette.PLANT)
+_ABOVE_IN, _BELOW_IN, _LEFT_IN = 1.6, 2.0, 0.78
+_COLOURS: Mapping[Mode, palette.Colour] = {"model": series_colour(2), "zoh": series_colour(3)}
+_INK = (27, 31, 36)
 
 
-def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
-    """Draw states, broadcasting and receiving intervals of one loop of a draw."""
+def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> FigureDescription:
+    """Describe states, broadcasting and receiving intervals of one loop of a draw."""
     shown = run.event_s <= SHOWN_S
     samples = run.at(np.linspace(0.0, SHOWN_S, round(SHOWN_S / _STEP_S) + 1))
     fates = _fates(resolved, int(shown.sum()))
     event_s = run.event_s[shown]
-    return paper_figure(
+    return states_figure(
         mode=resolved.mode,
         t_s=samples.t_s,
         x=samples.x,
@@ -68,51 +70,47 @@ def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
     return np.array([link.decide(0, 1, 0).fate for _ in range(events)], dtype=np.int64)
 
 
-@styled
-def ensemble_figure(results: Results) -> Figure:
-    """Draw the distributions over the draws, and below them both loops of each draw as points."""
-    figure = Figure(figsize=(layout().width_in, _HEIGHT_IN), layout="constrained")
-    panels = figure.subplots(2, len(_PANELS), height_ratios=(4, 5))
-    shown: list[Shown] = []
-    for (above, below), (name, title, unit, logarithm) in zip(panels.T, _PANELS, strict=True):
+def ensemble_figure(results: Results) -> FigureDescription:
+    """Describe the distributions over the draws; below, both loops of each draw as a point."""
+    above, below = [], []
+    for name, title, unit, logarithm in _PANELS:
         both: dict[Mode, Vector] = {mode: results.column(f"{mode}.{name}") for mode in MODES}
-        shown = _histogram(above, both, logarithm=logarithm)
-        above.set(title=title, xlabel=unit)
-        _against(below, both["model"], both["zoh"], logarithm=logarithm)
-        below.set(xlabel=f"MB-ET, {unit}", ylabel=f"ZOH-ET, {unit}")
-    panels[0, 0].set(ylabel="draws")
-    handles, labels = zip(*shown, strict=True)
-    figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
-    figure.suptitle(
-        f"{results.count():,} draws, each with MB-ET and ZOH-ET",
-        x=0.005, ha="left", weight="bold", size=layout().title_pt,
-    )  # fmt: skip
-    return figure
+        above.append(_histogram(title, unit, both, logarithm=logarithm))
+        below.append(_against(unit, both["model"], both["zoh"], logarithm=logarithm))
+    above = [replace(panel, legend=() if i else None) for i, panel in enumerate(above)]
+    return FigureDescription(
+        name="ensemble",
+        heading=f"{results.count():,} draws, each with MB-ET and ZOH-ET",
+        rows=[
+            Row(panels=above, height_in=_ABOVE_IN, left_in=_LEFT_IN),
+            Row(panels=below, height_in=_BELOW_IN, left_in=_LEFT_IN),
+        ],
+    )
 
 
-def _histogram(axes: Axes, both: Mapping[Mode, Vector], *, logarithm: bool) -> list[Shown]:
+def _histogram(title: str, unit: str, both: Mapping[Mode, Vector], *, logarithm: bool) -> Panel:
     seen = np.concatenate(list(both.values()))
     seen = seen[np.isfinite(seen)]
     edges = (np.geomspace if logarithm else np.linspace)(seen.min(), seen.max(), _BINS + 1)
-    shown: list[Shown] = []
-    for mode, values in both.items():
-        style = {"color": _COLOURS[mode], "alpha": 0.75}
-        axes.hist(values[np.isfinite(values)], edges.tolist(), **style)
-        shown.append((Patch(**style), MODES[mode]))
-    if logarithm:
-        logarithmic(axes, "x")
-    finish(axes)
-    return shown
+    bars = [
+        Bars(edges=edges, colour=_COLOURS[mode], opacity=0.75, label=MODES[mode],
+             heights=np.histogram(values[np.isfinite(values)], edges)[0].astype(np.float64))
+        for mode, values in both.items()
+    ]  # fmt: skip
+    x, y = Axis(label=f"{title}, {unit}", logarithmic=logarithm), Axis(label="draws")
+    return Panel(items=bars, x=x, y=y)
 
 
-def _against(axes: Axes, model: Vector, zoh: Vector, *, logarithm: bool) -> None:
-    """Draw one dot per draw; both loops are equal on the diagonal line."""
+def _against(unit: str, model: Vector, zoh: Vector, *, logarithm: bool) -> Panel:
+    """Describe one dot per draw; both loops are equal on the diagonal line."""
     finite = np.isfinite(model) & np.isfinite(zoh)
     model, zoh = model[finite], zoh[finite]
-    low, high = min(model.min(), zoh.min()), max(model.max(), zoh.max())
-    axes.plot((low, high), (low, high), color=INK, linewidth=0.9)
-    axes.plot(model, zoh, "o", color=_DOT, markersize=2.2, alpha=0.5, markeredgewidth=0)
-    if logarithm:
-        logarithmic(axes, "x")
-        logarithmic(axes, "y")
-    finish(axes)
+    ends = np.array([min(model.min(), zoh.min()), max(model.max(), zoh.max())])
+    diagonal = Line(x=ends, y=ends, colour=_INK, width=0.9)
+    dots = Marks(x=model, y=zoh, colour=palette.PLANT, size=2.2, opacity=0.5, stroke=0.0,
+                 reduced=False)  # fmt: skip
+    return Panel(
+        items=[diagonal, dots],
+        x=Axis(label=f"MB-ET, {unit}", logarithmic=logarithm),
+        y=Axis(label=f"ZOH-ET, {unit}", logarithmic=logarithm),
+    )

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from cosim.output.report.figure_files import save_figure
+from cosim.output.figure_files import save_figure
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import local

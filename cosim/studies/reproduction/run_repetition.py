@@ -14,7 +14,7 @@ from cosim.analysis.replay.replay_result import difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
-from cosim.output.network_table import network_rows
+from cosim.output.run_tables import network_rows
 from cosim.record.environment import Kind, all_changes_since, kind_of
 from cosim.record.record_source import Slice
 from cosim.record.run_directory import SCENARIO_FILE

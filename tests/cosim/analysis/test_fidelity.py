@@ -12,7 +12,7 @@ import cosim.analysis.fidelity
 from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
 from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
-from cosim.output.fidelity_table import summary_rows
+from cosim.output.run_tables import fidelity_rows
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
@@ -96,14 +96,14 @@ def test_a_rule_without_a_continuous_time_run_gives_one_line() -> None:
     summary = fidelity_for_summary(record)
     assert isinstance(summary, NoFidelityPart)
     assert "accumulate" in summary.reason
-    ((_, text),) = summary_rows(summary)
+    ((_, text),) = fidelity_rows(summary)
     assert text == f"not compared: {summary.reason}"
 
 
 def test_a_negative_share_partly_cancels_the_other_effects() -> None:
     shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "residual": 0.0}
     numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
-    shown = dict(summary_rows(FidelityPart.model_construct(**numbers)))
+    shown = dict(fidelity_rows(FidelityPart.model_construct(**numbers)))
     assert shown["  sampling"] == "142.0 %"
     assert shown["  delay"] == "-42.0 % (partly cancels the other effects)"
     assert shown["  held actuation"] == "0.0 %"

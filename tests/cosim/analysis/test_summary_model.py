@@ -16,7 +16,7 @@ from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
-from cosim.output.report.report_page import page
+from cosim.output.report_page import Report, page
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import changed_since, kind_of
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE
@@ -150,7 +150,7 @@ def show(record: RunRecord, summary: RunSummary) -> None:
     """Every function that reads a summary."""
     outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
     print_outcome(Console(file=io.StringIO()), outcome)
-    page(record.scenario, summary, [], "", {})
+    page(Report(summary, record.scenario, 0))
     run = noack.Run(outcome.run_dir, lambda: outcome)
     assert repr(run)
     assert run._repr_html_()

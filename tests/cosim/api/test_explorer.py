@@ -69,7 +69,7 @@ def test_a_loop_that_is_unstable_says_why() -> None:
     assert explorer.warning == ""
     A, B = explorer.scenario.plant.uncertainty_A, explorer.scenario.plant.uncertainty_B
     explorer.set({"plant.uncertainty_A": 15 * np.array(A), "plant.uncertainty_B": 15 * np.array(B)})
-    assert "The events accumulate" in explorer.warning
+    assert "Zeno-like behaviour" in explorer.warning
     assert "a mode of the loop grows" in explorer.warning
     assert "warning" in repr(explorer)
     assert explorer.run.t_s[-1] < explorer.scenario.horizon_s

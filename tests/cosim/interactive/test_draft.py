@@ -14,8 +14,9 @@ from cosim.interactive.draft import (
     draft_of_query,
     known_scenarios,
     open_draft,
+    value_text,
+    with_value,
 )
-from cosim.interactive.toml_edit import value_text, with_value
 from cosim.shipped_files import shipped_names
 from noack.config import toml_file
 from noack.config.scenario_file import put

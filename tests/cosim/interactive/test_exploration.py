@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.interactive import ensemble, exploration, figure_curves, run_exploration
+from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
-from cosim.interactive.figure_curves import Shown
-from cosim.lab.chart_options import data_options
+from cosim.interactive.exploration_figure import BAND, Shown, exploration_figure
+from cosim.lab.chart import data_options
+from cosim.output.figure_description import Line
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.resolution import resolve
@@ -41,15 +42,21 @@ def test_the_sensor_error_stays_at_or_below_its_threshold() -> None:
 
 def test_the_controllers_curves_begin_with_its_first_update() -> None:
     found = exploration.explore(noack.load("lane_following"))
-    drawn = figure_curves.sources(Shown(found, 0))["run"]
     assert found.e_c_norm[0] == pytest.approx(found.x_norm[0])  # it knows no state
-    for column in (drawn["x_c"], drawn["e_c"]):
-        assert np.flatnonzero(np.isnan(column)).tolist() == [0]
-    assert drawn["x_c"][1] == drawn["x"][1]
+    x, x_c, e_c = (curve(found, label) for label in ("plant x", "controller x_c", "‖e_c‖"))
+    for values in (x_c, e_c):
+        assert np.flatnonzero(np.isnan(values)).tolist() == [0]
+    assert x_c[1] == x[1]
     known = exploration.explore(
         noack.load("lane_following", {"network.initial_sync": "known_state"})
     )
-    assert np.isfinite(figure_curves.sources(Shown(known, 0))["run"]["e_c"]).all()
+    assert np.isfinite(curve(known, "‖e_c‖")).all()
+
+
+def curve(run: exploration.Exploration, label: str) -> np.ndarray:
+    rows = exploration_figure(Shown(run, 0)).rows
+    items = [item for row in rows for item in row.panels[0].items if isinstance(item, Line)]
+    return next(item.y for item in items if item.label == label)
 
 
 def test_a_legend_names_what_is_drawn() -> None:
@@ -63,12 +70,11 @@ def test_a_legend_names_what_is_drawn() -> None:
     assert void.guarantee is not None
     assert void.guarantee.verdict != guarantee.CERTIFIED
     for shown, expected in ((alone, False), (certified, True), (void, False)):
-        legends = figure_curves.legends(figure_curves.sources(shown))
-        assert ("certified bound" in legends["errors"]) is expected
-        assert figure_curves.BAND not in legends["state"]
-        assert data_options(shown)["legend"][1]["data"] == [
-            {"name": name} for name in legends["errors"]
-        ]
+        figure = exploration_figure(shown)
+        state, errors, *_ = (row.panels[0].legend or () for row in figure.rows)
+        assert ("certified bound" in errors) is expected
+        assert BAND not in state
+        assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
 
 
 def test_a_run_that_diverges_is_drawn_up_to_that_time() -> None:
@@ -90,7 +96,7 @@ def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
     assert even.t_s[-1] == even.event_s[-1] == pytest.approx(5.998)
     assert dict(even.numbers)["run"] == even.cut
     accumulating = exploration.explore(noack.load("lane_following", {"trigger.alpha_per_s": 2.5}))
-    assert accumulating.cut.startswith("the events accumulate: 3000 events until ")
+    assert accumulating.cut.startswith("Zeno-like behaviour: inter-event times shrink to 0 (")
     assert accumulating.t_s[-1] < 20.0
 
 
@@ -108,7 +114,7 @@ def test_a_simulated_run_is_drawn_with_its_events() -> None:
         "kind": "luenberger", "gain": [[40.0, 0.0], [0.0, 40.0]],
     }})  # fmt: skip
     assert exploration.why_not_exact(scenario) is not None
-    found = run_exploration.simulate_sampled(scenario)
+    found = exploration.simulate_sampled(scenario)
     assert found.kind == exploration.SAMPLED
     assert len(found.t_s) == len(found.x) == len(found.e_c_norm)
     assert len(found.event_s) == len(found.delivered) > 0

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from cosim.interactive.controls import Field, by_field, filled, form_of
 from cosim.interactive.draft import DraftError, open_draft
-from cosim.interactive.form_fields import Field, by_field, filled, form_of
 from cosim.shipped_files import shipped_names
 from noack.config import toml_file
 from noack.config.scenario_file import completed

@@ -84,7 +84,7 @@ def test_the_log_is_bounded() -> None:
 
 def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
     text = open_draft("double_integrator").with_value("horizon_s", 1.0).text
-    command = python_command("-m", "cosim.lab.live_child", tmp_path, tmp_path / "runs")
+    command = python_command("-m", "cosim.lab.live_run", tmp_path, tmp_path / "runs")
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           text=True) as process:  # fmt: skip
         assert process.stdin is not None

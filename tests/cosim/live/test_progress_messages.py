@@ -7,7 +7,8 @@ import pytest
 
 import noack
 from cosim.analysis.summary_model import RunSummary
-from cosim.output.report.run_figures import pictures
+from cosim.output.figure_drawing import draw
+from cosim.output.run_figures import run_figures
 from cosim.output.run_tables import key_numbers, short_numbers
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -58,7 +59,7 @@ def test_of_lost_actuations_the_report_has_the_number_and_the_inputs_applied_wit
     assert lost > 0
     for numbers in (key_numbers(summary), short_numbers(summary)):
         assert dict(numbers)["actuations lost"].startswith(f"{lost} (")
-    drawn = pictures(record)["input"]().figure.axes[0].lines[0].get_ydata()
+    drawn = draw(run_figures(record)["input"]()).axes[0].lines[0].get_ydata()
     applied, sent = record["plant_step"]["u"][:, 0], record["controller_step"]["u"][:, 0]
     late = np.count_nonzero(sent == 0) + 1  # 0 is sent, or applied before the first actuation
     assert np.isin(drawn, applied).all()

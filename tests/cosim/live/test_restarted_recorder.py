@@ -14,7 +14,7 @@ import zenoh
 
 from cosim.live import recorder
 from cosim.live.recorder import Recorder
-from cosim.output.viewer.recording_file import ViewError
+from cosim.output.viewer.recording import ViewError
 from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate

@@ -24,9 +24,11 @@ from cosim.analysis.over_time import (
 from cosim.analysis.summary_model import ExitPart, read_summary
 from cosim.cli import app
 from cosim.live.finalize import reopen
-from cosim.output.network_table import loop_row, network_rows
-from cosim.output.report.network_figures import error_map, norms_figure
-from cosim.output.viewer.opening_time import opening_time_ns
+from cosim.output.figure_description import Heat
+from cosim.output.figure_drawing import draw
+from cosim.output.run_figures import error_map, norms_figure
+from cosim.output.run_tables import loop_row, network_rows
+from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.run_record import load_record, load_run
 from noack.config.resolution import network_tables
@@ -210,7 +212,7 @@ def test_figures_of_few_and_many_loops(count: int) -> None:
     values = np.random.default_rng(1).uniform(0.1, 1, (count, INTERVALS))
     names = [f"loop-{i}" for i in range(count)]
     over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, 2 * values, values)
-    upper, lower = norms_figure(over_time, names, np.full(count, True)).axes
+    upper, lower = draw(norms_figure(over_time, names, np.full(count, True))).axes
     for axes, factor in ((upper, 1), (lower, 2)):
         drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
         if count == 3:
@@ -218,8 +220,9 @@ def test_figures_of_few_and_many_loops(count: int) -> None:
         else:
             np.testing.assert_allclose(drawn[0], factor * np.median(values, axis=0))
             np.testing.assert_array_equal(drawn[1], factor * values.max(axis=0))
-    image = error_map(over_time, names, np.full(count, True)).axes[0].images[0].get_array()
-    np.testing.assert_array_equal(image, values)
+    (heat,) = error_map(over_time, names, np.full(count, True)).rows[0].panels[0].items
+    assert isinstance(heat, Heat)
+    np.testing.assert_array_equal(heat.values, values)
 
 
 def test_a_loop_that_diverged_does_not_hide_the_others() -> None:
@@ -227,13 +230,13 @@ def test_a_loop_that_diverged_does_not_hide_the_others() -> None:
     values[1] *= 10.0 ** np.linspace(0, 20, INTERVALS)
     over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, values, values)
     names, stayed = ["a", "b", "c"], np.array([True, False, True])
-    for axes in norms_figure(over_time, names, stayed).axes:
+    for axes in draw(norms_figure(over_time, names, stayed)).axes:
         assert axes.get_ylim()[0] < 0.1
         assert axes.get_ylim()[1] < 1e7
-    colours = error_map(over_time, names, stayed).axes[0].images[0].norm
-    assert colours.vmax == values[stayed].max()
-    everything = error_map(over_time, names, np.full(3, False)).axes[0].images[0].norm
-    assert everything.vmax == values.max()
+    for known, most in ((stayed, values[stayed].max()), (np.full(3, False), values.max())):
+        scale = error_map(over_time, names, known).scale
+        assert scale is not None
+        assert scale.high == most
 
 
 def test_the_worst_loop(run_dir: Path) -> None:

@@ -13,7 +13,7 @@ from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
-from cosim.output.viewer.opening_time import opening_time_ns
+from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
 from cosim.record.run_record import RecordedRun, load_record

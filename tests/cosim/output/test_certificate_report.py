@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.cli import app
-from cosim.output.all_certificates import (
+from cosim.output.certificates import (
     IDEAL,
     SCHEDULE,
     Certificates,
@@ -166,20 +166,6 @@ def test_a_missing_certificate_fails_with_the_reason() -> None:
     assert result.exit_code == 1
     assert "void" in result.stdout
     assert "grows at" in result.stdout
-
-
-def test_the_text_states_the_bounds_and_their_conditions(document: dict[str, Any]) -> None:
-    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--late", "1"])
-    sentences = " ".join(result.stdout.split()).split("In words: ")[1:]
-    assert [one.partition(",")[0] for one in sentences] == [
-        "for the scenario's plant", "for every plant of the box"
-    ]  # fmt: skip
-    scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
-    for sentence, one in zip(sentences, scheduled, strict=True):
-        assert "under the assumptions above" in sentence
-        assert "at most M − 1 = 3 consecutive losses" in sentence
-        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t), from" in sentence
-        assert f"on ≤ {one['floor_constants']['state']:.4g}." in sentence
 
 
 def test_a_gain_of_the_opposite_sign_is_recognised() -> None:

@@ -10,9 +10,15 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.output.latex_text import latex_text
-from cosim.output.result_tables import KEY_VALUE, ResultTable, as_csv, as_latex, save_tables
-from cosim.output.run_result_tables import summary_tables
+from cosim.output.result_tables import (
+    KEY_VALUE,
+    ResultTable,
+    as_csv,
+    as_latex,
+    latex_text,
+    save_tables,
+)
+from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
 from tests.cosim.output.latex import compiled
 

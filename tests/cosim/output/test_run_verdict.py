@@ -1,23 +1,19 @@
 """The end of a run: three lines, one table that fits, and no warning without a cause."""
 
 import io
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 import noack
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import FidelityPart
-from cosim.cli import app
 from cosim.live.finalize import reopen
-from cosim.output.remarks import remarks
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import print_outcome, verdict
+from cosim.output.run_verdict import print_outcome, remarks, verdict
 from tests.cosim.summaries import with_values
 
 RED = "\x1b[1;31m"
@@ -66,15 +62,6 @@ def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome
     assert "--verbose" in last
     assert str(outcome.run_dir) in last
     assert list(remarks(summary)) == []
-
-
-def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
-    text = printed(outcome, verbose=True)
-    for what in ("numerical check of x_c − x_s (I1)", "the paper's assumptions", "idealised",
-                 "claims checked against this run", "certificate"):  # fmt: skip
-        assert what in text
-    assert RED not in text
-    assert "violated" not in text
 
 
 @pytest.mark.parametrize(
@@ -158,19 +145,6 @@ def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
     # there is no other value to compare with
     assert "ideal loop" not in verdict(run.summary)[1].text
-
-
-def test_summary_prints_the_short_form_and_all_tables_on_request(outcome: Outcome) -> None:
-    def noack_summary(*more: str) -> str:
-        done = CliRunner().invoke(app, ["summary", str(outcome.run_dir), *more])
-        assert done.exit_code == 0
-        return done.stdout
-
-    short, long = noack_summary(), noack_summary("--verbose")
-    assert short.splitlines()[:3] == [line.text for line in verdict(outcome.summary)]
-    assert len(short.splitlines()) <= 25 < len(long.splitlines())
-    assert long.splitlines()[:3] == short.splitlines()[:3]
-    assert json.loads(noack_summary("--json")) == outcome.summary.to_json()
 
 
 def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> None:

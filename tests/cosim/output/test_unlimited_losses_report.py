@@ -1,15 +1,12 @@
 """What ``noack certify`` says without the guarantee, against simulated runs and closed forms."""
 
-import io
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from cosim.output.all_certificates import Certificates
-from cosim.output.certificate_report import print_certificates
+from cosim.output.certificates import Certificates
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
@@ -82,13 +79,3 @@ def test_there_is_no_statement_where_losses_depend_on_times_and_the_reason_is_na
     assert found.unlimited is None
     assert found.unpredictable is not None
     assert Certificates(lane(), 2).unlimited is None
-
-
-def test_the_statements_are_printed(own: Certificates, weighted: UnlimitedLosses) -> None:
-    printed = Console(file=io.StringIO(), width=200)
-    print_certificates(printed, own)
-    assert isinstance(printed.file, io.StringIO)
-    text = printed.file.getvalue()
-    assert f"the mean of ‖x‖ is at most {weighted.moments[0].state:.4g}" in text
-    assert "no root mean square is certified" in text
-    assert "keeps it with probability" in text

@@ -13,7 +13,7 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
-from cosim.output.all_certificates import Certificates
+from cosim.output.certificates import Certificates
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.continuous import continuous_loop_of

@@ -27,7 +27,7 @@ def _envelope(
     if (bounds := run.known_state_bounds(certificate)) is None:
         return None
     values = bounds.controller_error(samples.t_s, samples.since_event.missing)
-    label = "certified for the missing events"
+    label = "bound, given the updates missing now"
     return Envelope(label, "e_c", samples.t_s, np.where(samples.in_common, values, np.nan))
 
 

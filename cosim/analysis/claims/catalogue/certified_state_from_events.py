@@ -37,7 +37,7 @@ def _envelope(
         return None
     t_s, since, missing = samples.t_s, samples.since_event, run.missing_events(samples, bounds)
     values = row_norms(since.predicted) + bounds.state_deviation(t_s, since.age_s, missing)
-    label = "certified from the newest event"
+    label = "bound, given x at the last event"
     return Envelope(label, "x", t_s, np.fmin(values, certificate.state(t_s)))
 
 

@@ -22,6 +22,8 @@ class PhasePicture(draw.Picture):
         reach: (n,) expected maximum of each |x_i|, above 0.
     """
 
+    draws_any = True
+
     def __init__(self, names: Sequence[str], reach: draw.Reals) -> None:
         self._names = list(names[:2])
         self._reach = np.asarray(reach, dtype=float)[:2]

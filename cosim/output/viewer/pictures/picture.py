@@ -1,12 +1,16 @@
-"""Interface of a plant's picture: static shapes, and their motion as columns of the recording.
+"""A plant's picture: static shapes, and their motion as columns of the recording.
+
+:func:`picture_of` chooses it; the other files in this folder have one kind of picture each.
 
 Pictures are two-dimensional: they are the same for every plant of a kind, sharp at every size, and
 cheap for a viewer without a graphics processor. A picture has the plant's lengths. Here, +y is up;
 in the viewer, +y is down, so that every shape and pose is flipped (:func:`upright`, :func:`poses`).
 """
 
+import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,8 +20,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.output.palette import CONTROLLER, PLANT, SENSOR, Colour
-from noack.config.resolution import LoopMatrices
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
+from noack.core.linear_systems import Propagator
 
 Reals = NDArray[np.float64]
 
@@ -96,6 +101,8 @@ class Picture(ABC):
 
     kinds: tuple[str, ...] = ()
     """Plant kinds that it draws; others may have states with the names that it draws."""
+    draws_any = False
+    """Whether it draws any plant, if no other picture does."""
     title: str
     """Title of its panel."""
     rate_hz = 60.0
@@ -241,3 +248,44 @@ def outline(
             at = [(i + part) / count for part in (0.15, 0.65)]
             pieces.append([(a + share * (b - a)).tolist() for share in at])
     return pieces
+
+
+_SAMPLES = 400
+_ROOM = 1.25
+
+
+def picture_of(scenario: Scenario) -> Picture:
+    """Return the picture of a resolved scenario's plant: of the first file that draws such plants.
+
+    It is a phase plot if no other one does.
+    """
+    loop = loop_of(scenario)
+    plant = DrawnPlant(scenario, loop, reach_of(loop, scenario.timing.horizon_ns))
+    package = __name__.rpartition(".")[0]
+    for module in pkgutil.iter_modules(import_module(package).__path__):
+        import_module(f"{package}.{module.name}")
+    kind = scenario.plant.system.kind
+    for drawing in sorted(
+        Picture.__subclasses__(), key=lambda one: (one.draws_any, kind not in one.kinds)
+    ):
+        if (picture := drawing.of(plant)) is not None:
+            return picture
+    raise AssertionError("the phase plot draws any plant")
+
+
+def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
+    """Return (n,) max |x_i| of the model's closed loop from x(0), plus a margin.
+
+    It is 1 for a state that stays at 0.
+    """
+    step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(
+        max(horizon_ns // _SAMPLES, 1)
+    )
+    at_rest = np.zeros(loop.n) if loop.setpoint is None else loop.setpoint
+    deviation, reach = loop.x0 - at_rest, np.abs(loop.x0)
+    with np.errstate(all="ignore"):
+        for _ in range(_SAMPLES):
+            deviation = step @ deviation
+            reach = np.fmax(reach, np.abs(at_rest + deviation))
+    known = np.isfinite(reach) & (reach > 0)
+    return np.where(known, _ROOM * reach, 1.0)

@@ -9,7 +9,7 @@ from cosim.analysis.over_time import INTERVALS, QUANTILES, loops_over_time
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.network_recording import (
+from cosim.output.viewer.run_recording import (
     ERROR,
     MAP,
     QUEUE,
@@ -17,8 +17,8 @@ from cosim.output.viewer.network_recording import (
     SIZE,
     map_pixels,
     usual_largest,
+    write_view,
 )
-from cosim.output.viewer.run_view import write_view
 from cosim.record.align import align_tables
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import RECORDING_FILE, write_scenario

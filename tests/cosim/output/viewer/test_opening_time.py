@@ -10,8 +10,12 @@ from typing import Any
 import pytest
 import rerun.experimental
 
-from cosim.output.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
-from cosim.output.viewer.viewer_server import RecordingServer
+from cosim.output.viewer.live_viewer import (
+    RecordingServer,
+    move_window_to,
+    opening_time_ns,
+    script_to_open_at,
+)
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve

@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cosim.output.viewer.network_diagram import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.lane_picture import LanePicture
-from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
 from cosim.output.viewer.pictures.phase_picture import PhasePicture
-from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel
-from cosim.output.viewer.pictures.picture_choice import picture_of, reach_of
+from cosim.output.viewer.pictures.picture import (
+    WHO,
+    Columns,
+    Frames,
+    Picture,
+    panel,
+    picture_of,
+    reach_of,
+)
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.config.resolution import loop_of, resolve

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.recording_file import ViewError
-from cosim.output.viewer.run_view import write_loop_view
+from cosim.output.viewer.recording import ViewError
+from cosim.output.viewer.run_recording import write_loop_view
 from cosim.record import decimate, run_record
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import RECORDING_FILE, write_scenario
@@ -92,7 +92,9 @@ def test_no_recording_is_written_on_a_full_disk(
 ) -> None:
     """After a failed write rerun may wait forever."""
     scenario = resolve(load(find_shipped("lane_following", "scenarios"), ["horizon_s=0.1"]))
-    monkeypatch.setattr("cosim.output.viewer.run_view.disk_usage", lambda _: Mock(free=1 << 20))
+    monkeypatch.setattr(
+        "cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20)
+    )
     with pytest.raises(ViewError, match="No space left"):
         write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE, 1)
     assert not [*tmp_path.iterdir()]

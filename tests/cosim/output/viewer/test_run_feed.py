@@ -8,9 +8,16 @@ import pytest
 from cosim.analysis.network_summary import counts_inside, times_inside
 from cosim.analysis.over_time import INTERVALS, loops_over_time, quantiles
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.network_recording import ERROR, MAP, QUEUE, SHARE, SIZE, NetworkRecording
 from cosim.output.viewer.run_feed import NetworkFeed
-from cosim.output.viewer.run_view import open_view
+from cosim.output.viewer.run_recording import (
+    ERROR,
+    MAP,
+    QUEUE,
+    SHARE,
+    SIZE,
+    NetworkRecording,
+    open_view,
+)
 from cosim.record.align import align_tables
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun

@@ -20,13 +20,17 @@ import rerun.chunk
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
-from cosim.output.viewer.live_viewer import LiveView, has_display, view_recording
+from cosim.output.viewer.live_viewer import (
+    RECORDING,
+    LiveView,
+    RecordingServer,
+    has_display,
+    view_recording,
+)
+from cosim.output.viewer.network_diagram import NetworkDiagram
 from cosim.output.viewer.pictures.lane_picture import LanePicture
-from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Frames, Picture
-from cosim.output.viewer.recording import RunView
-from cosim.output.viewer.recording_file import APPLICATION_ID, ViewError
-from cosim.output.viewer.viewer_server import RECORDING, RecordingServer
+from cosim.output.viewer.recording import APPLICATION_ID, RunView, ViewError
 from cosim.record.align import AlignedRun
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import Fate

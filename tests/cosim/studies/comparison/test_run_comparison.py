@@ -139,7 +139,7 @@ def test_runs_that_cannot_be_compared_give_one_line(runs: list[Path], tmp_path: 
         "compares one with the ideal loop\n",
         (runs[0], tmp_path): f"noack: {tmp_path}: not a run directory (no scenario.toml)\n",
         (*runs, "--out", tmp_path / "a.eps"): f"noack: {tmp_path / 'a.eps'}: a comparison is "
-        "written as .html, .svg, .png, .pdf, .pgf\n",
+        "written as .html, .svg, .png, .pdf\n",
     }
     for words, said in mistakes.items():
         done = compare(*words)

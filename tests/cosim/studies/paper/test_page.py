@@ -11,6 +11,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from cosim.cli import app, command
+from cosim.output.figure_drawing import draw
 from cosim.studies.campaign.draw_statistics import paired, quartiles
 from cosim.studies.paper import paper_run
 from cosim.studies.paper.paper_campaign import BASE, COLUMNS, load_campaign, parts
@@ -162,7 +163,7 @@ def test_quartiles_are_values_of_draws_and_may_be_infinite() -> None:
 
 def test_a_figure_with_draws_that_never_settle_can_be_drawn(results: Results) -> None:
     some = np.where(np.arange(results.count()) % 2, math.inf, 10.0)
-    assert ensemble_figure(with_column(results, "zoh.settled_5_s", some)).axes
+    assert draw(ensemble_figure(with_column(results, "zoh.settled_5_s", some))).axes
 
 
 def test_mistakes_give_one_line_before_any_simulation(tmp_path: Path) -> None:

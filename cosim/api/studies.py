@@ -1,0 +1,362 @@
+"""Certificates, margins, measurements and campaigns, and the tables of all results as files."""
+
+import shutil
+import sys
+import tempfile
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
+from cosim.api.runs import Run
+from cosim.api.scenarios import Source, load
+from cosim.measurement.network_measurement import Measurement, MeasurementOptions
+from cosim.measurement.trace_sources import read_source
+from cosim.output.certificates import Certificates, certificates_of
+from cosim.shipped_files import find_shipped
+from noack.config.resolution import resolve
+from noack.core.errors import CallerError
+from noack.core.number_format import Rows, as_html, as_text
+from noack.core.process_limits import cores
+from noack.theory.margins.joint_spectral_radius import ACCURACY
+from noack.traces.trace_formats import find_trace
+
+
+def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
+    """Return the certificates of a scenario, with their constants and conditions.
+
+    >>> import noack
+    >>> found = noack.certify("lane_following")
+    >>> found.schedule.constants is None  # there is one
+    False
+    >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
+    no two events closer than 8 ms
+
+    Args:
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
+            that more can be certified, which takes some seconds.
+        late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
+            own value.
+
+    Raises:
+        NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
+            the paper's, its plant is not linear or is disturbed, or the state is not fully
+            measured.
+    """
+    return certificates_of(load(scenario), weight, late)
+
+
+def margin(
+    scenario: Source, *, most_m: int = MOST_M, accuracy: float = ACCURACY, period: bool = True
+) -> MarginResult:
+    """Return the largest M for which a loop is stable under every loss pattern.
+
+    >>> import noack
+    >>> noack.margin("lane_periodic", most_m=3, period=False).stable_m
+    3
+
+    Args:
+        scenario: a scenario whose trigger has a longest time between two events, as ``periodic``
+            and ``deadline`` have, or a source that :func:`noack.load` accepts.
+        most_m: largest M to examine.
+        accuracy: wanted ratio of upper and lower bound of the growth, minus 1.
+        period: whether to search for the longest period with the scenario's own M, too.
+
+    Raises:
+        NoackError: the scenario is wrong; or its trigger has no longest time, its loop is not
+            linear, or its delay varies or is not below the shortest period.
+    """
+    return find_margin(
+        resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
+    )
+
+
+def measure(
+    *sources: str | PathLike[str],
+    deadline_s: float | None = None,
+    outage_s: float | None = None,
+    shares: Sequence[float] | None = None,
+) -> Measurement:
+    """Measure a network from a packet trace, as ``noack measure`` does.
+
+    >>> import noack
+    >>> found = noack.measure("rural_n8_10kmh", deadline_s=0.1)
+    >>> found.longest_loss_burst >= 1
+    True
+
+    Args:
+        sources: a file, the name of a shipped trace, or files that belong together.
+        deadline_s: a packet that takes longer counts as lost.
+        outage_s: loss bursts of this duration or more are outages; by default a test decides.
+        shares: shares of loss bursts and packets for which M is given.
+
+    Raises:
+        NoackError: a file cannot be read, or is not a trace.
+    """
+    trace = read_source([find_trace(str(source)) for source in sources])
+    options = MeasurementOptions(deadline_s=deadline_s, outage_s=outage_s)
+    if shares is not None:
+        options = MeasurementOptions(deadline_s, tuple(shares), outage_s=outage_s)
+    return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), trace.notes)
+
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+    from cosim.studies.campaign.finished_campaign import FinishedCampaign
+
+_TABLE = Path("campaign")
+"""Stands for the file of a campaign that is given as a table."""
+
+
+class CampaignResult:
+    """A finished campaign; :func:`noack.campaign` returns it."""
+
+    def __init__(self, finished: "FinishedCampaign", temporary: Path | None = None) -> None:
+        self._finished = finished
+        if temporary is not None:
+            weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the campaign, with its page and all runs."""
+        return self._finished.store.folder
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The results: ``summary.json``; ``docs/campaigns.md`` documents its keys."""
+        return self._finished.summary.document()
+
+    @property
+    def breaches(self) -> int:
+        """Number of runs in which a certified bound was exceeded: an error in noack."""
+        return self._finished.summary.breaches
+
+    def estimates(self) -> "pa.Table":
+        """Return every metric at every grid point, a row each.
+
+        Returns:
+            The value of each axis, as text; ``metric``; ``mean`` with ``halfwidth``, half of its
+            95 % confidence interval; quantiles ``q05``, ``q25``, ``median``, ``q75``, ``q95``;
+            ``largest``; the number of ``draws``, and how many of them are ``finite``.
+        """
+        rows = [
+            {**found.point.labels, "metric": str(metric), **one._asdict()}
+            for found in self._finished.summary.found
+            for metric, one in found.estimates.items()
+        ]
+        return _table(rows)
+
+    def differences(self) -> "pa.Table":
+        """Return the paired differences of every metric to the reference, draw by draw.
+
+        Returns:
+            As :meth:`estimates`, and the shares of the draws in which the metric is ``larger`` and
+            ``smaller`` than at the reference. Without ``compare`` in the campaign it is empty.
+        """
+        rows = [
+            {**one.point.labels, "metric": str(metric), **found.estimate._asdict(),
+             "larger": found.larger, "smaller": found.smaller}
+            for one in self._finished.summary.compared
+            for metric, found in one.differences.items()
+        ]  # fmt: skip
+        return _table(rows)
+
+    def draws(self, **axes: object) -> "pa.Table":
+        """Return all metrics of the runs at a grid point, a row per draw.
+
+        Args:
+            axes: a value of each axis, as in the campaign: ``draws(policy="MB-ET", beta=0.5)``.
+
+        Raises:
+            NoackError: there is no such grid point.
+        """
+        import pyarrow as pa
+
+        from cosim.studies.campaign.campaign_file import label_of
+        from cosim.studies.campaign.campaign_summary import runs_at
+
+        wanted = {name: label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
+        points = [one.point for one in self._finished.summary.found]
+        for point in points:
+            if dict(point.labels) == wanted:
+                metrics, _ = runs_at(point, self._finished.store)
+                return pa.table({str(name): values for name, values in metrics.items()})
+        known = "; ".join(
+            f"{axis.name} is one of {', '.join(axis.labels)}"
+            for axis in self._finished.summary.campaign.axes
+        )
+        raise CallerError(f"no such grid point: {known}")
+
+    def plot(self, figure: str | None = None) -> "Figure":
+        """Draw a figure that the campaign asks for, by default its first one.
+
+        Args:
+            figure: its kind and number: ``"curve-2"``.
+
+        Raises:
+            NoackError: the campaign has no such figure.
+        """
+        from cosim.output.figure_drawing import draw
+        from cosim.studies.campaign.campaign_figures import figures
+
+        known = []
+        for described in figures(self._finished.summary, self._finished.store):
+            if figure in (None, described.name):
+                return draw(described)
+            known.append(described.name)
+        named = f'"{figure}": no such figure' if figure else "no figure"
+        raise CallerError(f"{named} in this campaign; it has {', '.join(known) or 'none'}")
+
+    def report(self) -> Path:
+        """Return the path of the page with all tables and figures."""
+        from cosim.studies.campaign.campaign_report import PAGE
+
+        return self.folder / PAGE
+
+    def _rows(self) -> Rows:
+        from cosim.studies.campaign.campaign_report import campaign_tables
+
+        table = next(iter(campaign_tables(self._finished.summary)))
+        return [(*table.headings,), *((*row,) for row in table.rows)]
+
+    def __repr__(self) -> str:
+        return as_text(self._rows())
+
+    def _repr_html_(self) -> str:
+        return as_html(self._rows())
+
+
+def campaign(
+    source: str | PathLike[str] | Mapping[str, Any],
+    *,
+    draws: int | None = None,
+    folder: str | PathLike[str] | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> CampaignResult:
+    """Run a scenario over a grid of settings, with many random draws at each point.
+
+    >>> import noack
+    >>> found = noack.campaign(
+    ...     {
+    ...         "name": "losses",
+    ...         "scenario": "double_integrator",
+    ...         "draws": 20,
+    ...         "settings": {"horizon_s": 5.0},
+    ...         "axes": [{"name": "loss", "key": "network.loss.probability", "values": [0.2, 0.8]}],
+    ...     },
+    ...     workers=1,
+    ... )
+    >>> found.estimates().column_names[:3]
+    ['loss', 'metric', 'draws']
+    >>> found.breaches
+    0
+
+    Args:
+        source: the name of a shipped campaign (``"mb_vs_zoh"``), the path of a campaign file, or
+            its content as a table; ``docs/campaigns.md`` documents the keys.
+        draws: draws at each grid point; by default the campaign's.
+        folder: where the runs are kept; an interrupted campaign in it is continued. Without it,
+            a temporary folder, which exists as long as the result.
+        workers: processes; by default one per core. With 1, this process computes. Others import
+            the main program anew: a script needs ``if __name__ == "__main__":``.
+        progress: show a progress line on standard error.
+
+    Raises:
+        NoackError: one line per mistake in the campaign; or it was interrupted.
+    """
+    from cosim.studies.campaign.campaign_file import Campaign, load
+    from cosim.studies.campaign.campaign_workers import local
+    from cosim.studies.campaign.finished_campaign import finish_campaign
+    from noack.config import toml_file
+
+    if isinstance(source, Mapping):
+        path = _TABLE
+        plan = toml_file.validated(Campaign, source, str(path))
+    else:
+        path = find_shipped(str(source), "campaigns")
+        plan = load(path)
+    temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
+    bar = None
+    if progress:
+        from cosim.live.progress import PatientConsole, runs_bar
+
+        bar = runs_bar(PatientConsole(file=sys.stderr))
+    start = partial(local, workers or cores())
+    try:
+        finished = finish_campaign(
+            plan, path, Path(folder or temporary or ""), start, draws=draws,
+            show=lambda text: nullcontext(), bar=bar,
+        )  # fmt: skip
+    except BaseException:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    return CampaignResult(finished, temporary)
+
+
+def _table(rows: list[dict[str, Any]]) -> "pa.Table":
+    import pyarrow as pa
+
+    return pa.Table.from_pylist(rows)
+
+
+if TYPE_CHECKING:
+    from cosim.output.result_tables import ResultTable
+
+Result = Run | Certificates | MarginResult | CampaignResult
+
+
+def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
+    """Write the tables of a result, each as LaTeX (booktabs) and as CSV, as ``--tables`` does.
+
+    >>> import noack, tempfile
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> files = noack.save_tables(noack.certify("lane_following"), folder.name)
+    >>> [file.name for file in files]
+    ['certificates.tex', 'certificates.csv', 'limits.tex', 'limits.csv']
+    >>> folder.cleanup()
+
+    Args:
+        result: a run, or what :func:`noack.certify`, :func:`noack.margin` or
+            :func:`noack.campaign` returned.
+        folder: where the files are written; it is made if it does not exist.
+
+    Returns:
+        The paths.
+
+    Raises:
+        NoackError: it is another object, or a file cannot be written.
+    """
+    from cosim.output.result_tables import save_tables as save
+
+    return save(_tables(result), Path(folder))
+
+
+def _tables(result: Result) -> "Iterable[ResultTable]":
+    """Return the tables that the command of such a result prints."""
+    match result:
+        case Run():
+            from cosim.output.run_tables import summary_tables
+
+            return summary_tables(result.summary)
+        case Certificates():
+            from cosim.output.certificate_report import certificate_tables
+
+            return certificate_tables(result)
+        case MarginResult():
+            from cosim.output.certificate_report import margin_tables
+
+            return margin_tables(result)
+        case CampaignResult():
+            from cosim.studies.campaign.campaign_report import campaign_tables
+
+            return campaign_tables(result._finished.summary)
+    raise CallerError(f"{type(result).__name__}: has no tables")

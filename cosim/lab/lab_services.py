@@ -1,0 +1,295 @@
+"""What the page computes: the services that all visitors share, and the session of each.
+
+:class:`LabServices` has a worker process, the known scenarios and the live run; :class:`Session`
+has what one visitor explores, the edited scenario and what was computed of it.
+"""
+
+import asyncio
+import multiprocessing
+import os
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
+from cosim.interactive.ensemble import Ensemble, explore_ensemble
+from cosim.interactive.exploration import Exploration, explore, simulate_sampled, why_not_exact
+from cosim.interactive.exploration_figure import Shown
+from cosim.interactive.scenario_guarantee import (
+    Guarantee,
+    Margin,
+    certify,
+    margin_of,
+    warning,
+)
+from cosim.lab.live_run import LiveRun
+from cosim.record.run_directory import SUMMARY_FILE
+from noack.config.scenario import Scenario
+from noack.core.errors import NoackError
+
+T = TypeVar("T")
+
+ANSWER_S = 60.0
+"""So long a browser may take to answer: without a graphics card it may draw for seconds."""
+_GIVE_UP_S = 3.0
+"""So long the worker may go on with a call whose page does not want it any more."""
+_NICE = 10
+"""The worker yields to a live run and to the page."""
+
+
+class LabServices:
+    """The services of the page; a context, which ends the worker and a live run."""
+
+    def __init__(self, scenario: str, folder: Path, runs: Path) -> None:
+        self.scenario, self.folder, self.runs = scenario, folder, runs
+        self.live: LiveRun | None = None
+        self._pool = _new_pool()
+        self._turn = asyncio.Lock()
+        self._following: asyncio.Task[None] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _end(self._pool)
+        if self.live is not None:
+            self.live.stop()
+
+    @property
+    def known(self) -> Mapping[str, str]:
+        """Scenarios that the page offers, and what opens them."""
+        return known_scenarios(self.folder, self.scenario)
+
+    async def compute(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Call a function in the worker process, after the calls that were made before.
+
+        A cancelled call is not begun, or given up after a moment.
+
+        Raises: what the function raises.
+        """
+        try:
+            return await self._call(function, *arguments)
+        except BrokenProcessPool:  # killed, perhaps out of memory
+            self._replace_worker()
+            return await self._call(function, *arguments)
+
+    async def _call(self, function: Callable[..., T], *arguments: Any) -> T:
+        loop = asyncio.get_running_loop()
+        await self._turn.acquire()
+        call: asyncio.Future[T] = loop.run_in_executor(self._pool, function, *arguments)
+        call.add_done_callback(self._end_turn)
+        try:
+            # Shielded: Python 3.11 prints a traceback when a pool ends that has cancelled calls.
+            return await asyncio.shield(call)
+        except asyncio.CancelledError:
+            loop.call_later(_GIVE_UP_S, self._give_up, call)
+            raise
+
+    def _end_turn(self, call: asyncio.Future[Any]) -> None:
+        self._turn.release()
+        if not call.cancelled():
+            call.exception()  # perhaps nobody waits for it any more
+
+    def _give_up(self, call: asyncio.Future[Any]) -> None:
+        if not call.done():
+            self._replace_worker()
+
+    def _replace_worker(self) -> None:
+        """Begin a new worker process; a call in the old one is broken."""
+        old, self._pool = self._pool, _new_pool()
+        _end(old)
+
+    async def run_live(self, text: str, horizon_s: float, folder: Path) -> LiveRun:
+        """Start a live run, after the end of the one before."""
+        if self.live is not None:
+            await self.live.end()
+        self.live = LiveRun(horizon_s)
+        await self.live.start(text, folder, self.runs)
+        self._following = asyncio.create_task(self.live.follow())
+        return self.live
+
+    def recorded(self) -> list[str]:
+        """Return the names of the run directories, the newest first."""
+        with suppress(OSError):
+            found = [path for path in self.runs.iterdir() if (path / "scenario.toml").is_file()]
+            return sorted((one.name for one in found if not one.is_symlink()), reverse=True)
+        return []
+
+    def has_ended(self, name: str) -> bool:
+        """Whether a recorded run has a summary."""
+        return (self.runs / name / SUMMARY_FILE).is_file()
+
+
+class PageCalls:
+    """The computations that one page waits for."""
+
+    def __init__(self, services: LabServices) -> None:
+        self._services = services
+        self._calls: set[asyncio.Task[Any]] = set()
+
+    async def compute(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Call a function in the worker process.
+
+        Raises: what the function raises; CancelledError if the page is closed.
+        """
+        call = asyncio.create_task(self._services.compute(function, *arguments))
+        self._calls.add(call)
+        call.add_done_callback(self._calls.discard)
+        return await call
+
+    def give_up(self) -> None:
+        """Give all of them up: the page is closed."""
+        for call in self._calls:
+            call.cancel()
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """End a worker at once: it may compute for seconds."""
+    for worker in multiprocessing.active_children():
+        worker.kill()
+    pool.shutdown(wait=True)
+
+
+def _new_pool() -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_prepare)
+
+
+def _prepare() -> None:
+    """Yield to others, and load what is needed, so that the first answer is quick."""
+    os.nice(_NICE)
+    from cosim.interactive import ensemble, scenario_guarantee  # noqa: F401
+
+
+_QUIET_S = 0.15
+"""So long after the last change, what takes longer than a redraw is computed."""
+_MARGIN_S = 0.6
+_SLOW_S = 1.0
+"""Without a result for so long, the page says that it waits."""
+
+
+@dataclass
+class Session:
+    """The state of one page; :meth:`change` is called with each new draft."""
+
+    calls: PageCalls
+    draft: Draft
+    on_drawn: Callable[[], Awaitable[None]]
+    """Called when there is something new to draw."""
+    run: Exploration | None = None
+    ensemble: Ensemble | None = None
+    guarantee: Guarantee | None = None
+    margin: Margin | None = None
+    reference: Exploration | None = None
+    state: int = 0
+    mistakes: list[Mistake] = field(default_factory=list)
+    note: str = ""
+    """Why there is no run, or what its drawing leaves out."""
+    pending: str = ""
+    """In words: what is computed, or waits for the processor."""
+    redraw_ms: float = 0.0
+    _wanted: int = 0
+    _drawn: int = 0
+    _busy: bool = False
+    _later: asyncio.Task[None] | None = None
+
+    def end(self) -> None:
+        """Compute nothing more: the page was closed."""
+        if self._later is not None:
+            self._later.cancel()
+        self.calls.give_up()
+
+    async def change(self, draft: Draft) -> None:
+        """Take another draft; of several changes during a redraw only the newest is drawn."""
+        self.draft = draft
+        self._wanted += 1
+        if self._later is not None:
+            self._later.cancel()
+        if self._busy:
+            return
+        self._busy = True
+        try:
+            while self._drawn < self._wanted:
+                self._drawn = self._wanted
+                began_s = time.perf_counter()
+                await self._explore()
+                await self.on_drawn()
+                self.redraw_ms = 1e3 * (time.perf_counter() - began_s)
+        finally:
+            self._busy = False
+        self._later = asyncio.create_task(self._compute_rest())
+
+    @property
+    def warning(self) -> str:
+        """In words: whether the loop is unstable, and why nothing is guaranteed."""
+        return "" if self.run is None else warning(self.run, self.guarantee, self.margin)
+
+    def keep(self) -> None:
+        """Keep the run for comparison, or forget the one that was kept."""
+        self.reference = self.run if self.reference is None else None
+
+    def shown(self) -> Shown | None:
+        """Return what the figure shows; None without a run."""
+        if self.run is None:
+            return None
+        self.state = min(self.state, self.run.x.shape[1] - 1)
+        return Shown(self.run, self.state, self.ensemble, self.guarantee, self.reference)
+
+    async def _explore(self) -> None:
+        self.ensemble = self.guarantee = self.margin = None
+        self.mistakes, self.note = [], ""
+        try:
+            scenario = self.draft.scenario
+            if scenario.loops:
+                self.run, self.note = None, "a scenario of several loops: run it live"
+                return
+            if (why := why_not_exact(scenario)) is None:
+                self.run = explore(scenario)
+            else:
+                self.note = f"in virtual time, which takes about a second: {why}"
+                self.run = await self._compute("run", simulate_sampled, scenario)
+        except DraftError as error:
+            self.run, self.mistakes = None, error.mistakes
+        except NoackError as error:
+            self.run, self.note = None, str(error)
+        self.pending = "" if self.run is None else "computing: certificate"
+
+    async def _compute_rest(self) -> None:
+        """Compute what takes longer, once the settings have rested for a moment."""
+        if self.run is None:
+            return
+        await asyncio.sleep(_QUIET_S)
+        scenario = self.draft.scenario
+        try:
+            self.guarantee = await self._compute("certificate", certify, scenario)
+            await self.on_drawn()
+            if why_not_exact(scenario) is None:
+                self.ensemble = await self._compute("bands", explore_ensemble, scenario)
+                await self.on_drawn()
+            await asyncio.sleep(_MARGIN_S)
+            self.margin = await self._compute("margin", margin_of, scenario)
+        except NoackError as error:
+            self.note, self.pending = str(error), ""
+        await self.on_drawn()
+
+    async def _compute(self, what: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
+        """Compute a result, and say so; if it does not come soon, that it waits."""
+
+        async def say_waiting() -> None:
+            await asyncio.sleep(_SLOW_S)
+            self.pending = f"{what}: waiting for the processor"
+            await self.on_drawn()
+
+        self.pending = f"computing: {what}"
+        waiting = asyncio.create_task(say_waiting())
+        try:
+            found = await self.calls.compute(function, scenario)
+        finally:
+            waiting.cancel()
+        self.pending = ""
+        return found

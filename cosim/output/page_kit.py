@@ -1,0 +1,68 @@
+"""The kit of all HTML pages: templates in ``pages/``, with filters for values and figures.
+
+A page extends ``page.html.jinja`` and uses the macros for verdicts, tables and figures. All text is
+escaped; figures are drawn where they are used.
+"""
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from cosim.analysis.fidelity import is_against
+from cosim.output.figure_description import FigureDescription
+from cosim.output.figure_files import inline
+from cosim.output.run_tables import interval_text
+from noack.core.number_format import number, percent
+
+PAGES = Path(__file__).with_name("pages")
+_NONE = "–"
+_TONES = {"held": "good", "holds": "good", "violated": "bad", "void": "doubt"}
+
+
+@cache
+def templates(folder: Path = PAGES) -> Environment:
+    """Return the templates of a folder and of the kit."""
+    environment = Environment(
+        loader=FileSystemLoader([folder, PAGES]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters: dict[str, Any] = {
+        "tone": lambda word: _TONES.get(word, ""),
+        "inline": _markup,
+        "interval": interval_text,
+        "number": number,
+        "percent": percent,
+        "shown": value_text,
+        "words": words,
+    }
+    environment.filters |= filters
+    environment.tests["is_against"] = is_against
+    return environment
+
+
+def _markup(figure: FigureDescription) -> Markup:
+    return Markup(inline(figure))
+
+
+def words(key: str) -> str:
+    """Return a key as words."""
+    return str(key).replace("_", " ")
+
+
+def value_text(value: Any) -> str:
+    """Write a value of a JSON document as text."""
+    if value is None:
+        return _NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{words(key)} {value_text(entry)}" for key, entry in value.items())
+    return str(value)

@@ -1,0 +1,362 @@
+"""The report in a browser, for a screen reader, and with hostile input."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
+
+from cosim.analysis.replay.replay_result import difference
+from cosim.analysis.summary_model import RunSummary
+from cosim.cli import app
+from cosim.live import finalize as concluding
+from cosim.output import figure_files, report_page
+from cosim.output.figure_drawing import draw
+from cosim.output.figure_files import markup_of
+from cosim.output.figure_style import settings
+from cosim.output.report_page import Report, page, write_report
+from cosim.output.run_figures import BOUNDED, run_figures
+from cosim.record.run_directory import REPORT_FILE
+from cosim.record.run_ending import RunEnding
+from cosim.record.run_record import RunRecord
+from noack.config.scenario_file import dumps as scenario_toml
+from noack.core.errors import ExitStatus, MachineError
+from tests.cosim.output.conftest import HOSTILE, make_record, scenario_of
+from tests.cosim.record.changed_records import changed
+from tests.cosim.summaries import alone, summary_of
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+FIGURES = ["states", "errors", "state-norm", "input", "inter-event", "losses"]
+TIMED = ["lateness", "latency"]
+CLAIM = {
+    "what": "controller error", "source": "theorem T", "bound": "‖e_c‖ ≤ 5 β e^(−αt)",
+    "certified": 2.5, "observed": 0.4371, "ratio": 0.17484, "verdict": "held", "since_s": None,
+    "why": "", "from_s": 0.0, "until_s": None,
+}  # fmt: skip
+CLAIMS = [
+    CLAIM,
+    CLAIM | {"verdict": "void", "since_s": 3.25, "why": "7 consecutive losses"},
+    CLAIM | {"verdict": "violated", "certified": 0.011, "ratio": None},
+]
+
+
+class Page(HTMLParser):
+    """A strict parser: every element that opens must close, in order."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        assert len(dict(attrs)) == len(attrs), f"an attribute of {tag} is given twice"
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open, f"</{tag}> closes nothing"
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def attributes(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    def ids(self) -> list[str]:
+        return [attributes["id"] or "" for _, attributes in self.tags if "id" in attributes]
+
+
+def written(record: RunRecord, run_dir: Path, **more: Any) -> tuple[Page, RunSummary]:
+    """Write a report and check it."""
+    (run_dir / "scenario.toml").write_text(scenario_toml(record.scenario), encoding="utf-8")
+    summary = summary_of(record, **more)
+    html = write_report(alone(record), summary, run_dir).read_text(encoding="utf-8")
+    assert html.startswith("<!DOCTYPE html>")
+    parsed = Page(html)
+    check(parsed, html)
+    return parsed, summary
+
+
+def shown(record: RunRecord, **more: Any) -> str:
+    """The text of a report without figures, which take most of the time."""
+    html = page(Report(summary_of(record, **more), record.scenario, 0))
+    found = Page(html)
+    check(found, html)
+    return found.text
+
+
+def check(parsed: Page, html: str) -> None:
+    """Properties of every report."""
+    ids = parsed.ids()
+    assert len(ids) == len(set(ids))
+    tags = {tag for tag, _ in parsed.tags}
+    assert not tags & {"script", "link", "iframe", "object", "embed", "form", "base"}
+    for tag, attributes in parsed.tags:
+        for name, value in attributes.items():
+            assert not name.startswith("on"), (tag, name)
+            if name in ("src", "href", "action", "data", "srcset", "poster"):
+                assert value is not None
+                assert value.startswith(("#", "data:image/png")), value
+            if value is not None:
+                for found in re.findall(r"url\(([^)]*)\)", value):
+                    assert found.startswith("#"), found
+                for found in re.findall(r"(?:url\(|^)#([^)]+)", value if name != "style" else ""):
+                    assert found in ids, found
+    assert not re.search(r"@import|url\(", html.partition("<style>")[2].partition("</style>")[0])
+    for attributes in parsed.attributes("svg"):
+        assert attributes["role"] == "img"
+        assert attributes["aria-label"]
+    for attributes in parsed.attributes("img"):
+        assert attributes["alt"]
+    for attributes in parsed.attributes("th"):
+        assert attributes.get("scope") in ("col", "row")
+    assert parsed.attributes("html")[0]["lang"] == "en"
+    assert "undefined" not in parsed.text.lower()
+    assert len(html.encode()) < 2_000_000
+
+
+def figure_names(parsed: Page) -> list[str]:
+    return [(a["id"] or "").removeprefix("figure-") for a in parsed.attributes("figure")]
+
+
+def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path) -> None:
+    (tmp_path / "environment.json").write_text(
+        json.dumps({"started": "2020-01-02", "command": ["noack", "run"], "packages": {"a": "1.2"}})
+    )
+    parsed, summary = written(record, tmp_path, claims=CLAIMS)
+    assert figure_names(parsed) == FIGURES + TIMED
+    for claim in CLAIMS:
+        for key in ("what", "source", "bound", "verdict", "why"):
+            assert str(claim[key]) in parsed.text
+    for number in ("2.5", "0.4371", "17.5 %", "t = 3.25 s", "0.011"):
+        assert number in parsed.text
+    for assumption in summary.loops[0].assumptions:
+        assert assumption.what in parsed.text
+        assert assumption.why in parsed.text
+    assert scenario_toml(record.scenario) in parsed.text
+    claims = "claims: 1 of 3 held, 1 violated (controller error), 1 void (7 consecutive losses)"
+    assert claims in parsed.text
+    assert "live run, model-based, M − 1 = 2, started 2020-01-02" in parsed.text
+    assert "noack run" in parsed.text
+    assert "plant lateness" in parsed.text
+
+
+def test_the_report_of_a_simulated_run_has_no_lateness(record: RunRecord) -> None:
+    assert list(run_figures(record, timed=False)) == FIGURES
+    text = shown(record, kind="simulated", lateness_us={}, latency_us=None)
+    assert "simulated run" in text
+    assert "lateness" not in text
+
+
+def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
+    content["description"] = HOSTILE
+    scenario = scenario_of(content, 3, state_names=[HOSTILE, "_x", "$y$"], input_names=[HOSTILE])
+    parsed, _ = written(
+        make_record(scenario),
+        tmp_path,
+        exit={"status": 1, "reason": HOSTILE},
+        claims=[
+            CLAIM | dict.fromkeys(("what", "source", "bound", "why"), HOSTILE) | {"verdict": "void"}
+        ],
+        assumptions=[dict.fromkeys(("what", "source", "verdict", "why"), HOSTILE)],
+        assumption_violations=[dict.fromkeys(("process", "cause", "what"), HOSTILE) | {"t_s": 1.0}],
+        fidelity={"reason": HOSTILE},
+        replay={"bit_exact": None, "error": HOSTILE},
+        rejected_datagrams={HOSTILE: {HOSTILE: 3}},
+        missing_samples=1,
+        missing_by_table={HOSTILE: 1},
+    )
+    assert parsed.text.count(HOSTILE) >= 15
+    assert parsed.attributes("title") == [{}]
+
+
+def fidelity(**changed: Any) -> dict[str, Any]:
+    """A run's difference to the ideal loop, in the form of its summary."""
+    shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "residual": 0.0}
+    return {
+        "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
+        "rms_x_live": 2.0, "shares": shares, "events_ideal": 31, "events_live": 30,
+        "max_event_difference_s": 0.0125, "first_different_event": None, "reason": None,
+    } | changed  # fmt: skip
+
+
+def replayed(**changed: Any) -> dict[str, Any]:
+    found = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}
+    return found | changed
+
+
+def test_the_difference_to_the_ideal_loop_is_explained(record: RunRecord) -> None:
+    text = shown(record, fidelity=fidelity())
+    for sentence in (
+        "by 0.25 (RMS), 12 % of x itself, and by at most 0.5",
+        "explain the difference: the residual is 1e-07 % of the difference.",
+        "30 events, the ideal loop 31; the times of an event differ by at most 12.5 ms",
+        "An effect with a negative share",
+        "held actuation", "-42.0 %",
+    ):  # fmt: skip
+        assert sentence in text
+    assert "held_actuation" not in text
+    assert "Replay" not in text
+    shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "residual": 0.0}
+    text = shown(record, fidelity=fidelity(explained=False, explained_relative=0.4,
+                                           shares=shares, first_different_event=7))  # fmt: skip
+    assert "do not explain the difference" in text
+    assert "the residual is 40 % of the difference, which is too large" in text
+    assert "They agree up to event 7" in text
+    assert "negative share" not in text
+    nothing = {"reason": "the run diverged"}
+    assert "Not compared with the ideal loop: the run diverged." in shown(record, fidelity=nothing)
+
+
+def test_the_replay_has_a_section(record: RunRecord) -> None:
+    text = shown(record, replay=replayed())
+    assert "The 10,001 recorded inputs were replayed" in text
+    assert "bit for bit" in text
+    assert "gaps" not in text
+    other = difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0).model_dump()
+    text = shown(record, replay=replayed(bit_exact=False, complete=False, first_difference=other))
+    assert "differs from its record" in text
+    assert "plant_step row 7, x_1: another x: recorded 1.0" in text
+    assert "The record has gaps" in text
+    text = shown(record, replay={"bit_exact": None, "error": "KeyError('x')"})
+    assert "Nothing could be replayed: KeyError('x')." in text
+
+
+def test_a_section_without_data_is_left_out(record: RunRecord) -> None:
+    text = shown(record)
+    assert not any(heading in text for heading in ("Fidelity", "Replay", "Claims"))
+
+
+def lone(content: dict[str, Any], *present: str) -> RunRecord:
+    """A run with only these tables."""
+    record = make_record(scenario_of(content))
+    rows = {t: record[t][: None if t in present else 0] for t in record.tables}
+    return changed(record, rows)
+
+
+CASES = {
+    "empty": lone,
+    "two steps": lambda content: make_record(scenario_of(content | {"horizon_s": 0.002})),
+    "diverged": lambda content: make_record(scenario_of(content), largest=np.inf),
+    "plant only": lambda content: lone(content, "plant_step"),
+    "deliveries only": lambda content: lone(content, "controller_delivery"),
+    "forty states": lambda content: make_record(scenario_of(content, 40)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_run_gets_a_report(case: str, content: dict[str, Any]) -> None:
+    record = CASES[case](content)
+    drawn = [describe() for describe in run_figures(record).values()]
+    assert [one.name for one in drawn] == FIGURES + TIMED
+    with settings():
+        for one in drawn:
+            draw(one).draw_without_rendering()
+    shown(record)
+
+
+@pytest.mark.parametrize(
+    ("exit_", "message"),
+    [
+        ({"status": 0, "reason": "horizon"}, "completed 1 s"),
+        ({"status": 1, "reason": "plant died"}, "failed after 1 s of 1 s: plant died"),
+    ],
+)
+def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], message: str) -> None:
+    assert message in shown(record, exit=exit_).partition("Key numbers")[0]
+
+
+def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:
+    t_s = np.linspace(0, 1, 50)
+    envelopes: list[Any] = [
+        ("a", "e_c", t_s, 1 + t_s, "identity"),
+        ("b", "x", t_s, t_s, "certified"),
+        ("c", "inter_event", t_s, t_s, "printed"),
+    ]
+    found = {
+        name: [label for label, *_ in "abc" if label in labels_of(draw(describe()))]
+        for name, describe in run_figures(record, envelopes).items()
+    }
+    assert {name: labels for name, labels in found.items() if labels} == dict(
+        zip(BOUNDED, (["a"], ["b"], ["c"]), strict=True)
+    )
+
+
+def labels_of(figure: Figure) -> list[str]:
+    legends = [axes.get_legend() for axes in figure.axes]
+    return [text.get_text() for legend in legends if legend for text in legend.get_texts()]
+
+
+def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
+    figure = Figure(figsize=(2, 1))
+    figure.add_axes((0, 0, 1, 1))
+    assert not Page(markup_of(figure, "small", 'named "so"')).attributes("img")
+    monkeypatch.setattr(figure_files, "_HEAVY_CHARACTERS", 10)
+    (image,) = Page(markup_of(figure, "large", 'named "so"')).attributes("img")
+    assert image["alt"] == 'named "so"'
+    assert (image["src"] or "").startswith("data:image/png;base64,")
+
+
+def test_a_report_that_cannot_be_written_gives_one_line(
+    record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_page, "run_figures", lambda *_, **options: {})
+    (tmp_path / REPORT_FILE).mkdir()
+    with pytest.raises(MachineError, match=r"report\.html: cannot be written"):
+        written(record, tmp_path)
+
+
+@pytest.fixture
+def dead_run(content: dict[str, Any], tmp_path: Path) -> Path:
+    """The directory of a run in which all processes died before they recorded anything."""
+    (tmp_path / "scenario.toml").write_text(scenario_toml(scenario_of(content)), encoding="utf-8")
+    return tmp_path
+
+
+def test_a_failed_report_does_not_fail_the_run(
+    dead_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("no such luck")
+
+    monkeypatch.setattr(report_page, "write_report", fail)
+    outcome = concluding.finalize(RunEnding(dead_run, 0, ExitStatus.OK, "horizon"))
+    assert "report" not in outcome.reason
+    assert (dead_run / "summary.json").is_file()
+    assert not (dead_run / REPORT_FILE).exists()
+    assert capsys.readouterr().err == "noack: warning: no report.html: no such luck\n"
+
+
+def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: Path) -> None:
+    """Also for a run that has not been finalized."""
+    ran = CliRunner().invoke(app, ["report", str(dead_run), "--json"])
+    assert ran.exit_code == 0, ran.output
+    path = dead_run / REPORT_FILE
+    assert json.loads(ran.stdout) == {"report": str(path)}
+    parsed = Page(path.read_text(encoding="utf-8"))
+    assert "the launcher ended early" in parsed.text
+    path.write_text("as it was")
+    assert CliRunner().invoke(app, ["report", str(dead_run)]).stdout == f"{path}\n"
+    assert path.read_text() == "as it was"
+    assert CliRunner().invoke(app, ["report", str(dead_run), "--again"]).exit_code == 0
+    assert Page(path.read_text(encoding="utf-8")).text == parsed.text
+
+
+def test_the_command_reports_what_is_wrong(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert ran.exit_code == 2
+    assert ran.stderr == f"noack: {tmp_path}: not a run directory (no scenario.toml)\n"
