@@ -9,9 +9,8 @@ import sys
 from pathlib import Path
 
 from cosim.live.simulated_run import simulate_run
-from cosim.record.environment import write_environment
-from cosim.record.loop_rows import with_loop
-from cosim.record.run_directory import RECORD
+from cosim.record.record_source import with_loop
+from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.resolution import run_tables
 from noack.config.scenario_file import load

@@ -318,7 +318,7 @@ class Run:
 
     @cached_property
     def _envelopes(self) -> list[Any]:
-        from cosim.analysis.claims.claims_by_part import claims_of
+        from cosim.analysis.claims.claim_evaluation import claims_of
 
         return claims_of(self._record).envelopes()
 

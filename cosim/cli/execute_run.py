@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from cosim.live.fork_server import ForkServer
     from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
-    from cosim.record.run_ending import RunEnding
+    from cosim.record.run_directory import RunEnding
     from noack.config.scenario import Scenario
 
 # All processes wait for the slowest one: modules not needed at the start are imported later.

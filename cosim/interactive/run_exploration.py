@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from cosim.analysis.value_reduction import decimate_all
 from cosim.interactive.exploration import (
     SAMPLED,
     Exploration,
@@ -18,7 +19,6 @@ from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.align import align_tables
 from cosim.record.data_frames import events, samples
-from cosim.record.decimate import decimate_all
 from cosim.record.run_record import load_record
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector

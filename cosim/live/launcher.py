@@ -24,15 +24,16 @@ from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.remote_hosts import RemoteStart
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.wait_limit import DEFAULT_S, WaitLimit
-from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     PROCESSES_FILE,
+    EndingFile,
+    RunEnding,
     active_run,
     new_run_dir,
     point_to_latest,
+    write_environment,
     write_scenario,
 )
-from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import require_equal_sizes, resolve_run, resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.packet_outcomes import updates_in
+from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (

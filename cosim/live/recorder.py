@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cosim.analysis.value_reduction import is_long
 from cosim.live.telemetry_recorder import Recorder
-from cosim.record.decimate import is_long
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from noack.core.errors import ExitStatus, MachineError
 from noack.protocol.machine_interface import RESTART, Notice

@@ -12,7 +12,7 @@ from cosim.live.claim_monitor import ClaimMonitor, Finding
 from cosim.live.process_tokens import ProcessTokens
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
-from cosim.record.process_reports import report_of, write_reports
+from cosim.record.processes import report_of, write_reports
 from cosim.record.run_record import Rows
 from noack.config.loops import loop_names
 from noack.config.parameter_changes import ParameterChange, change_notice

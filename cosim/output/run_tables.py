@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.model_comparison import linearisation_rows
+from cosim.analysis.run_summary import linearisation_rows
 from cosim.analysis.summary_model import (
     ChangePart,
     Claim,

@@ -12,28 +12,34 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.environment import Kind, kind_of
-from cosim.record.loop_rows import LoopTables, NetworkRows, count_of, with_loop
-from cosim.record.process_lives import Life, LifeNumbers, RowCounts, generations, lives_of
-from cosim.record.process_reports import (
+from cosim.record.processes import (
+    Life,
+    LifeNumbers,
+    RowCounts,
     entries_of_loop,
+    generations,
     joint_reports,
+    lives_of,
     report_entries,
     valid_reports,
 )
 from cosim.record.record_source import (
     BATCH_ROWS,
     DerivedRows,
+    LoopTables,
+    NetworkRows,
     RecordSource,
     RowsInMemory,
     Slice,
+    count_of,
     joined,
     packed,
     slices,
     with_columns,
+    with_loop,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
 from noack.config.loops import loop_names, loop_scenario, loop_sections, loops_of, phases_ns
 from noack.config.resolution import (
     LoopMatrices,

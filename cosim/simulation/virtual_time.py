@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import controllers_of
-from cosim.record.loop_rows import NetworkRows
+from cosim.record.record_source import NetworkRows
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.loops import loops_of, phases_ns

@@ -215,4 +215,4 @@ def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
 
 @lru_cache(maxsize=64)
 def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: float) -> ErrorGains:
-    return ErrorGains(*map(matrix_of, (H, K, weight)), alpha_per_s)
+    return ErrorGains(matrix_of(H), matrix_of(K), matrix_of(weight), alpha_per_s)

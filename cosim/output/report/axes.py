@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.ticker import LogFormatter
 
+from cosim.analysis.value_reduction import Reals, decimate
 from cosim.output import palette
 from cosim.output.report.figure_layout import layout as layout
 from cosim.output.report.figure_style import NotebookFigure, printed
-from cosim.record.decimate import Reals, decimate
 
 BoundKind = Literal["certified", "identity", "printed"]
 """Source of a bound: a certificate, identity (I1), or a formula of the paper."""

@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from cosim.analysis.value_reduction import Reals
 from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import printed, styled
-from cosim.record.decimate import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER

@@ -10,7 +10,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cosim.analysis.over_time import LoopsOverTime, loops_over_time, quantiles
+from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary_model import RunSummary
 from cosim.output import palette
 from cosim.output.report import axes as draw

@@ -10,9 +10,9 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.analysis.claims.claims_by_part import claims_of
+from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.over_time import WorstLoop, worst_loop
+from cosim.analysis.network_summary import WorstLoop, worst_loop
 from cosim.analysis.summary_model import RunSummary
 from cosim.output.network_table import CAPTION, HEADINGS, badness, loop_row, network_rows
 from cosim.output.remarks import remarks

@@ -7,15 +7,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.analysis.quantile_sketch import QuantileSketch
-from cosim.analysis.timing_statistics import latency_us, lateness_parts
+from cosim.analysis.loop_statistics import latency_us, lateness_parts
+from cosim.analysis.value_reduction import QuantileSketch, Reals, decimate, decimate_all
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.clock_figure import ClockErrors, clock_errors, clock_figure
 from cosim.output.report.loss_figure import LossPanel, loss_figure
 from cosim.record.align import AlignedRun, aligned_parts
-from cosim.record.decimate import Reals, decimate, decimate_all
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S

@@ -16,11 +16,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cosim.analysis.fidelity import Fidelity
-from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.value_reduction import QuantileSketch, Reals
 from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_style import PAPER, NotebookFigure, printed, styled
-from cosim.record.decimate import Reals
 
 Flags = NDArray[np.bool_]
 

@@ -29,7 +29,8 @@ from matplotlib import colormaps
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from cosim.analysis.over_time import QUANTILES, WorstLoop, quantiles
+from cosim.analysis.network_summary import QUANTILES, WorstLoop, quantiles
+from cosim.analysis.value_reduction import Reals, is_long
 from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
@@ -39,9 +40,7 @@ from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import LoopView
 from cosim.output.viewer.recording_file import Nanoseconds, RecordingFile
 from cosim.output.viewer.recording_text import about
-from cosim.record.decimate import Reals, is_long
-from cosim.record.environment import Kind
-from cosim.record.run_directory import RECORDING_FILE
+from cosim.record.run_directory import RECORDING_FILE, Kind
 from noack.config.loops import loop_names, phases_ns
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-from cosim.analysis.over_time import worst_loop
+from cosim.analysis.network_summary import worst_loop
 from cosim.analysis.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import logged_port

@@ -1,7 +1,7 @@
 """The viewer's text about a loop, in Markdown."""
 
 from cosim.output.viewer.pictures.network_picture import LEG_S
-from cosim.record.environment import Kind
+from cosim.record.run_directory import Kind
 from noack.config.scenario import Scenario
 
 

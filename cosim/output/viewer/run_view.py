@@ -8,8 +8,9 @@ from shutil import disk_usage
 
 import numpy as np
 
-from cosim.analysis.over_time import loops_over_time, worst_loop
+from cosim.analysis.network_summary import loops_over_time, worst_loop
 from cosim.analysis.summary_model import RunSummary
+from cosim.analysis.value_reduction import is_long
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_recording import ERROR, PICTURED, SIZE, NetworkRecording
 from cosim.output.viewer.pictures.network_picture import NetworkDiagram
@@ -18,9 +19,7 @@ from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.recording_text import about
 from cosim.output.viewer.table_feed import ViewFeed, log_level
-from cosim.record.decimate import is_long
-from cosim.record.environment import Kind
-from cosim.record.run_directory import RECORDING_FILE, file_of_loop
+from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario import Scenario

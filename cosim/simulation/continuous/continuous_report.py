@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.record.divergence import Divergence, divergence
+from cosim.record.run_events import Divergence, divergence
 from cosim.simulation.continuous.continuous_loop import Samples, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import (
     MAX_EVENTS,

@@ -9,13 +9,13 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cosim.analysis.value_reduction import Reals
 from cosim.output import palette
 from cosim.output.report import axes as draw
 from cosim.output.report.figure_files import FIGURE_SUFFIXES, inline, save_drawn
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, align_tables
-from cosim.record.decimate import Reals
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

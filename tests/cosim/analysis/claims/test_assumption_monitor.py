@@ -9,9 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.condition_reader import (
+    AssumptionMonitor,
+    ConditionReader,
+    read_conditions,
+)
 from cosim.analysis.claims.observed_conditions import (
     CAUSES,
     CLOCK_CAUSES,

@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.claims_by_part import RunClaims
-from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
+from cosim.analysis.claims.condition_reader import (
+    AssumptionMonitor,
+    ConditionReader,
+    read_conditions,
+)
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import Claim, ClaimVerdict

@@ -17,9 +17,8 @@ from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefiniti
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, definitions
 from cosim.analysis.claims.run_evidence import RunPart
 from cosim.analysis.summary_model import Claim, ClaimVerdict
-from cosim.record.align import align_tables
+from cosim.record.align import UNKNOWN, align_tables
 from cosim.record.run_record import RunRecord
-from cosim.record.since_event import UNKNOWN
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

@@ -14,7 +14,7 @@ from matplotlib.legend import Legend
 from PIL import ImageColor
 
 import noack
-from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.value_reduction import QuantileSketch
 from cosim.output import palette
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind

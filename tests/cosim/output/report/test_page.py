@@ -20,8 +20,7 @@ from cosim.output.report.figure_files import inline
 from cosim.output.report.figure_style import settings
 from cosim.output.report.report_page import page, write_report
 from cosim.output.report.run_figures import BOUNDED, pictures
-from cosim.record.run_directory import REPORT_FILE
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError

@@ -12,9 +12,7 @@ from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.run_view import write_loop_view
 from cosim.record import decimate, run_record
-from cosim.record.environment import write_environment
-from cosim.record.run_directory import RECORDING_FILE, write_scenario
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import RunRecord, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
