@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.record_source import RecordSource, Rows, slices
+from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
@@ -155,7 +155,7 @@ def valid_reports(
     return reports, earlier
 
 
-_COLUMNS = ("input", "now_ns")
+LIFE_COLUMNS = ("input", "now_ns")
 
 
 class RowCounts(NamedTuple):
@@ -271,15 +271,17 @@ class _Counts:
 
 
 def lives_of(
-    source: RecordSource,
+    parts: Iterable[Slice],
     tables: Sequence[str],
     numbers: LifeNumbers,
     reports: Mapping[int, Mapping[str, Any]],
-    width_ns: int,
 ) -> list[Life]:
-    """Return the generations of one process from its tables; ``reports`` are by generation."""
+    """Return the generations of one process from the parts of its tables, with ``LIFE_COLUMNS``.
+
+    ``reports`` are by generation.
+    """
     counts = [_Counts(generation, tables) for generation in numbers.begun]
-    for part in slices(source, tables, width_ns, _COLUMNS):
+    for part in parts:
         if len(counts) == 1:
             counts[0].add(part)
             continue

@@ -132,14 +132,6 @@ def slices(
     before the part's end. The ends are multiples of ``width_ns``; intervals without rows are
     omitted.
     """
-    if all(source.count(table) <= BATCH_ROWS for table in tables):
-        parts = {table: [*source.batches(table, columns)] for table in tables}
-        if any(parts.values()):
-            yield {
-                table: joined(found, with_columns(source.types[table], columns))
-                for table, found in parts.items()
-            }
-        return
     readers = {table: _TableReader(source, table, columns) for table in tables}
     end_ns: int | None = None
     while True:

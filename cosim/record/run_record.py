@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.processes import (
+    LIFE_COLUMNS,
     Life,
     LifeNumbers,
     RowCounts,
@@ -139,8 +140,15 @@ class RunRecord:
 
         A part holds at most ``BATCH_ROWS`` steps of the plant; a short run is one part.
         """
-        columns = (*columns, "now_ns") if columns else ()
-        return slices(self.source, tables or [*self.tables], self._slice_ns, columns)
+        names, columns = tables or [*self.tables], (*columns, "now_ns") if columns else ()
+        if any(self.count(table) > BATCH_ROWS for table in names):
+            yield from slices(self.source, names, self._slice_ns, columns)
+        elif any(map(self.count, names)):
+            types = {table: with_columns(self.source.types[table], columns) for table in names}
+            yield {
+                table: joined([*self.source.batches(table, columns)], dtype)
+                for table, dtype in types.items()
+            }
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -184,10 +192,9 @@ class RunRecord:
     def lives(self, role: str) -> list[Life]:
         """The generations of a process, in order."""
         if role not in self._lives:
-            self._lives[role] = lives_of(
-                self.source, self.owned_by(role), self.life_numbers(role), self._reports_of(role),
-                self._slice_ns,
-            )  # fmt: skip
+            tables, reports = self.owned_by(role), self._reports_of(role)
+            parts = self.slices(*tables, columns=LIFE_COLUMNS)
+            self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
         return self._lives[role]
 
     def row_counts(self, role: str) -> list[RowCounts]:
