@@ -26,8 +26,8 @@ from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 
 ROUNDS = 5
 _RTOL = 1e-10

@@ -57,7 +57,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
-from plant_server.watchdog import too_old
+from plant_server.plant import too_old
 
 _STEPS = {
     "plant": PLANT_STEP,

@@ -43,9 +43,9 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.kept_loss import expected_loss
+from noack.impairments.loss_prediction import expected_loss
+from noack.plants.plant_settings import PlantSystem
 from noack.plants.systems.plant_linearisation import linearise
-from noack.plants.systems.plant_system import PlantSystem
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -56,7 +56,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.theory.assumptions import assumptions
+from noack.theory.certificates.assumptions import assumptions
 from plant_server.plant import system_of
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from cosim.measurement.trace_sources import read_source
-from noack.traces.shipped_traces import find_trace
+from noack.traces.trace_formats import find_trace
 
 
 def measure(

@@ -15,7 +15,7 @@ from noack.config.parameter_changes import (
 from noack.config.scenario import MOST_CHANGES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.kept_loss import found_probabilities
+from noack.impairments.loss_prediction import found_probabilities
 from noack.runtime.control_messages import ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket

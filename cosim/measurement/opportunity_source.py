@@ -14,8 +14,7 @@ from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
-from noack.impairments.link_records import NEVER_NS
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 
 _LINES = re.compile(rb"(?:[0-9]{1,15}[ \t]*\r?\n)+[0-9]{0,15}")

@@ -11,9 +11,8 @@ from cosim.measurement.opportunity_source import is_opportunity_file, read_oppor
 from cosim.measurement.run_source import read_run
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
-from noack.traces.capture_blocks import is_capture
-from noack.traces.capture_numbers import SequenceField
-from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.capture_packets import is_capture
+from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace
 

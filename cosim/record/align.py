@@ -34,7 +34,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.identities import MissedEvents, missed_sum
+from noack.theory.paper.error_bounds import MissedEvents, missed_sum
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]

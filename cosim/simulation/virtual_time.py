@@ -6,23 +6,21 @@ live run in which no deadline is missed. It depends on its scenario alone, bit f
 of the network couple the loops.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows
+from cosim.record.record_source import NetworkRows, without_loop
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
-from noack.config.resolution import network_tables, resolve, tables_of
+from noack.config.resolution import has_loop, network_tables, resolve, shape_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
-from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import NEVER_NS
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
@@ -97,18 +95,10 @@ class VirtualRun:
         network: Network | None = None,
     ) -> None:
         self._scenario = scenario
-        self.groups: Sequence[Sequence[int]] = [*_groups(loops)]
-        """The numbers of the loops whose rows have the same columns."""
-        self.phases_ns = phases = phases_ns(scenario)
+        self.phases_ns = phases_ns(scenario)
         """When each loop begins."""
-        self.machines = [
-            {
-                role: make([loops[k] for k in numbers], [phases[k] for k in numbers], numbered=True)
-                for role, make in _ROLES.items()
-            }
-            for numbers in self.groups
-        ]
-        """The machines of each group of loops whose rows have the same columns, by role."""
+        self.machines = {role: make(loops, self.phases_ns) for role, make in _ROLES.items()}
+        """The machines of all loops, by role."""
         self.channel = channel_of(scenario, loops=len(loops), network=network)
         self.record = RecordCollector()
         self.core: Any = self._new_core(len(loops))
@@ -132,11 +122,9 @@ class VirtualRun:
             elif simulation.asking == core.NOACK_NETWORK:
                 self.channel.answer(reason)
             elif reason == core.NOACK_ROWS_FULL:
-                role = [*_ROLES][simulation.asking]
-                self._take(simulation.asking_group, role)
+                self._take([*_ROLES][simulation.asking])
             else:
-                role = [*_ROLES][simulation.asking]
-                self.machines[simulation.asking_group][role].answer(reason)
+                self.machines[[*_ROLES][simulation.asking]].answer(reason)
         self._take_all()
 
     def announce(self) -> None:
@@ -147,21 +135,16 @@ class VirtualRun:
         """
         changes = scheduled(self._scenario)
         for role in CHANGEABLE:
+            announcing = self.channel if role == "netem" else self.machines[role]
             for change in changes:
-                if role == "netem":
-                    for output in self.channel.announce(change, 0):
-                        self.record.take(role, output)
-                    continue
-                for group, machines in enumerate(self.machines):
-                    for output in machines[role].announce(change, 0):
-                        self.record.take(role, self._of_run(group, output))
+                for output in announcing.announce(change, 0):
+                    self.record.take(role, output)
         for change in changes:
             self.record.take(RECORDER, change_notice(change))
 
     def reception(self, role: str, loop: int, *, acknowledges: bool = False) -> dict[str, Any]:
         """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
-        place = self.core.of_loop[loop]
-        machine = self.machines[place.group][role].machines[place.place].machine
+        machine = self.machines[role].machines[loop].machine
         counts = machine.acknowledgements if acknowledges else machine.received
         rejected = zip(Rejection, counts.rejected, strict=True)
         return {
@@ -172,22 +155,13 @@ class VirtualRun:
     def _new_core(self, loops: int) -> Any:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
-        numbers = [ffi.new("int64_t[]", one) for one in self.groups]
-        groups = ffi.new("noack_loop_group[]", len(self.groups))
-        of_loop = ffi.new("noack_loop_place[]", loops)
-        for number, (group, machines) in enumerate(zip(groups, self.machines, strict=True)):
-            group.processes = [one.core for one in machines.values()]
-            group.numbers = numbers[number]
-            for place, loop in enumerate(self.groups[number]):
-                of_loop[loop] = (number, place)
         simulation = ffi.new("noack_simulation *", {
-            "groups": len(groups), "loops": loops, "of_group": groups, "of_loop": of_loop,
+            "loops": loops, "processes": [machines.core for machines in self.machines.values()],
             "channel": self.channel.core, "wire": {"run_id": RUN_ID},
             "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
             "steps_left": _INPUTS_PER_PROGRESS,
         })  # fmt: skip
         core.noack_wire_key(ffi.addressof(simulation, "wire"), key)
-        self._kept = numbers, groups, of_loop
         self._sent = ffi.new("noack_sent_datagram[]", _SENT_PLACES)
         simulation.sent, simulation.sent_places = self._sent, _SENT_PLACES
         return simulation
@@ -202,32 +176,18 @@ class VirtualRun:
         self._sent = simulation.sent = larger
         simulation.sent_places, simulation.sent_first = 2 * places, 0
 
-    def _take(self, group: int, role: str) -> None:
-        """Take the rows and notices of machines."""
-        machines, numbers = self.machines[group][role], np.array(self.groups[group])
-        for table, rows in machines.take_rows():
-            if len(self.groups) > 1:
-                rows[LOOP] = numbers[rows[LOOP]]
+    def _take(self, role: str) -> None:
+        """Take the rows and notices of the machines of a role."""
+        for table, rows in self.machines[role].take_rows():
             self.record.extend(table, rows)
-        for notice in machines.take_notices():
-            self.record.take(role, self._of_run(group, notice))
+        for notice in self.machines[role].take_notices():
+            self.record.take(role, notice)
 
     def _take_all(self) -> None:
-        for group, machines in enumerate(self.machines):
-            for role in machines:
-                self._take(group, role)
+        for role in self.machines:
+            self._take(role)
         for table, rows in self.channel.take_rows():
             self.record.extend(table, rows)
-
-    def _of_run(self, group: int, output: Record | Notice) -> Record | Notice:
-        """Return an output of a group with the number that its loop has in the run."""
-        numbers = self.groups[group]
-        if isinstance(output, Notice):
-            return output if output.loop is None else output._replace(loop=numbers[output.loop])
-        if len(self.groups) == 1:
-            return output
-        place, *row = output.row
-        return Record(output.table, (numbers[place], *row))
 
 
 def simulate(
@@ -272,19 +232,19 @@ def _simulated(
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
     packets = NetworkRows(of_network, run.phases_ns)
-    own = [dict[str, Rows]() for _ in loops]
-    for numbers in run.groups:
-        for table, dtype in tables_of(loops[numbers[0]]).items():
-            if OWNER[table] != "netem":
-                rows = run.record.rows(table, np.dtype([(LOOP, "<u2"), *dtype.descr]))
-                for number, of_loop in _split(rows, dtype, numbers):
-                    own[number][table] = of_loop
+    by_loop = {
+        table: _split(run.record.rows(table, dtype), len(loops))
+        for table, dtype in row_types(map(shape_of, loops)).items()
+        if has_loop(table)
+    }
     records = []
     for number, loop in enumerate(loops):
-        found = own[number] | packets.of_loop(number)
+        found = packets.of_loop(number)
+        found |= {table: rows[number] for table, rows in by_loop.items()}
         # Nothing in virtual time compares clocks: these tables are empty.
         tables = {
-            table: found.get(table, np.zeros(0, dtype)) for table, dtype in tables_of(loop).items()
+            table: without_loop(found[table], dtype) if table in found else np.zeros(0, dtype)
+            for table, dtype in tables_of(loop).items()
         }
         reports = _reports(run, tables, scenario, number)
         notices = run.record.notices(number)
@@ -297,31 +257,14 @@ def _simulated(
     return RecordedRun(common, records)
 
 
-def _groups(loops: Sequence[Scenario]) -> Iterator[list[int]]:
-    """Yield the numbers of the loops whose rows have the same columns."""
-    groups: list[tuple[Mapping[str, np.dtype[np.void]], list[int]]] = []
-    for number, loop in enumerate(loops):
-        types = tables_of(loop)
-        same = next((numbers for known, numbers in groups if known == types), None)
-        if same is None:
-            groups.append((types, [number]))
-        else:
-            same.append(number)
-    yield from (numbers for _, numbers in groups)
-
-
-def _split(
-    rows: Rows, dtype: np.dtype[np.void], numbers: Sequence[int]
-) -> Iterator[tuple[int, Rows]]:
-    """Yield the number and the rows of each loop, without the column of its number."""
-    loops = rows[LOOP]
-    order = np.argsort(loops, kind="stable") if len(numbers) > 1 else slice(None)
-    counts = np.bincount(loops, minlength=max(numbers) + 1)
+def _split(rows: Rows, loops: int) -> list[Rows]:
+    """Return the rows of each loop, without the column of its number."""
+    numbers = rows[LOOP]
+    is_sorted = bool((numbers[1:] >= numbers[:-1]).all())
+    order = slice(None) if is_sorted else np.argsort(numbers, kind="stable")
     data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
-    own = np.ascontiguousarray(data).view(dtype).reshape(-1)
-    ends = [*accumulate(counts.tolist(), initial=0)]
-    for number in numbers:
-        yield number, own[ends[number] : ends[number + 1]]
+    own = np.ascontiguousarray(data).view(np.dtype(rows.dtype.descr[1:])).reshape(-1)
+    return np.split(own, np.cumsum(np.bincount(numbers, minlength=loops))[:-1])
 
 
 def _reports(

@@ -86,7 +86,7 @@ static double climb(
     lanes y, dy;
     value_and_slope(curve, p, low_s, &y, &dy);
     double low = dot(y, dy) + rate * dot(y, y);
-    double best = sqrt(dot(y, y)) * exp(rate * low_s);
+    double best = sqrt(dot(y, y)) * fixed_exp(rate * low_s);
     *at_s = low_s;
     value_and_slope(curve, p, high_s, &y, &dy);
     double high = dot(y, dy) + rate * dot(y, y);
@@ -96,7 +96,7 @@ static double climb(
         if (low > 0.0 && 0.0 > high)
             s = low_s + (high_s - low_s) * (low / (low - high));
         value_and_slope(curve, p, s, &y, &dy);
-        double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * exp(rate * s);
+        double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * fixed_exp(rate * s);
         int rises = slope > 0.0 && size >= best;
         *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);
@@ -174,7 +174,7 @@ static double passed_at(
     int p = degree_for(memory->reach_s, end_s);
     for (int i = 0; i < halvings; i++) {
         double s = 0.5 * (low_s + high_s);
-        double level = phase->threshold * exp(-phase->rate_per_s * s);
+        double level = phase->threshold * fixed_exp(-phase->rate_per_s * s);
         if (is_within(state_at(memory, p, s), limit, level))
             low_s = s;
         else

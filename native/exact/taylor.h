@@ -99,7 +99,7 @@ static void find_reaches(exact_memory *memory) {
         memory->reach_s[i] = memory->measured_s[i] = left_out == 0.0 ? INFINITY : 0.0;
         if (left_out != 0.0 && left_out < INFINITY) {
             double most_s = z > 0.0 ? (p + 2) / (2.0 * z) : INFINITY;
-            double carried_s = exp(log(NEGLIGIBLE / left_out) / (p + 1));
+            double carried_s = fixed_exp(noack_log(NEGLIGIBLE / left_out) / (p + 1));
             memory->reach_s[i] = least(carried_s, most_s);
             memory->measured_s[i] = least(carried_s * LESS_STRICT[i], most_s);
         }

@@ -33,7 +33,7 @@ from noack.config.scenario_changes import with_settings
 from noack.config.sections.network_section import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.constraints import guarantee_of
+from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
@@ -174,7 +174,7 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
 
 def _window(direction: DirectionSection) -> LossWindow:
     link = direction.link
-    windows = guarantee_of(link.mansd, link.constraints).windows
+    windows = join_guarantee(link.mansd, link.constraints).windows
     return min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
 
 

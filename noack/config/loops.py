@@ -5,7 +5,7 @@ that time of the run.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,8 @@ from noack.trigger.periodic_trigger import PeriodicSettings
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
 
+PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
+"""Keys of a scenario that each loop has for itself."""
 _KINDS: Mapping[str, tuple[str, ...]] = {
     "model": ("name", "A", "file"),
     "plant": (),
@@ -78,7 +80,7 @@ def with_loop_tables(
 
     ``change`` gets the place of an entry, e.g. ``loops.0``, and the scenario of its loops. It
     returns the new tables by their places, e.g. ``plant.system``; only those of tables that the
-    entry sets itself are used.
+    entry sets itself, or that its scenario file has, are used.
     """
     sections = []
     for place, section in enumerate(scenario.loops or ()):
@@ -89,6 +91,9 @@ def with_loop_tables(
             content = table.model_dump(mode="json", exclude_none=True)
             if (own := getattr(section, part)) is not None and (not inner or inner in own):
                 update[part] = own | {inner: content} if inner else content
+            elif part in (file := update.get("scenario", section.scenario) or {}):
+                own = file[part] | {inner: content} if inner else content
+                update["scenario"] = file | {part: own}
         sections.append(section.model_copy(update=update))
     return scenario.model_copy(update={"loops": tuple(sections) or None})
 
@@ -99,43 +104,46 @@ def loop_scenario(scenario: "Scenario", section: LoopSection) -> "Scenario":
     Raises:
         ValueError: it is not valid; the message begins with the key within the entry.
     """
+    loop = scenario.model_copy(update={"loops": None})
+    if isinstance(section.scenario, str):
+        raise ValueError("scenario: it is read where a scenario file is loaded; give tables here")
+    if section.scenario is not None:
+        loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
     content: dict[str, Any] = {} if section.mode is None else {"mode": section.mode}
     for part, kinds in _KINDS.items():
         if (given := getattr(section, part)) is None:
             continue
-        own = getattr(scenario, part)
+        own = getattr(loop, part)
         template = {} if own is None else own.model_dump(mode="json", exclude_none=True)
         content[part] = given if any(kind in given for kind in kinds) else template | given
-    if not content:
-        return scenario.model_copy(update={"loops": None})
-    model = _parts_model(type(scenario), frozenset(content))
-    try:
-        parts = model.model_validate_json(json.dumps(content))
-    except ValidationError as error:
-        raise ValueError(explain(error, "", model)[0].removeprefix(": ")) from None
-    update = {part: getattr(parts, part) for part in content}
-    loop = scenario.model_copy(update=update | {"loops": None})
-    check_sections(loop)
-    check_changes(loop)
+    if content:
+        loop = _with_parts(loop, content, content)
+    if content or section.scenario is not None:
+        check_sections(loop)
+        check_changes(loop)
     return loop
+
+
+def _with_parts(
+    scenario: "Scenario", content: Mapping[str, Any], parts: Iterable[str], place: str = ""
+) -> "Scenario":
+    """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
+    model = _parts_model(type(scenario), frozenset(parts))
+    try:
+        found = model.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise ValueError(place + explain(error, "", model)[0].removeprefix(": ")) from None
+    return scenario.model_copy(update={part: getattr(found, part) for part in parts})
 
 
 def check_loops(scenario: "Scenario") -> None:
     """Raise ValueError unless the loops can run together; the message begins with the key."""
     names: dict[str, int] = {}
-    rates: dict[str, float] = {}
     for place, section in enumerate(scenario.loops or ()):
         try:
-            loop = loop_scenario(scenario, section)
+            loop_scenario(scenario, section)
         except ValueError as error:
             raise ValueError(f"loops.{place}.{error}") from None
-        rates = rates or _rates(loop)
-        for key, value in _rates(loop).items():
-            if value != rates[key]:
-                raise ValueError(
-                    f"loops.{place}.{key}: should be {rates[key]:g}, as for loops.0: all loops "
-                    "have the same periods"
-                )
         for name in section.names:
             if name in names:
                 raise ValueError(
@@ -144,14 +152,6 @@ def check_loops(scenario: "Scenario") -> None:
             names[name] = place
         if len(names) > MOST_LOOPS:
             raise ValueError(f"loops.{place}.count: a run has at most {MOST_LOOPS} loops")
-
-
-def _rates(loop: "Scenario") -> dict[str, float]:
-    return {
-        "plant.rate_hz": loop.plant.rate_hz,
-        "plant.measure_every": loop.plant.measure_every,
-        "controller.rate_hz": loop.controller.rate_hz,
-    }
 
 
 def _period_ns(loop: "Scenario") -> int:

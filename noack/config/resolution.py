@@ -18,7 +18,7 @@ from noack.config.setpoint import input_at
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
-from noack.observers.observability import unobservable_mode
+from noack.observers.observer_settings import unobservable_mode
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,
@@ -224,18 +224,6 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
         table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
         for table, dtype in tables(**asdict(largest(shapes))).items()
     }
-
-
-def require_equal_sizes(scenario: Scenario) -> None:
-    """Raise CallerError if the vectors of a live run's loops have different sizes."""
-    first, *others = (shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario))
-    for place, one in enumerate(others, 1):
-        if one != first:
-            raise CallerError(
-                f"loops.{place}: its vectors have other sizes than those of loops.0; the loops of "
-                "a live run have the same numbers of states, inputs and outputs (`noack simulate` "
-                "allows different ones)"
-            )
 
 
 def has_loop(table: str) -> bool:

@@ -62,18 +62,18 @@ class Scenario(ScenarioSection):
     """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
     the measurement must be the state."""
     network: NetworkSection
-    controller: AnyController = LinearFeedbackSettings()
-    certificate: CertificateSection = CertificateSection()
+    controller: AnyController = LinearFeedbackSettings.model_construct()
+    certificate: CertificateSection = CertificateSection.model_construct()
     clocks: ClocksSection | None = None
     """The clocks of a run on several hosts. Without it, claims assume one clock."""
-    recovery: RecoverySection = RecoverySection()
+    recovery: RecoverySection = RecoverySection.model_construct()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """Changes of settings during the run, in the order of time."""
     loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None
     """The loops on the network, if there are several."""
-    seeds: SeedsSection = SeedsSection()
-    ports: PortsSection = PortsSection()
-    realtime: RealtimeSection = RealtimeSection()
+    seeds: SeedsSection = SeedsSection.model_construct()
+    ports: PortsSection = PortsSection.model_construct()
+    realtime: RealtimeSection = RealtimeSection.model_construct()
 
     def _rows(self) -> list[tuple[str, str]]:
         n, m = self.model.dimensions

@@ -6,8 +6,8 @@ import numpy as np
 
 from noack.config.setpoint import input_at
 from noack.core.clock import NS_PER_S
-from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.matrices import require_length, require_shape
 
@@ -22,8 +22,6 @@ def check_sections(scenario: "Scenario") -> None:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
         )
-    if scenario.clocks is not None and scenario.loops:
-        raise ValueError("clocks: not in a run of several loops")
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")

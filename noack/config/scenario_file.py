@@ -11,6 +11,7 @@ from typing import Any
 import tomli_w
 
 from noack.config import toml_file
+from noack.config.loop_files import with_named_scenarios
 from noack.config.loops import with_loop_tables
 from noack.config.matrix_files import with_matrices
 from noack.config.runtime_parameters import SHORT, full_key
@@ -60,6 +61,7 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
     """
     source = source or str(path)
     content = with_matrices(content, path.parent, source)
+    content = with_named_scenarios(content, path.parent, source)
     return _with_files(validate(content, source), path, source)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, discretise
-from noack.observers.estimation_model import EstimationModel
+from noack.observers.observer_settings import EstimationModel
 
 
 class SteadyState(NamedTuple):

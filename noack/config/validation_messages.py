@@ -96,7 +96,7 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
     at = _locate(mistake["loc"], root)
     key = shortened(".".join(map(str, at.path)))
     value, kind = mistake["input"], mistake["type"]
-    shown = f"{key} = {_show(value)}"
+    shown = f"{key} = {show_value(value)}"
     if kind == "missing":
         return f"{key}: missing{_purpose(at.section, str(at.path[-1]))}"
     if kind == "extra_forbidden":
@@ -220,7 +220,7 @@ def _own_check(key: str, value: Any, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
-        shown = f" = {_show(value)}" if isinstance(value, str) else ""
+        shown = f" = {show_value(value)}" if isinstance(value, str) else ""
         return f"{key}{shown}: {message}"
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
@@ -228,7 +228,7 @@ def _own_check(key: str, value: Any, message: str) -> str:
             value = value[int(part) if isinstance(value, list) else part]
         except (KeyError, IndexError, ValueError, TypeError):
             return f"{path}: {rest}"
-    return f"{path} = {_show(value)}: {rest}"
+    return f"{path} = {show_value(value)}: {rest}"
 
 
 def _choice(key: str, value: Any, at: _Place) -> str:
@@ -239,7 +239,7 @@ def _choice(key: str, value: Any, at: _Place) -> str:
     chosen = value[at.discriminator]
     close = difflib.get_close_matches(str(chosen), at.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    return f"{key} = {_show(chosen)}: must be one of {known}{hint}"
+    return f"{key} = {show_value(chosen)}: must be one of {known}{hint}"
 
 
 def _table_example(value: Any, at: _Place) -> str:
@@ -281,6 +281,7 @@ def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"
 
 
-def _show(value: Any) -> str:
+def show_value(value: Any) -> str:
+    """Return a value as JSON, cut off after 60 characters."""
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."

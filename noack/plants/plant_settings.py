@@ -1,4 +1,4 @@
-"""The settings that every kind of plant has.
+"""The interface of a system that a plant advances, and the settings that every kind of plant has.
 
 The loop uses x and u, the deviations from an operating point. The plant's own state z may have
 other coordinates, and more of them.
@@ -8,13 +8,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
 from pydantic import Field
 
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, NoackError
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.systems.plant_system import PlantSystem
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.section import ScenarioSection
 
@@ -24,6 +23,41 @@ Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
 Advance = Callable[[Vector, Vector, float, float], tuple[int, float]]
 """Advances z (N,) in place under a constant v from a time by a duration, in seconds; returns a
 status code of scipy's "dopri5", negative for a failure, and the time of the failure."""
+
+
+class SystemFailedError(NoackError):
+    """A system cannot continue; the message is one line that names the system."""
+
+
+class PlantSystem(Protocol):
+    """A system that holds its own state.
+
+    Its motion is a function of its start and of the steps since then: the same steps give the same
+    bits, so a run can be replayed.
+    """
+
+    @property
+    def x(self) -> Vector:
+        """The state of the loop: the deviation from the operating point, shape (n,)."""
+        ...
+
+    @property
+    def z(self) -> Vector:
+        """The system's own state, shape (N,); empty if x is the whole state."""
+        ...
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Advance from ``t_ns`` by ``dt_ns`` under the constant input ``u``.
+
+        Args:
+            u: deviation from the operating point's input, shape (m,).
+            t_ns: simulated time since the run's epoch.
+            dt_ns: length of the step.
+
+        Raises:
+            SystemFailedError: the system cannot continue; do not advance it again.
+        """
+        ...
 
 
 class PlantStart(NamedTuple):

@@ -167,7 +167,7 @@ class RunProcess:
         """How long to gather the ticks of many loops."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
-        period_ns = loops_of(self.scenario)[0].timing.plant_period_ns
+        period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
         return min(int(period_ns / _REST_SHARE / self.scenario.speed), _LONGEST_REST_NS)
 
     @contextmanager
@@ -289,7 +289,7 @@ class RunProcess:
     @property
     def _end_ns(self) -> int:
         """The last horizon of all loops."""
-        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns)
+        return self.scenario.timing.horizon_ns + max(self.phases_ns)
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""

@@ -24,7 +24,8 @@ _LEAST_RATE_HZ = 1e-9  # lowest rate; its period in nanoseconds fits into 64 bit
 class ScenarioSection(BaseModel):
     """A frozen table of a settings file that refuses unknown keys."""
 
-    # Validators are built at their first use, that of a scenario with those of all its tables.
+    # Validators are built at their first use, that of a scenario with those of all its tables. So
+    # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     @classmethod

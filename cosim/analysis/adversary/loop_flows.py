@@ -32,7 +32,7 @@ from cosim.simulation.sampled.sampled_loop import Numbers, Runs, SampledLoop, Sc
 from noack.core.core_library import core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _GRAMIAN_POINTS = 12
 _MEASURES = {

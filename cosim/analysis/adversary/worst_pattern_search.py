@@ -47,13 +47,12 @@ from cosim.simulation.sampled.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.core.random_streams import stream
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.enclosure import response
-from noack.theory.error_gains import ErrorGains, Output
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.enclosure import NotDecayingError, response
+from noack.theory.bounds.gains import ErrorGains, Output
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 
 NODES = 500_000
 BEAM = 512

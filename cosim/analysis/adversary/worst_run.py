@@ -32,8 +32,8 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
 from noack.disturbances.uniform import UniformDisturbance
 from noack.impairments.loss_guarantee import outcome_letters
-from noack.theory.certificate_terms import Constants
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _MOST_RESPONSES = 2000
 """With more values than this, successive ones have the same sign."""

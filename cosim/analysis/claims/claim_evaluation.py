@@ -8,7 +8,8 @@ reset to x. There are no claims in between.
 
 Such a part starts with an input of the part before: until the plant applies the first input of the
 new part, u was computed from older updates. ‖u − Kx‖ is recorded, and the certificate holds if it
-covers input errors of this size (:class:`noack.theory.scenario_certificates.CertificateScope`).
+covers input errors of this size; see ``CertificateScope`` in
+:mod:`noack.theory.certificates.scenario_certificates`.
 
 The processes of a stopped run end some milliseconds apart. Claims and conditions are checked up to
 the last time that all of them reached, because the loop is incomplete after it.
@@ -55,10 +56,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
-from noack.theory.certified_bounds import OWN_PLANT
-from noack.theory.persistent_causes import forcing_of
-from noack.theory.scenario_certificates import outside_box
-from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
+from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint
+from noack.theory.certificates.scenario_certificates import outside_box
 
 _IDEAL_LOOP = (
     "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"
@@ -475,7 +475,7 @@ def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    pushes, forcing = 0.0, forcing_of(own.scenario, loop.B)
+    pushes, forcing = 0.0, bound_forcing(own.scenario, loop.B)
     if forcing is not None:
         pushes = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
     bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + pushes)

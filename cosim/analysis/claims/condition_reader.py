@@ -52,8 +52,8 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.run_conditions import allowed_conditions
-from plant_server.watchdog import too_old
+from noack.theory.certificates.conditions import allowed_conditions
+from plant_server.plant import too_old
 
 Times = NDArray[np.int64]
 

@@ -46,13 +46,20 @@ from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_bounds import ErrorMonitor
-from noack.theory.known_state import KnownStateBounds, known_state_bounds
-from noack.theory.paper_bounds import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
-from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify, certify_box
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
+from noack.theory.certificates.conditions import (
+    allowed_conditions,
+    ideal_conditions,
+    nominal_conditions,
+)
+from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.paper.error_bounds import ErrorMonitor
+from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.controller import controller_of
+from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.processes import RowCounts
@@ -40,8 +40,8 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Flow
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
+from plant_server.plant import plants_of
+from sensor_node.sensor import sensors_of
 
 Numbers = NDArray[np.int64]
 
@@ -176,10 +176,10 @@ class InputReplay:
             _settings(recorded["change"].tobytes()),
         )  # fmt: skip
         outputs = self._machine.announce(change, int(recorded["now_ns"]))
-        emitted = [one for one in outputs if type(one) is Record]
-        assert len(emitted) == 1
+        (emitted,) = (output for output in outputs if type(output) is Record)
+        values = emitted.row if self._is_network else emitted.row[1:]  # without the loop's number
         replayed = np.zeros(1, rows.dtype)[0]
-        for name, value in zip(_own_names(rows.dtype), emitted[0].row, strict=True):
+        for name, value in zip(_own_names(rows.dtype), values, strict=True):
             replayed[name] = value
         if LOOP in (rows.dtype.names or ()):
             replayed[LOOP] = recorded[LOOP]
@@ -306,10 +306,10 @@ def _settings(data: bytes) -> dict[str, Any]:
 
 
 _MACHINES: Mapping[str, Callable[[Scenario, Start], LoopMachines | Channel]] = {
-    "plant": plant_of,
-    "sensor": sensor_of,
+    "plant": lambda loop, start: plants_of((loop,), start=start),
+    "sensor": lambda loop, start: sensors_of((loop,), start=start),
     "netem": lambda scenario, start: channel_of(scenario, start, loops=len(loops_of(scenario))),
-    "controller": controller_of,
+    "controller": lambda loop, start: controllers_of((loop,), start=start),
 }
 
 

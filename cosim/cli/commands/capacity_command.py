@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli import command as cli
-from cosim.cli.execute_campaign import Workers, execute_campaign, worker_pool
+from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr
 

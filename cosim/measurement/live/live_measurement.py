@@ -10,7 +10,7 @@ from cosim.measurement.live.probe_run import listen, send
 from cosim.measurement.live.probe_sender import ProbePlan
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.quantities import OWN_TIME_S
+from noack.impairments.words import OWN_TIME_S
 from noack.protocol.probe_format import (
     LONGEST_PERIOD_NS,
     MAX_PROBE_BYTES,

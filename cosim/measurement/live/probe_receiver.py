@@ -16,8 +16,7 @@ from noack.protocol.probe_format import (
     decode_probe,
     encode_probe,
 )
-from noack.traces.packet_trace import packet_trace
-from noack.traces.relative_delay import relative_delays
+from noack.traces.packet_trace import packet_trace, relative_delays
 
 _AFTER_END_NS = 2 * NS_PER_S
 _AFTER_SCHEDULE_NS = 5 * NS_PER_S

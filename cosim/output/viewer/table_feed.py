@@ -40,11 +40,14 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_bounds import ErrorMonitor
-from noack.theory.known_state import KnownStateBounds, known_state_bounds
-from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.paper.error_bounds import ErrorMonitor
 
 LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""

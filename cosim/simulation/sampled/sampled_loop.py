@@ -14,18 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.controller import controller_of
+from controller_node.controller import controllers_of
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import assumed_model
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.theory.run_conditions import network_delay_ns
-from plant_server.disturbance_signal import disturbance_of
-from plant_server.measurement import measurement_model_of
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
+from noack.theory.certificates.conditions import network_delay_ns
+from plant_server.plant import disturbance_of, measurement_model_of, plants_of
+from sensor_node.sensor import sensors_of
 
 Stack = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -107,7 +105,8 @@ class SampledLoop:
             self._gains = _dense(
                 np.array([*islice(resolved.observer.gains(assumed), measurements)])
             )
-        self._machines = (plant_of(resolved), sensor_of(resolved), controller_of(resolved))
+        loops = (resolved,)
+        self._machines = (plants_of(loops), sensors_of(loops), controllers_of(loops))
         self._set_causes(pushes_of(resolved), noise_of(resolved))
 
     def _set_causes(self, push: Matrix, noise: Matrix) -> None:

@@ -10,7 +10,7 @@ from cosim.studies.campaign.metrics import Metric
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_process import loss_process
+from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
 
 

@@ -10,8 +10,8 @@ from cosim.simulation.batch.batch_status import OK
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
-from noack.theory.error_gains import Output, error_gains
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import Output, error_gains
 
 Metric = Literal[
     "transmissions",

@@ -13,9 +13,9 @@ from cosim.studies.design.design_space import Candidate
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify, certify_box, outside_box
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 
 Bounded = Literal["state", "error"]
 Bounds = Mapping[Bounded, float]

@@ -10,9 +10,9 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.weight import choose_weight
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.weight import choose_weight
 
 NORMS = ("identity", "given", "chosen")
 COSTS_OF_INPUT = (0.1, 1.0, 10.0)

@@ -22,7 +22,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
-from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
+from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1
 from noack.trigger.decaying import DecayingTrigger
 
 Numbers = dict[str, Any]

@@ -34,9 +34,9 @@ class LoopSeeds(ScenarioSection):
 class LoopSection(ScenarioSection):
     """A loop, or ``count`` loops, on the run's network.
 
-    A loop is the scenario's top level with the keys of this entry in place of its own. A table that
-    names its kind (``trigger.policy``, ``observer.kind``, ``controller.kind``; ``model.name``,
-    ``model.A`` or ``model.file``) replaces the whole table of the top level.
+    A loop is the scenario's top level, or that of the entry's scenario file, with the keys of this
+    entry in place of its own. A table that names its kind (``trigger.policy``, ``observer.kind``,
+    ``controller.kind``; ``model.name``, ``model.A`` or ``model.file``) replaces the whole table.
     """
 
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -47,6 +47,11 @@ class LoopSection(ScenarioSection):
     """Start of the loop after that of the run, as a share of the time between two transmissions of
     a periodic trigger, or else between two measurements. By default drawn by seed, and 0 for the
     first loop of the run."""
+    scenario: str | Table | None = None
+    """Another scenario file: the loop has its mode, model, plant, trigger, observer and controller
+    in place of those of the top level. A path relative to this file, or the name of a shipped
+    scenario. A network, certificate or changes in it must be those of this run; its other keys have
+    no effect. Loading the scenario replaces the name by the tables."""
     mode: Literal["model", "zoh"] | None = None
     """The loop's mode."""
     model: Table | None = None
@@ -59,7 +64,7 @@ class LoopSection(ScenarioSection):
     """Keys of the loop's observer."""
     controller: Table | None = None
     """Keys of the loop's controller."""
-    seeds: LoopSeeds = LoopSeeds()
+    seeds: LoopSeeds = LoopSeeds.model_construct()
 
     @model_validator(mode="before")
     @classmethod
@@ -67,6 +72,8 @@ class LoopSection(ScenarioSection):
         for key in SHARED:
             if isinstance(content, dict) and key in content:
                 raise ValueError(f"{key}: all loops share it; set it at the top level")
+        if isinstance(content, dict) and not isinstance(content.get("scenario", ""), str | dict):
+            raise ValueError("scenario: should be the name of a scenario file, in quotes")
         return content
 
     @model_validator(mode="after")

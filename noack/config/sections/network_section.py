@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.impairments.constraints import guarantee_of, require_consistent
+from noack.impairments.constraints import join_guarantee, require_consistent
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
@@ -19,7 +19,7 @@ from noack.settings.section import ScenarioSection
 class DirectionSection(ScenarioSection):
     """A direction of the network: what happens to its packets, and the guarantee."""
 
-    loss: Loss = NoLoss()
+    loss: Loss = NoLoss.model_construct()
     """Loss of packets, before the guarantee is applied."""
     mansd: Mansd | None = None
     """Largest number of consecutive lost packets; unlimited if not given."""
@@ -78,8 +78,7 @@ class NetworkSection(DirectionSection):
     """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
     controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     encrypted: bool = False
-    """Live, the processes encrypt the vectors of their datagrams (ChaCha20-Poly1305). Machines of
-    many loops are then not compiled."""
+    """Live, the processes encrypt the vectors of their datagrams (ChaCha20-Poly1305)."""
     acknowledgements: AcknowledgementSection | None = None
     """The direction from controller to sensor, for protocol = "ack"; by default without loss.
     It has no effect if protocol = "none"."""
@@ -140,4 +139,4 @@ class NetworkSection(DirectionSection):
     @property
     def guarantee(self) -> LossGuarantee:
         """What mansd and the constraints say, also if the network does not enforce it."""
-        return guarantee_of(self.mansd, self.constraints)
+        return join_guarantee(self.mansd, self.constraints)

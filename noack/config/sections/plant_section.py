@@ -9,7 +9,7 @@ from noack.config.feature_kinds import AnyDisturbance, AnyPlant
 from noack.config.sections.model_section import require_read
 from noack.core.linear_systems import Vector
 from noack.disturbances.disturbance_settings import Place
-from noack.observers.estimation_model import NoiseVariances
+from noack.observers.observer_settings import NoiseVariances
 from noack.plants.linear import LinearSettings
 from noack.settings.matrices import (
     Row,
@@ -85,7 +85,7 @@ class WatchdogSection(ScenarioSection):
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
-    system: AnyPlant = LinearSettings()
+    system: AnyPlant = LinearSettings.model_construct()
     """The kind of plant: a table with ``kind``; by default a linear system."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
@@ -110,10 +110,10 @@ class PlantSection(ScenarioSection):
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """Number of plant steps per measurement."""
-    measurement: MeasurementSection = MeasurementSection()
+    measurement: MeasurementSection = MeasurementSection.model_construct()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """Disturbances of the plant; they add up."""
-    watchdog: WatchdogSection = WatchdogSection()
+    watchdog: WatchdogSection = WatchdogSection.model_construct()
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.integrate import ode
 
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import PlantEquations
-from noack.plants.systems.plant_system import SystemFailedError
+from noack.plants.plant_settings import PlantEquations, SystemFailedError
 
 _MAX_STEPS = 10_000
 _ESCAPE = 1e4

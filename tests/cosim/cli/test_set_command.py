@@ -11,7 +11,7 @@ import tomli_w
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.commands.set_command import parsed
+from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
 from noack.config.feature_kinds import POLICIES

@@ -10,7 +10,7 @@ from cosim.measurement.loss_likelihood import ChainRates
 from cosim.measurement.network_file import trace_csv
 from noack.config import toml_file
 from noack.config.sections.network_section import NetworkSection
-from noack.impairments.link_settings import read_files
+from noack.impairments.loss_prediction import read_files
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.oracles.link import Link

@@ -39,7 +39,7 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, read_header
-from noack.theory.assumptions import AssumptionStatus, assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
 from tests.cosim.summaries import alone
 from tests.oracles.link import Datagram, Duplex, Link, network_of

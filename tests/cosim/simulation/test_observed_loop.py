@@ -26,10 +26,10 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.theory.assumptions import assumptions
-from sensor_node.sensor import sensor_of
+from noack.theory.certificates.assumptions import assumptions
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed
+from tests.machine_parts import sensor_of
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from noack.core.errors import CallerError
+from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
-from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.named_file import located
 from tests.noack.plants.motion import H_NS, motion
 

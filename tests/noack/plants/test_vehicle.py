@@ -13,8 +13,7 @@ from noack.config.named_models import single_track_lane
 from noack.core.errors import CallerError
 from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
-from noack.plants.systems.vehicle_equations import CompiledVehicle, compiled_vehicle
-from noack.plants.vehicle import VehicleSettings
+from noack.plants.vehicle import CompiledVehicle, VehicleSettings, compiled_vehicle
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.2, -0.1, 0.05, 3.0])

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from noack.plants import vehicle as compiled
 from noack.plants.four_tank import FourTankSettings
-from noack.plants.systems import vehicle_equations as compiled
-from noack.plants.systems.vehicle_equations import equations, library
-from noack.plants.vehicle import VehicleSettings
+from noack.plants.vehicle import VehicleSettings, equations, library
 
 CARS = (1, 2, 3)
 WIDTHS = {"ks": 5, "st": 7, "std": 9, "mb": 29}

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate_terms import Constants
-from noack.theory.error_gains import ErrorGains, Growth, Output
-from noack.theory.kernel_bounds import constant_kernel
-from noack.theory.plant_gains import Coefficients, PlantGains
+from noack.theory.bounds.enclosure import constant_kernel
+from noack.theory.bounds.gains import Coefficients, ErrorGains, Growth, Output, PlantGains
+from noack.theory.bounds.terms import Constants
 from tests.noack.theory.loops import System
 
 

@@ -9,10 +9,10 @@ from unittest.mock import patch
 import numpy as np
 
 from noack.core.linear_systems import Vector
-from noack.theory import lost_events, sharpened_bounds
-from noack.theory.delivery_flow import DeliveryFlow, Reach
-from noack.theory.plant_gains import PlantGains
-from noack.theory.sharpened_bounds import InvariantEllipsoids
+from noack.theory.bounds.gains import PlantGains
+from noack.theory.certificates import delivery_flow, solution
+from noack.theory.certificates.delivery_flow import DeliveryFlow, Reach
+from noack.theory.certificates.solution import InvariantEllipsoids
 
 
 def only_the_start() -> AbstractContextManager[Any]:
@@ -29,25 +29,25 @@ def only_the_start() -> AbstractContextManager[Any]:
 
 def no_lost_updates() -> AbstractContextManager[Any]:
     """At an event e_c is 0."""
-    return patch.object(sharpened_bounds, "errors_at_events", np.zeros_like)
+    return patch.object(solution, "errors_at_events", np.zeros_like)
 
 
 def no_event_at_the_end() -> AbstractContextManager[Any]:
     """A lost event adds nothing to e_c."""
-    exact = sharpened_bounds.errors_after_losses
+    exact = solution.errors_after_losses
 
     def shifted(*given: Any) -> Vector:
         found = exact(*given)
         return np.append(found[:1], found[:-1])
 
-    return patch.object(sharpened_bounds, "errors_after_losses", shifted)
+    return patch.object(solution, "errors_after_losses", shifted)
 
 
 def half_of_the_threshold() -> AbstractContextManager[Any]:
     """Between events ‖e_s‖ stays below half of the threshold."""
-    exact = lost_events._Stage.largest_error
+    exact = delivery_flow._Stage.largest_error
     return patch.object(
-        lost_events._Stage,
+        delivery_flow._Stage,
         "largest_error",
         lambda self, size, added: exact(self, 0.5 * size, added),
     )
@@ -56,7 +56,7 @@ def half_of_the_threshold() -> AbstractContextManager[Any]:
 def no_drive_of_the_error() -> AbstractContextManager[Any]:
     """After an event e_s stays what H makes of it."""
     return patch.object(
-        sharpened_bounds, "error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
+        solution, "error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
     )
 
 

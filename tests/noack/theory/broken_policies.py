@@ -6,13 +6,12 @@ from typing import Any
 from unittest.mock import patch
 
 from noack.config.scenario import Scenario
-from noack.theory import certificate, scenario_certificates
-from noack.theory.certificate_terms import Constants, NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_growth import TriggerBound
-from noack.theory.error_inequalities import ErrorInequalities, ErrorWay
-from noack.theory.scenario_certificates import certify, trigger_bounds
-from noack.theory.trigger_bounds import TriggerBounds
+from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound
+from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.certificates import scenario_certificates, solution
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
+from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from noack.trigger.error_promise import ErrorPromise
 
 Conditions = NetworkConditions
@@ -81,15 +80,15 @@ def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCert
 def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
     """Each part bounds e_c in the way that is tighter for it, and the bounds are added."""
 
-    true = certificate._smallest
+    true = solution._smallest
 
     def smallest(
         steps: Sequence[ErrorInequalities], spacing_s: float
-    ) -> tuple[list[Constants], ErrorWay]:
+    ) -> tuple[list[Constants], BoundMethod]:
         found = [true([step], spacing_s) for step in steps]
         return [constants for (constants,), _ in found], found[0][1]
 
-    with patch.object(certificate, "_smallest", smallest):
+    with patch.object(solution, "_smallest", smallest):
         return certify(resolved, conditions)
 
 

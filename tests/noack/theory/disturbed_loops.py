@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from noack.theory.certificate_terms import Constants, EstimationBound, Part
-from noack.theory.error_gains import ErrorGains, Growth
-from noack.theory.error_growth import TriggerBound
-from noack.theory.forcing import Forcing
-from noack.theory.plant_gains import PlantGains
-from noack.theory.superposition import solve_divided
+from noack.theory.bounds.gains import ErrorGains, Forcing, Growth, PlantGains
+from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerBound
+from noack.theory.certificates.disturbed import solve_two_parts
 from tests.noack.theory.loops import (
     RUNS,
     STEPS,
@@ -64,7 +61,7 @@ class DisturbedLoop:
         decaying, pushed = system.gains(), loop.pushed(plant)
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ loop.noise)))
-        first, rest = solve_divided(
+        first, rest = solve_two_parts(
             Part(decaying.error, decaying, TriggerBound(system.beta, None)),
             Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from noack.theory.certificate_terms import Constants
-from noack.theory.error_gains import Output
-from noack.theory.known_state import KnownStateBounds, KnownStatePart
+from noack.theory.bounds.gains import Output
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.certified_bounds import KnownStateBounds, KnownStatePart
 from tests.noack.theory.disturbed_loops import DisturbedLoop, random_disturbed_loop
 from tests.noack.theory.loops import STEPS, System, Trace, random_system, times_s
 

@@ -22,11 +22,9 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.theory.certificate import solve
-from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
-from noack.theory.error_gains import ErrorGains
-from noack.theory.error_growth import TriggerBound
-from noack.theory.plant_gains import PlantGains
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
+from noack.theory.certificates.solution import solve
 from tests.noack.theory.compiled_loops import (
     Given,
     Propagators,
@@ -135,7 +133,7 @@ def certified_or_skipped(
 ) -> Constants:
     try:
         return system.certify(conditions, structured=structured)
-    except VoidError:
+    except NoCertificateError:
         assume(False)
         raise
 

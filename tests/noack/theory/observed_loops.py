@@ -10,8 +10,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import spectral_abscissa
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.scenario_certificates import own_plant
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.scenario_certificates import own_plant
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
 from tests.noack.theory.loops import (
     RUNS,

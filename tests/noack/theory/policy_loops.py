@@ -10,7 +10,7 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from tests.noack.theory.event_rules import (
     Area,
     AtLatest,

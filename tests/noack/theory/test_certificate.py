@@ -7,7 +7,7 @@ import pytest
 from hypothesis import find, given, settings
 from hypothesis import strategies as st
 
-from noack.theory.certificate_terms import VoidError
+from noack.theory.bounds.terms import NoCertificateError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.loops import (
     SEARCH,
@@ -52,7 +52,7 @@ def test_runs_exceed_a_broken_certificate_and_not_the_true_one(mutant: str) -> N
         try:
             caught = trace.exceeded(system, broken(system)) != []
             assert not caught or trace.exceeded(system, system.certify()) == []
-        except VoidError:
+        except NoCertificateError:
             return False
         return caught
 

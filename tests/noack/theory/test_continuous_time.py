@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from noack.theory.certificate_terms import NetworkConditions
+from noack.theory.bounds.terms import NetworkConditions
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import (
     ROUNDING,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.error_bounds import ErrorMonitor
+from noack.theory.paper.error_bounds import ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.loops import seeds
 

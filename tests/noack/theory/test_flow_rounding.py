@@ -7,8 +7,8 @@ from hypothesis import given, settings
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.theory.delivery_flow import ROUNDING, DeliveryFlow
-from noack.theory.fixed_point import exponential
+from noack.theory.certificates.delivery_flow import ROUNDING, DeliveryFlow
+from noack.theory.margins.exact_matrices import exponential
 from tests.noack.theory.loops import SEARCH, System, systems
 
 

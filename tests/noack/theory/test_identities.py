@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.theory.identities import MissedEvents, missed_sum
+from noack.theory.paper.error_bounds import MissedEvents, missed_sum
 
 PERIOD_NS = 1_000_000
 H = np.array([[-0.3, 1.0, 0.2], [-2.0, -0.1, 0.0], [0.5, 0.0, 0.4]])

@@ -13,12 +13,10 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
-from noack.theory.certificate import solve
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.error_gains import ErrorGains, Output
-from noack.theory.error_growth import TriggerBound
-from noack.theory.loss_accumulation import LossAccumulation
-from noack.theory.plant_gains import PlantGains
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, TriggerBound
+from noack.theory.certificates.inequalities import LossAccumulation
+from noack.theory.certificates.solution import solve
 from tests.noack.theory.loops import SEARCH, System, systems
 
 EVENTS = 120

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from noack.theory.network_limits import MOST_S, largest
+from noack.theory.certificates.scenario_certificates import MOST_S, largest
 
 GAINS: dict[str, Callable[[float], float]] = {
     "proportional": lambda share: share,

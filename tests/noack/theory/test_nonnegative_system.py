@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from noack.theory.nonnegative_system import solve_inequalities
+from noack.theory.certificates.inequalities import solve_inequalities
 
 
 def exact_solution(F: np.ndarray, g: np.ndarray) -> list[Fraction]:

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import load
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.known_state import known_state_bounds
-from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import known_state_bounds
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.scenario_certificates import certify
 from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
 from tests.noack.theory.exact_loops import observe

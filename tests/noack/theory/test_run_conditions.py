@@ -9,8 +9,8 @@ from noack.config.scenario_file import validate
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
-from noack.theory.assumptions import assumptions
-from noack.theory.run_conditions import nominal_conditions
+from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.conditions import nominal_conditions
 
 
 @pytest.mark.parametrize(

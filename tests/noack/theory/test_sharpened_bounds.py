@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate_terms import Constants, NetworkConditions
-from noack.theory.delivery_flow import Reach
-from noack.theory.error_gains import Output
-from noack.theory.lost_events import bend_of_error, errors_after_losses
-from noack.theory.sharpened_bounds import InvariantEllipsoids
+from noack.theory.bounds.gains import Output
+from noack.theory.bounds.terms import Constants, NetworkConditions
+from noack.theory.certificates.delivery_flow import Reach, bend_of_error, errors_after_losses
+from noack.theory.certificates.solution import InvariantEllipsoids
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import (

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.traces.capture_blocks import captured_packets
-from noack.traces.udp_headers import CapturedFlow, udp_of
+from noack.traces.capture_packets import CapturedFlow, captured_packets, find_udp
 from tests.noack.traces.capture_files import LINKS, Sent, pcap_of, pcapng_of
 
 families = st.one_of(
@@ -35,7 +34,7 @@ families = st.one_of(
 def read(data: bytes) -> list[tuple[int, CapturedFlow, bytes, bool]]:
     found = []
     for packet in captured_packets(io.BytesIO(data)):
-        datagram = udp_of(packet.interface, packet.link_type, packet.data)
+        datagram = find_udp(packet.interface, packet.link_type, packet.data)
         assert datagram is not None
         found.append((packet.t_ns, *datagram))
     return found

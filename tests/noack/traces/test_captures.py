@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
-from noack.traces.capture_numbers import SequenceField
-from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.packet_trace import PacketTrace
 from tests.noack.traces.capture_files import Sent, pcap_of, pcapng_of
 

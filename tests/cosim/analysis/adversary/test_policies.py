@@ -21,8 +21,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.scenario_certificates import certify
 
 EXAMPLES = {
     name: example.model_dump(mode="json", exclude_none=True)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cosim.analysis.value_reduction import decimate
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.run_view import write_loop_view
-from cosim.record import decimate, run_record
+from cosim.record import run_record
 from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import RunRecord, write_run
 from cosim.shipped_files import find_shipped

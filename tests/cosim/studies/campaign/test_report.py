@@ -38,8 +38,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load as load_scenario
 from noack.config.scenario_file import validate
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]

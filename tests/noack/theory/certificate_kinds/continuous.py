@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from tests.noack.theory.broken_flow import BROKEN_FLOWS
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
@@ -35,7 +35,7 @@ def _conditions(system: System) -> NetworkConditions:
 def _bounds(system: System) -> Bounds | None:
     try:
         found = system.certify(_conditions(system))
-    except (VoidError, NotDecayingError):
+    except (NoCertificateError, NotDecayingError):
         return None
     more = {"x_W": found.state_weighted, "E x": max(found.mismatch, _ROUNDED)}
     return bounds_of(found, system.beta) | more

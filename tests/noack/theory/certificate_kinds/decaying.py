@@ -11,8 +11,8 @@ from itertools import product
 
 import numpy as np
 
-from noack.theory.certificate_terms import Constants, VoidError
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.terms import Constants, NoCertificateError
 from tests.noack.theory.broken_certificates import MUTANTS
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.loops import (
@@ -52,7 +52,7 @@ def certified_by(certify: Callable[[System], Constants]) -> Callable[[System], B
     def bounds(system: System) -> Bounds | None:
         try:
             return bounds_of(certify(system), system.beta)
-        except (VoidError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError):
             return None
 
     return bounds

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from noack.config.scenario import Scenario
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.scenario_certificates import certify
 from tests.noack.theory import policy_loops
 from tests.noack.theory.broken_policies import BROKEN_POLICIES
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate_terms import VoidError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.known_state import KnownStateBounds
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.terms import NoCertificateError
+from noack.theory.certificates.certified_bounds import KnownStateBounds, ScenarioCertificate
 from tests.noack.theory import disturbed_loops, known_state_loops
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
@@ -48,7 +47,7 @@ def shares_of(
     def bounds(case: Case) -> Bounds | None:
         try:
             case.found = certify(case)
-        except (VoidError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError):
             return None
         return None if case.found is None else dict.fromkeys(names, 1.0)
 
