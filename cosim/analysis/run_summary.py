@@ -260,8 +260,6 @@ def _or_none(statistic: Callable[..., Any], values: NDArray[np.float64]) -> floa
 
 
 Linearisation = LinearisationPart | NoLinearisationPart
-
-
 _EXACT = 1e-3
 """Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
 

@@ -45,6 +45,15 @@ class Segment(NamedTuple):
     last: int
     read: Callable[[], Rows]
 
+    def of_loop(self, number: int) -> "Segment":
+        """Return the rows of a loop."""
+
+        def read() -> Rows:
+            rows = self.read()
+            return rows.compress(rows[LOOP] == number)
+
+        return self._replace(read=read)
+
 
 def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
     """Yield the segments of a table in a spool."""
@@ -166,14 +175,18 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     path = run_dir / RECORD / f"{table}.parquet"
     segments = [*group_segments(path, dtype)] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
-    if loops == 1 or not has_loop(table):
+    if not has_loop(table):
         yield from merged(segments, dtype)
         return
     paths = [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
     all_bytes = sum(one.stat().st_size for one in paths)
     at_once = max(loops * _BLOCK_BYTES // max(all_bytes, _BLOCK_BYTES), 1)
     for first in range(0, loops, at_once):
-        yield from by_loop(segments, dtype, range(first, min(first + at_once, loops)))
+        block = range(first, min(first + at_once, loops))
+        if len(block) > 1:
+            yield from by_loop(segments, dtype, block)
+        else:
+            yield from merged([segment.of_loop(first) for segment in segments], dtype)
 
 
 def remove_spool(run_dir: Path) -> None:

@@ -96,8 +96,6 @@ def weight_of(system: ContinuousLoop) -> Matrix:
 
 Pattern = tuple[bool, ...]
 """Whether the update of each event is delivered; events after its end are delivered."""
-
-
 Flags = NDArray[np.bool_]
 
 

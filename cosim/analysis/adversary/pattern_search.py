@@ -24,8 +24,6 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 
 Indices = NDArray[np.int64]
-
-
 SearchReport = Callable[[str, int, float], None]
 """Receives the current search step, the segments computed so far, and the largest value so far."""
 
@@ -177,8 +175,6 @@ def after_events(
 
 Ceiling = Callable[[Nodes], Vector]
 """Returns an upper bound on the value that the rest of each run can add, (N,)."""
-
-
 _BLOCK = 4096
 
 
@@ -218,11 +214,7 @@ def _top(pile: list[Nodes]) -> Nodes:
 
 
 _ALIKE = 1e-4
-
-
 _PARTS = 2
-
-
 _CROWD = 8
 
 
@@ -294,17 +286,9 @@ def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
 
 
 _RANDOM = 64
-
-
 _IMPROVED = 3
-
-
 _NODES_FOR_A_GUESS = 20_000
-
-
 _LONGEST = 1000
-
-
 _PERIODS = 24
 """Longest period of the regular patterns of a constraint."""
 

@@ -243,11 +243,7 @@ class ClaimEvaluation(RunEvidence):
 
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
-
-
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
-
-
 _PACES = {
     "plant": (PLANT_STEP, "t_ns"),
     "sensor": (SENSOR_MEASUREMENT, "t_ns"),

@@ -56,18 +56,10 @@ from noack.theory.certificates.conditions import allowed_conditions
 from plant_server.plant import too_old
 
 Times = NDArray[np.int64]
-
-
 Batches = list[tuple[NDArray[Any], ...]]
 """Columns of the waiting rows, batch by batch."""
-
-
 NEVER = 2**63 - 1
-
-
 NO_TIMES: Times = np.zeros(0, np.int64)
-
-
 _KEPT_TICKS = 512
 """A process sends its tables one after the other, up to 256 rows of each."""
 
@@ -387,8 +379,6 @@ READ = (
     NETEM_PACKET,
 )  # fmt: skip
 """The tables that the conditions depend on."""
-
-
 _COLUMNS = (
     "input", "sequence", "t_ns", "event", "actuation", "u", "entry", "model_t_ns", "error_ns",
     "flow", "fate", "release_ns", "copy_ns", "bit", "head",

@@ -44,21 +44,11 @@ from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 
 Numbers = NDArray[np.int64]
-
-
 _ROLES = {"plant": 0, "sensor": 1, "controller": 2, "netem": 3}
-
-
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
-
-
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
-
-
 _HEADER_WORDS = 3
-
-
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
 
 

@@ -32,8 +32,6 @@ I1_CONTROLLER_ERROR = ClaimDefinition(
         "bound from (I1)", "e_c", samples.t_s, samples.error_bounds[0], "identity"
     ),
 )  # fmt: skip
-
-
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
 
 
