@@ -193,7 +193,7 @@ class RunRecord:
         """The generations of a process, in order."""
         if role not in self._lives:
             tables, reports = self.owned_by(role), self._reports_of(role)
-            parts = self.slices(*tables, columns=LIFE_COLUMNS)
+            parts = self.slices(*tables, columns=LIFE_COLUMNS) if tables else ()
             self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
         return self._lives[role]
 
