@@ -161,6 +161,6 @@ def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
     table, phases_ns = CLOCK_TABLES[0], (0, 7)
     rows = np.zeros(2, tables(1, 1, clocks=True)[table])
     rows["t_ns"] = 10, 20
-    found = dict(rows_by_loop(table, rows, phases_ns))
+    found = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
     assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
     assert rows["t_ns"].tolist() == [10, 20]
