@@ -20,10 +20,10 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
-from noack.config.feature_kinds import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
+from noack.config.sections import PLANTS
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow, Message

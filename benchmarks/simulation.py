@@ -18,10 +18,8 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from benchmarks.batch import integrated
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
-from cosim.simulation.batch.batch_interface import Population, setting_of
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.batch import Population, setting_of
+from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.config.parameter_changes import ChangeSchedule, settings_key
-from noack.config.resolution import loop_of, policy_of, setpoint_of
+from noack.config.resolution import assumed_model, loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import assumed_model
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
@@ -39,8 +38,7 @@ from noack.protocol.record_tables import (
     RecordShape,
 )
 from noack.protocol.wire_format import Flow
-from noack.trigger.core_rule import fill_rule, rule_rows
-from noack.trigger.trigger_policy import CodedPolicy, EventTrigger, Policy
+from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
 SENSOR = Role(
     "sensor", "noack_sensor", Flow.MEASUREMENT,

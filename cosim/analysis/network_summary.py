@@ -20,8 +20,7 @@ from cosim.analysis.summary_model import (
 )
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.config.loops import phases_ns
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import row_norms

@@ -130,8 +130,8 @@ def warn_of_violations(scenario: "Scenario") -> None:
     Loops that share a network: also what may go wrong at their bottleneck.
     """
     from noack.config.link_load import link_loads, load_warnings
-    from noack.config.loops import loop_names, loop_scenario, loop_sections
     from noack.config.resolution import resolve
+    from noack.config.scenario import loop_names, loop_scenario, loop_sections
     from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 
     shares = len(loop_names(scenario)) > 1

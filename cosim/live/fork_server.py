@@ -261,7 +261,7 @@ def _fork_twice() -> int:
 
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
-    from noack.config.scenario_changes import prepare_changes
+    from noack.config.scenario_checks import prepare_changes
     from noack.impairments.kinds.loss import LossOf
     from noack.impairments.link_settings import LinkSettings
     from noack.runtime.join_ticket import Ticket

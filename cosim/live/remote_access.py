@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from cosim.live.coordinator import AdmissionPass, Coordinator
 from cosim.live.remote_hosts import Host, load_hosts
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.invitation_proof import InvitationProof
 from noack.protocol.topology import LOOP_ROLES

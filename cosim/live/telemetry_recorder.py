@@ -14,10 +14,9 @@ from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.processes import report_of, write_reports
 from cosim.record.run_record import Rows
-from noack.config.loops import loop_names
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Start

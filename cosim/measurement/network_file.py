@@ -10,7 +10,7 @@ from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.network_measurement import Measurement
 from noack.config import toml_file
 from noack.config.scenario_file import toml_text
-from noack.config.sections.network_section import NetworkSection
+from noack.config.sections import NetworkSection
 from noack.core.errors import printable
 from noack.core.file_access import require_suffix, write_whole
 from noack.impairments.loss_prediction import read_files

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, loop_of, steady_state
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import steady_state
 from noack.core.linear_systems import Propagator, row_norms
 from noack.core.model_flow import ModelFlow
 from noack.protocol.machine_interface import GENERATION

@@ -41,7 +41,6 @@ from cosim.record.record_source import (
 )
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
-from noack.config.loops import loop_names, loop_scenario, loop_sections, loops_of, phases_ns
 from noack.config.resolution import (
     LoopMatrices,
     is_of_network,
@@ -51,7 +50,14 @@ from noack.config.resolution import (
     run_tables,
     tables_of,
 )
-from noack.config.scenario import Scenario
+from noack.config.scenario import (
+    Scenario,
+    loop_names,
+    loop_scenario,
+    loop_sections,
+    loops_of,
+    phases_ns,
+)
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole

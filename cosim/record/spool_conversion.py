@@ -24,8 +24,8 @@ from cosim.record.run_record import (
     vector_names,
     write_tables,
 )
-from noack.config.loops import loop_names
 from noack.config.resolution import has_loop, run_tables
+from noack.config.scenario import loop_names
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder

@@ -15,10 +15,9 @@ from controller_node.controller import controllers_of
 from cosim.record.record_source import NetworkRows, without_loop
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
-from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
 from noack.config.resolution import has_loop, network_tables, resolve, shape_of, tables_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of, phases_ns
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.datagram_seal import KEY_BYTES

@@ -22,10 +22,6 @@ typedef struct { /* the comparison from the start of a piece on */
 
 static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 
-static inline lanes weigh(const double *weight, lanes v) {
-    return weight == NULL ? v : times(weight, v);
-}
-
 /* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
    three arguments are constants, each combination of which has code. */
 static inline __attribute__((always_inline)) void expand_with(

@@ -23,7 +23,7 @@ from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.words_to_settings import settings_of, text_of
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import CallerError, MachineError, NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_kept_loss

@@ -26,11 +26,10 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from noack.config.loops import loop_scenario
 from noack.config.resolution import policy_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_changes import with_settings
-from noack.config.sections.network_section import DirectionSection
+from noack.config.scenario import Scenario, loop_scenario
+from noack.config.scenario_checks import with_settings
+from noack.config.sections import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
@@ -40,7 +39,7 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.trigger.periodic_trigger import PeriodicSettings
-from noack.trigger.trigger_policy import CodedPolicy
+from noack.trigger.trigger_rule import CodedPolicy
 
 
 class Demand(NamedTuple):

@@ -23,7 +23,7 @@ from noack.config.runtime_parameters import (
     trigger_parameters,
 )
 from noack.config.scenario import Scenario
-from noack.config.scenario_changes import content_with_settings, with_settings
+from noack.config.scenario_checks import content_with_settings, with_settings
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

@@ -10,4 +10,6 @@ property tests use what they import. What stands around them, in the order in wh
 * ``loss_guarantee.py``: the rules that a network keeps, as counters over the outcomes of packets;
 * ``link_settings.py``: the settings of one direction of a link, made of all these;
 * ``markov_chain.py``, ``loss_prediction.py``: the expected loss rate, with and without a guarantee.
+
+Predictions import scipy in the functions that use it: an emulator without them starts faster.
 """

@@ -32,8 +32,8 @@ from noack.impairments.words import (
     percent_text,
     time_text,
 )
-from noack.settings.named_file import NamedFile
 from noack.settings.section import Correlation, Probability, ScenarioSection
+from noack.settings.user_files import NamedFile
 
 T = TypeVar("T")
 Table = dict[str, Any]

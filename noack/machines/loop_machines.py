@@ -357,10 +357,12 @@ def row_layout(own: np.dtype[np.void], whole: np.dtype[np.void]) -> NDArray[np.i
         own: the row type of the loop, without its number.
         whole: the row type of the table, with the number of the loop.
     """
+    own_fields: Mapping[str, Any] = own.fields or {}
+    fields: Mapping[str, Any] = whole.fields or {}
     layout = np.full((whole.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
     for name in own.names or ():
-        kind, begin = (own.fields or {})[name][:2]
-        room, at = (whole.fields or {})[name][:2]
+        kind, begin = own_fields[name][:2]
+        room, at = fields[name][:2]
         first, words = (at - core.NOACK_LOOP_BYTES) // 8, kind.itemsize // 8
         layout[first : first + room.itemsize // 8] = core.NOACK_MISSING_NAN
         layout[first : first + words] = begin // 8 + np.arange(words)

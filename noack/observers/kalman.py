@@ -15,7 +15,7 @@ from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
-from noack.settings.matrices import Row, Rows, require_length, require_shape, require_squares
+from noack.settings.section import Row, Rows, require_length, require_shape, require_squares
 
 
 class KalmanSettings(ObserverSettings):

@@ -21,7 +21,7 @@ from noack.observers.observer_settings import (
     ObserverSettings,
     observer_gain,
 )
-from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import Rows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 

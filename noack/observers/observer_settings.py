@@ -13,8 +13,7 @@ import numpy as np
 
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector
-from noack.settings.matrices import Row, require_length
-from noack.settings.section import ScenarioSection
+from noack.settings.section import Row, ScenarioSection, require_length
 
 _RANK_TOLERANCE = 1e-9
 _POLE_TOLERANCE = 1e-6

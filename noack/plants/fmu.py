@@ -33,8 +33,8 @@ from noack.plants.plant_settings import (
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.matrices import Row, require_length
-from noack.settings.named_file import FileSettings, unchanged
+from noack.settings.section import Row, require_length
+from noack.settings.user_files import FileSettings, unchanged
 
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
 """Status codes of FMI."""

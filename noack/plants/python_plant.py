@@ -13,13 +13,14 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import (
     Names,
+    OdeSystem,
     PlantEquations,
     PlantSettings,
     PlantStart,
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.user_class import (
+from noack.settings.user_files import (
     ClassSettings,
     new_instance,
     read_only,
@@ -110,8 +111,6 @@ class PythonSystem:
 
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
-        from noack.plants.systems.ode_integrator import OdeSystem
-
         equations = PlantEquations(
             derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
         )

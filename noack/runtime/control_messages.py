@@ -17,7 +17,7 @@ from pydantic import (
     ValidationError,
 )
 
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import PeerError
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]

@@ -17,7 +17,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.config.parameter_changes import ParameterChange
-from noack.config.scenario import MOST_CHANGES
+from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR

@@ -15,11 +15,10 @@ from functools import cached_property
 from itertools import chain, repeat
 from typing import Any, Protocol
 
-from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolved_loops, run_tables
-from noack.config.scenario import Scenario
-from noack.config.scenario_changes import prepare_changes
+from noack.config.scenario import Scenario, loops_of, phases_ns
+from noack.config.scenario_checks import prepare_changes
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start

@@ -4,7 +4,7 @@ import select
 from collections.abc import Callable
 from typing import NamedTuple
 
-from noack.config.sections.run_sections import ClocksSection
+from noack.config.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S
 from noack.core.clock_offset import ClockOffset, Restart, RestartCause
 from noack.core.errors import PeerError

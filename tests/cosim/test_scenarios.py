@@ -26,8 +26,8 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix
 from noack.plants.four_tank import FourTankSettings
+from noack.plants.plant_settings import OdeSystem
 from noack.plants.quadrotor import QuadrotorSettings
-from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
 from noack.theory.certificates.conditions import allowed_conditions

@@ -17,7 +17,7 @@ import pytest
 from benchmarks._report import MeasurementError
 from benchmarks._two_hosts import TwoHosts, two_hosts
 from cosim.record.run_record import load_record, load_run
-from noack.config.loops import phases_ns
+from noack.config.scenario import phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES

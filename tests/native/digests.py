@@ -6,7 +6,7 @@ import hashlib
 import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
-from cosim.simulation.batch.batch_interface import run_with_events
+from cosim.simulation.batch import run_with_events
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.config.resolution import resolve, tables_of
+from noack.config.resolution import assumed_model, resolve, steady_state, tables_of, true_model
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.config.state_estimation import assumed_model, steady_state, true_model
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise

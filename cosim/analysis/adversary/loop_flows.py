@@ -25,10 +25,9 @@ from cosim.analysis.adversary.objective import (
     Segments,
     weight_of,
 )
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.continuous import ContinuousLoop, ContinuousRun
 from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
-from cosim.simulation.sampled.sampled_loop import Numbers, Runs, SampledLoop, Scales
+from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales
 from noack.core.core_library import core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector

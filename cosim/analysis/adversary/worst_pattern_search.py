@@ -40,10 +40,14 @@ from cosim.analysis.adversary.worst_run import (
     reported,
     worst_causes,
 )
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.sampled.sampled_loop import SampledLoop
+from cosim.simulation.continuous import (
+    ContinuousLoop,
+    ContinuousRun,
+    continuous_loop_of,
+    network_fates,
+    simulate_continuous,
+)
+from cosim.simulation.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.core.random_streams import stream

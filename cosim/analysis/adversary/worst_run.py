@@ -18,7 +18,7 @@ from rich.table import Table
 
 from cosim.analysis.adversary.loop_flows import SampledFlow, SampledRun, Valued
 from cosim.analysis.adversary.objective import Measure, Objective, Pattern
-from cosim.simulation.sampled.sampled_loop import (
+from cosim.simulation.sampled_loop import (
     Numbers,
     Runs,
     SampledLoop,

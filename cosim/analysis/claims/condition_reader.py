@@ -34,8 +34,8 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows, RunRecord
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (

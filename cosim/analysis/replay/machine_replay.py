@@ -19,9 +19,8 @@ from cosim.record.processes import RowCounts
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
-from noack.config.loops import loops_of
 from noack.config.parameter_changes import ParameterChange, settings_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines

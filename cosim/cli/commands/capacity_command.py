@@ -246,8 +246,8 @@ def _plan(
 
 def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, dict[str, Any]]:
     from cosim.studies.capacity.loop_mixture import MODEL, PERIODIC, ZOH
+    from noack.config.run_sections import NAME_PATTERN
     from noack.config.scenario_file import value_of
-    from noack.config.sections.loop_section import NAME_PATTERN
 
     found: dict[str, dict[str, Any]] = {}
     for text in policies:

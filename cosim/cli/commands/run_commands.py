@@ -14,7 +14,7 @@ from noack.core.number_format import number
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cosim.simulation.continuous.continuous_run import ContinuousRun
+    from cosim.simulation.continuous import ContinuousRun
     from noack.config.scenario import Scenario
 
 _EVENTS_SHOWN = 40
@@ -122,7 +122,7 @@ def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
     import numpy as np
 
     from cosim.live.progress import PatientConsole
-    from cosim.simulation.continuous.continuous_report import document, run_continuous, summary
+    from cosim.simulation.continuous import document, run_continuous, summary
     from noack.config.resolution import resolve
 
     resolved = resolve(scenario)

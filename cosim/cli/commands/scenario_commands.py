@@ -84,8 +84,8 @@ def check(
     """
     from cosim.output.assumptions_table import print_assumptions
     from noack.config.link_load import require_capacity
-    from noack.config.loops import loop_names
     from noack.config.resolution import resolve
+    from noack.config.scenario import loop_names
     from noack.config.scenario_file import dumps as scenario_toml
     from noack.theory.certificates.assumptions import assumptions
 
@@ -113,7 +113,7 @@ def check(
 def _make_trigger(resolved: "Scenario") -> None:
     """Make the trigger: some policies need a stable loop, others a user's class."""
     from noack.config.resolution import policy_of
-    from noack.trigger.trigger_policy import CodedPolicy
+    from noack.trigger.trigger_rule import CodedPolicy
 
     policy = policy_of(resolved)
     if isinstance(policy, CodedPolicy):
@@ -128,8 +128,8 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
         require_capacity,
         update_delay,
     )
-    from noack.config.loops import phases_ns
     from noack.config.resolution import resolved_loops
+    from noack.config.scenario import phases_ns
     from noack.config.scenario_file import dumps as scenario_toml
 
     loops, loads = resolved_loops(scenario), link_loads(scenario)

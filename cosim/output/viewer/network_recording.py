@@ -41,9 +41,8 @@ from cosim.output.viewer.recording import LoopView
 from cosim.output.viewer.recording_file import Nanoseconds, RecordingFile
 from cosim.output.viewer.recording_text import about
 from cosim.record.run_directory import RECORDING_FILE, Kind
-from noack.config.loops import loop_names, phases_ns
 from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, phases_ns
 
 PICTURED = 12
 """Up to so many loops are shown one by one, with their pictures."""

@@ -27,9 +27,8 @@ from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
-from noack.config.loops import phases_ns
 from noack.config.resolution import loop_of, resolved_loops, tables_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (

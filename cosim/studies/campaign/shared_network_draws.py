@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.batch.batch_interface import ROW
-from cosim.simulation.batch.batch_status import OK
+from cosim.simulation.batch import ROW
+from cosim.simulation.exact_simulation import OK
 from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import SampledWork

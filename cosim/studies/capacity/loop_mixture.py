@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from noack.config.loops import loop_scenario
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.sections.loop_section import LoopSection
+from noack.config.run_sections import LoopSection
+from noack.config.scenario import Scenario, loop_scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.trigger.periodic_trigger import PeriodicSettings

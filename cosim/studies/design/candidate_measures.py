@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch.batch_interface import Population, run_batch, setting_of
+from cosim.simulation.batch import Population, run_batch, setting_of
 from cosim.studies.campaign.draw_statistics import estimate, interval_ranks, quantile_interval
 from cosim.studies.design.design_space import Candidate
 from noack.config.resolution import loop_of, resolve

@@ -6,11 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_report import run_continuous
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa, transition
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions

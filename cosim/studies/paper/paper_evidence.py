@@ -11,9 +11,13 @@ import numpy as np
 from scipy.linalg import schur
 
 from cosim.record.align import align_tables
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_report import run_continuous
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import (
+    ContinuousLoop,
+    ContinuousRun,
+    continuous_loop_of,
+    run_continuous,
+    simulate_continuous,
+)
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.paper.draw_measures import MODES, open_loop_eigenvalues, resolved_draw
 from noack.config.named_models import lane_following

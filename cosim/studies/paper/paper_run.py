@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output.report.figure_files import save_figure
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import local
 from cosim.studies.campaign.draw_statistics import quartiles

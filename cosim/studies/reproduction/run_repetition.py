@@ -20,11 +20,10 @@ from cosim.record.run_directory import SCENARIO_FILE, Kind, all_changes_since, k
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
 from cosim.studies.comparison.run_comparison import compare_runs
 from cosim.studies.reproduction.run_archive import MANIFEST, outside_files, unpack
-from noack.config.loops import loops_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, why
-from noack.settings.named_file import file_tables
+from noack.settings.user_files import file_tables
 
 _MOST_STEPS = 1_000_000
 _US_PER_STEP = 100.0

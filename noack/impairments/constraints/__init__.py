@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from noack.impairments.feature import Constraint
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.settings.registry import kinds_in, union_of
+from noack.settings.section import kinds_in, union_of
 
 _KINDS = kinds_in(__name__, Constraint)
 CONSTRAINTS = tuple(_KINDS.values())

@@ -14,7 +14,7 @@ from noack.core.errors import shortened
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.words import OWN_TIME_S, TIME, WordReader, time_text
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
 MOST_INTERVALS = 1_000_000

@@ -28,7 +28,7 @@ from noack.impairments.feature import (
     require_inside,
 )
 from noack.impairments.words import COUNT, SIGNED_COUNT, WordReader, brief_number
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000

@@ -37,8 +37,8 @@ from noack.impairments.words import (
     percent_text,
     time_ns_text,
 )
-from noack.settings.named_file import NamedFile
 from noack.settings.section import Probability
+from noack.settings.user_files import NamedFile
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 from noack.traces.trace_formats import find_trace, read_trace
 

@@ -12,7 +12,7 @@ from noack.impairments.feature import LossModel, StageTables, Table, Word
 from noack.impairments.loss_models.scripted import MAX_SCRIPT, ScriptedLoss
 from noack.impairments.markov_chain import NotPredictableError, Pattern
 from noack.impairments.words import WordReader
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 
 _SPACES = b" \t\r\n\v\f"
 

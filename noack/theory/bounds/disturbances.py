@@ -24,9 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
+from noack.config.resolution import assumed_model, loop_of
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import assumed_model
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.theory.bounds.contraction import largest_gains, spectral_norm, times

@@ -10,10 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, SteadyState, loop_of, steady_state
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import SteadyState, steady_state
-from noack.config.theory_coverage import UNCERTIFIED_ACKNOWLEDGEMENTS
+from noack.config.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.bounds.disturbances import normal_bounds

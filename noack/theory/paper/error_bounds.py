@@ -30,7 +30,7 @@ from noack.core.linear_systems import (
     transition,
 )
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 _PART_NUMBERS = 2**20
 """Numbers in the jumps that are computed at once."""

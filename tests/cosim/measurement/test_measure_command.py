@@ -18,7 +18,7 @@ from cosim.measurement.measurement_tables import measurement_tables
 from cosim.measurement.network_file import trace_csv
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.config import toml_file
-from noack.config.sections.network_section import NetworkSection
+from noack.config.sections import NetworkSection
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of

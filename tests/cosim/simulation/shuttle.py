@@ -12,10 +12,9 @@ import numpy as np
 
 from cosim.record.run_record import RunRecord
 from netem.channel import RUN_ID, Datagram, Network, channel_of
-from noack.config.loops import phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
 from noack.config.resolution import tables_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, phases_ns
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER, Fate

@@ -16,7 +16,7 @@ from cosim.live.simulated_run import simulate_run
 from cosim.output.all_certificates import Certificates
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_run
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

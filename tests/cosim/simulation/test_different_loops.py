@@ -9,21 +9,20 @@ from cosim.analysis.replay import replay
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.loops import loop_names, loops_of, phases_ns
 from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, loops_of, phases_ns
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import OWNER
 
 NETWORKS: dict[str, Sequence[str]] = {
-    "no losses": ('network.loss={ model = "none" }',),
+    "no losses": ('network.loss={ model = "lossless" }',),
     "numbered losses": ('network.loss={ model = "periodic", period = 3, burst = 2 }',),
     "most losses and a delay": (
         'network.loss={ model = "worst_case" }',
         'network.impairments=[{ kind = "delay", delay_s = 0.011 }]',
     ),
     "lost actuations": (
-        'network.loss={ model = "none" }',
+        'network.loss={ model = "lossless" }',
         'network.actuation={ mansd = 2, loss = { model = "periodic", period = 4, burst = 1 } }',
     ),
 }  # fmt: skip

@@ -13,15 +13,14 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.record.align import align_tables, expected_rms, true_states
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch.batch_interface import setting_of
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.batch import setting_of
+from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.candidate_measures import DesignLimits
 from cosim.studies.design.design_search import design
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, steady_state
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, validate
-from noack.config.state_estimation import steady_state
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.loops import loop_names, loops_of
 from noack.config.resolution import resolve, resolve_run, resolved_loops
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load, toml_text
+from noack.config.scenario import Scenario, loop_names, loops_of
+from noack.config.scenario_file import dumps, load, toml_text, validate
 from noack.core.errors import CallerError
 
 PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
@@ -70,7 +69,7 @@ def test_keys_of_the_entry_change_the_file(content: dict[str, Any], tmp_path: Pa
 def test_an_observer_of_the_top_level_is_not_that_of_the_file(
     content: dict[str, Any], tmp_path: Path
 ) -> None:
-    content |= {"observer": {"kind": "luenberger", "decay_per_s": 5.0}}
+    content |= {"observer": {"kind": "luenberger", "poles_per_s": [-5.0, -6.0]}}
     first, second = loops_of(loaded(tmp_path, content, OTHER))
     assert first.observer is not None
     assert second.observer is None
@@ -119,8 +118,8 @@ NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
     ("other", "what"),
     [
         ({"network": NETWORK | {"mansd": 3}}, "network.mansd is 3 there and 2 in this run"),
-        ({"network": NETWORK | {"loss": {"model": "none"}}},
-         'network.loss.model is "none" there and "bernoulli" in this run'),
+        ({"network": NETWORK | {"loss": {"model": "lossless"}}},
+         'network.loss.model is "lossless" there and "bernoulli" in this run'),
         ({"network": NETWORK | {"limit": 5}}, "network.limit is 5 there and 16384 in this run"),
         ({"certificate": {"late_periods": 1}},
          "certificate.late_periods is 1 there and 2 in this run"),
@@ -155,7 +154,7 @@ def test_a_file_may_say_what_the_run_says(content: dict[str, Any], tmp_path: Pat
         ("parts/other.toml", {"loops": [{"name": "c"}]},
          'loops.0.scenario = "parts/other.toml": that file has loops itself'),
         ("parts/other.toml", {"plant": {"initial_state": [1.0, 2.0]}},
-         "loops.0.plant.initial_state = [1.0, 2.0]: expected 1 entries"),
+         "run.toml: loops.0.plant.initial_state: expected 1 entries (one per state), found 2"),
         ("parts/other.toml", {"trigger": {"policy": "periodic", "perod_s": 0.1}},
          "other.toml: trigger.perod_s = 0.1: unknown key; did you mean period_s?"),
         ("parts/other.toml", {"horizon": 3.0}, "other.toml: horizon = 3.0: unknown key"),
@@ -169,3 +168,9 @@ def test_a_mistake_in_a_loops_file_is_named(
     with pytest.raises(CallerError) as refused:
         load(run)
     assert message in str(refused.value)
+
+
+def test_a_ticket_carries_the_tables(content: dict[str, Any], tmp_path: Path) -> None:
+    """A ticket has all keys, also those without a value."""
+    scenario = loaded(tmp_path, content, OTHER)
+    assert validate(scenario.model_dump(mode="json"), "ticket") == scenario

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.loops import loops_of, phases_ns
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of, phases_ns
 from noack.config.scenario_file import completed, dumps, load, validate
 from noack.core.errors import CallerError
 

@@ -38,8 +38,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.self_triggered import SelfTrigger
 from noack.trigger.send_on_area import SendOnAreaTrigger
-from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
-from noack.trigger.trigger_rule import Forecast
+from noack.trigger.trigger_rule import CodedPolicy, Forecast, Policy, TriggerDecision
 from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import OneLoop

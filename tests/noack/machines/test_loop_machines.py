@@ -34,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.trigger_policy import CodedPolicy
+from noack.trigger.trigger_rule import CodedPolicy
 from plant_server.plant import BLOCK, Plant
 from sensor_node.sensor import Sensor, sensors_of
 from tests.machine_parts import controller_of, machine, sensor_of

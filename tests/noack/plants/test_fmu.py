@@ -15,10 +15,9 @@ import pytest
 from noack.core.errors import CallerError
 from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import PlantEquations, SystemFailedError
-from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
 from noack.plants.systems.plant_linearisation import linearise
-from noack.settings.named_file import located
+from noack.settings.user_files import located
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 

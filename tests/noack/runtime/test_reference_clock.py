@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from benchmarks._driven_clocks import DrivenClocks
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario_file import validate
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record

@@ -17,7 +17,7 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import Coefficients, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     RUNS,
     SEARCH,
     STEPS,

@@ -17,7 +17,7 @@ from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify, certify_box
 from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
-from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
+from tests.oracles.lossy_loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
 
 ROOT = Path(__file__).parents[3]
 

@@ -15,7 +15,7 @@ from noack.theory.certificates.certified_bounds import (
     KnownStatePart,
     integral_until,
 )
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     SEARCH,
     STEPS,
     System,

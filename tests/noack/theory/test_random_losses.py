@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.random_losses.moments import moment_at_events, moments
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import loop_of
-from tests.noack.theory.loops import System, random_system
+from tests.oracles.lossy_loops import System, random_system
 
 EVENTS = 12
 

@@ -26,7 +26,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box
 from noack.theory.paper.theorems import theorem_2
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     STEPS,

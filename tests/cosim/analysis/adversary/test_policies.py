@@ -14,12 +14,12 @@ from cosim.analysis.adversary.loop_flows import SampledFlow, run_of
 from cosim.analysis.adversary.objective import Pattern
 from cosim.analysis.adversary.worst_run import bounds_of
 from cosim.record.run_record import RunRecord
-from cosim.simulation.sampled.sampled_loop import SampledLoop, Scales
+from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
-from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.output.report.figure_files import inline
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,

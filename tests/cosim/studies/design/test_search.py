@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import run_batch, setting_of
+from cosim.simulation.batch import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.candidate_measures import DesignLimits, measure, require_draws
 from cosim.studies.design.design_result import DesignResult

@@ -15,9 +15,9 @@ from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import NoCertificateError
 from noack.theory.random_losses.moments import moments
-from tests.noack.theory.broken_certificates import NoForcedResponse, NoMismatch
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.loops import STEPS, System, random_system, simulate, times_s
+from tests.noack.theory.certificate_kinds.decaying import NoForcedResponse, NoMismatch
+from tests.oracles.lossy_loops import STEPS, System, random_system, simulate, times_s
 
 _RUNS = 300
 _ERRORS = 5

@@ -1,5 +1,7 @@
-"""The network's delays in the conditions that certificates assume."""
+"""The conditions of a scenario's schedule, and the largest times for which a certificate exists."""
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.scenario_certificates import MOST_S, largest
 
 
 @pytest.mark.parametrize(
@@ -60,3 +63,40 @@ def test_the_certified_delay_replaces_the_longest_one(content: dict[str, Any]) -
     assert nominal_conditions(resolved, 2) == longest
     why = "; ".join(assumption.why for assumption in assumptions(resolved))
     assert "up to 3000 ms; the certificates allow for 20 ms" in why
+
+
+GAINS: dict[str, Callable[[float], float]] = {
+    "proportional": lambda share: share,
+    "steep": lambda share: share**9,
+    "flat": lambda share: share**0.1,
+    "offset": lambda share: 0.9 + 0.1 * share,
+    "exponential": lambda share: math.exp(min(share, 500.0) - 1),
+    "unknown above": lambda share: share if share < 1 else math.inf,
+    "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
+    "without a gain": lambda share: 0.0 if share < 1 else 5.0,
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+@pytest.mark.parametrize("limit_s", [3e-6, 2e-3, 0.04, 3.0])
+@pytest.mark.parametrize("usual_s", [0.0, 2e-3, 1.0])
+def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
+    tried: list[float] = []
+
+    def gain(value_s: float) -> float:
+        tried.append(value_s)
+        return GAINS[name](value_s / limit_s)
+
+    assert (1 - 1.1e-3) * limit_s <= largest(gain, usual_s) < limit_s
+    assert len(tried) < 40
+
+
+def test_all_times_or_none_may_have_a_certificate() -> None:
+    assert largest(lambda value_s: 0.5, 0.01) == MOST_S
+    assert largest(lambda value_s: math.inf, 0.01) == 0.0
+
+
+def test_a_smooth_gain_needs_few_certificates() -> None:
+    tried: list[float] = []
+    largest(lambda value_s: tried.append(value_s) or 0.2 + 20 * value_s, 0.004)  # type: ignore[func-returns-value]
+    assert len(tried) <= 10

@@ -11,8 +11,8 @@ A real loop differs from the paper's loop by these effects:
   applies an actuation computed from it.
 
 Without held actuation the plant follows u = K x_c(t) continuously, as in
-:mod:`cosim.simulation.continuous.continuous_loop`; with it, by the exact zero-order hold that the
-live plant uses. The trigger is that of the core, which the sensor has, too.
+:mod:`cosim.simulation.continuous`; with it, by the exact zero-order hold that the live plant uses.
+The trigger is that of the core, which the sensor has, too.
 """
 
 from collections.abc import Callable
@@ -22,12 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from cosim.simulation.continuous import ContinuousLoop
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.trigger.core_rule import fill_rule, rule_rows
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy, fill_rule, rule_rows
 
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""
@@ -53,7 +52,7 @@ class StepSchedule:
 
 
 @dataclass(frozen=True)
-class SampledRun:
+class PlantGridRun:
     """A run on the plant's grid."""
 
     x: Matrix
@@ -62,7 +61,7 @@ class SampledRun:
     """Step of each event."""
 
 
-class SampledLoop:
+class PlantGridLoop:
     """The loop under a schedule."""
 
     def __init__(
@@ -76,7 +75,7 @@ class SampledLoop:
         self._one_step = discretise(system.loop.A, system.loop.B, schedule.period_ns)
 
     @np.errstate(all="ignore")
-    def run(self, *, delay: bool, hold: bool) -> SampledRun:
+    def run(self, *, delay: bool, hold: bool) -> PlantGridRun:
         """Simulate; once the state is not finite, it stays non-finite."""
         schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
         last = len(schedule.measured) - 1
@@ -104,7 +103,7 @@ class SampledLoop:
             while in_flight and in_flight[0].acts_ns <= now_ns:
                 newest = max(newest, in_flight.pop(0), key=lambda update: update.number)
             if step == last:
-                return SampledRun(states, np.array(events, dtype=np.int64))
+                return PlantGridRun(states, np.array(events, dtype=np.int64))
             until = min(step + _BLOCK, last)
             if in_flight:
                 until = min(until, max(in_flight[0].acts_ns // period_ns, step + 1))

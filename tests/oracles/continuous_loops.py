@@ -13,8 +13,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.systems.code_cache import cache_folder, compiler
-from tests.noack.theory.compiled_loops import PART
-from tests.noack.theory.loops import STEPS, Flags, Reals, Steps, System
+from tests.oracles.lossy_loops import PART, STEPS, Flags, Reals, Steps, System
 
 _ORDER = 16
 _HALVINGS = 60

@@ -9,9 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.continuous.continuous_loop import vanished, vanishes_s
-from cosim.simulation.continuous.continuous_run import MAX_EVENTS
-from cosim.simulation.continuous.network_fates import timeless
+from cosim.simulation.continuous import MAX_EVENTS, timeless, vanished, vanishes_s
 from cosim.simulation.exact_simulation import ROW as ROW
 from cosim.simulation.exact_simulation import EventLog, ExactSimulation
 from netem.channel import UPDATE_LINK
@@ -22,7 +20,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
 from noack.impairments.link_settings import LinkSettings
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 
 class Population(NamedTuple):

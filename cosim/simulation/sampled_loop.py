@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from noack.config.resolution import loop_of, policy_of
+from noack.config.resolution import assumed_model, loop_of, policy_of
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import assumed_model
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
