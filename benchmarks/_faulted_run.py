@@ -11,8 +11,8 @@ import psutil
 
 from benchmarks._report import MeasurementError
 from benchmarks.soak.watch import is_of
+from cosim.analysis.loop_statistics import lateness_us
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.timing_statistics import lateness_us
 from cosim.cli import find_scenario
 from cosim.live.launcher import Watcher, launch
 from cosim.record.run_record import RunRecord, load_record

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.live import finalize
 from cosim.output.viewer import run_recording
 

@@ -18,7 +18,7 @@ from benchmarks._faulted_run import STEPS, FaultedRun, Processes, faulted_run, r
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, Figures, Rounds, Row, say
 from benchmarks.soak.watch import udp_port
-from cosim.analysis.timing_statistics import lateness_us
+from cosim.analysis.loop_statistics import lateness_us
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
 

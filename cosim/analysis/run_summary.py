@@ -1,4 +1,7 @@
-"""The summary of a loop, computed from its record."""
+"""The summary of a loop, computed from its record.
+
+:func:`linearisation` compares the linearisation of a non-linear plant with the loop's model.
+"""
 
 import math
 from collections import Counter
@@ -8,33 +11,41 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from cosim.analysis.loss_statistics import (
+from cosim.analysis.loop_statistics import (
+    disturbances,
     drops_by_cause,
     from_controller,
+    latency,
+    lateness,
     missing_rows,
     reported_violations,
+    signal_statistics,
     unintended_losses,
+    watchdog_actions,
 )
-from cosim.analysis.signal_statistics import disturbances, signal_statistics, watchdog_actions
 from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
     ExitPart,
+    LinearisationPart,
     LoopSummary,
+    NoLinearisationPart,
     RestartPart,
     RunSummary,
 )
-from cosim.analysis.timing_statistics import latency, lateness
-from cosim.record.divergence import Divergence, divergence
-from cosim.record.packet_outcomes import packet_outcomes
-from cosim.record.recorded_changes import changes_of
+from cosim.record.run_events import Divergence, changes_of, divergence, packet_outcomes
 from cosim.record.run_record import RunRecord, no_such_loop
+from noack.config.resolution import loop_of
 from noack.config.runtime_parameters import text_of
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.errors import ExitStatus
+from noack.core.errors import ExitStatus, NoackError
+from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
+from noack.plants.plant_settings import PlantSystem
+from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -46,6 +57,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.theory.certificates.assumptions import assumptions
+from plant_server.plant import system_of
 
 
 @dataclass(frozen=True)
@@ -245,3 +257,72 @@ def _seconds(t_ns: int | None) -> float | None:
 
 def _or_none(statistic: Callable[..., Any], values: NDArray[np.float64]) -> float | None:
     return float(statistic(values)) if len(values) else None
+
+
+Linearisation = LinearisationPart | NoLinearisationPart
+_EXACT = 1e-3
+"""Tolerance for an entry with a half-width of 0, as the linearisation uses finite differences."""
+
+
+def linearisation(resolved: Scenario) -> Linearisation | None:
+    """Return the linearisation of a resolved scenario's plant; None for a linear plant.
+
+    Its fields: ``A`` and ``B`` by rows; ``eigenvalues`` of A + BK as pairs of real and imaginary
+    part; ``off_A`` and ``off_B``, A − Â and B − B̂; ``in_box``, whether these are within the
+    half-widths of the scenario's uncertainty box, None without a box. If x is not the whole state,
+    the only field is ``A``, with the value None.
+    """
+    if resolved.coverage.is_linear:
+        return None
+    loop, plant = loop_of(resolved), resolved.plant
+
+    def system_at(x0: Vector) -> PlantSystem:
+        started = plant.model_copy(update={"initial_state": tuple(x0.tolist())})
+        return system_of(resolved.model_copy(update={"plant": started}))
+
+    n, m = loop.n, loop.m
+    try:
+        with np.errstate(all="ignore"):
+            A, B = plant.system.linearisation() or linearise(
+                system_at, n, m, settling_s=plant.system.settling_s
+            )
+    except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
+        A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        return NoLinearisationPart(A=None)
+    off_A, off_B = A - loop.A_model, B - loop.B_model
+    poles = np.linalg.eigvals(A + B @ loop.K)
+    in_box: bool | None = None
+    if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
+        in_box = _within(off_A, plant.uncertainty_A) and _within(off_B, plant.uncertainty_B)
+    return LinearisationPart(
+        A=A.tolist(),
+        B=B.tolist(),
+        eigenvalues=[[float(pole.real), float(pole.imag)] for pole in poles],
+        off_A=off_A.tolist(),
+        off_B=off_B.tolist(),
+        in_box=in_box,
+    )
+
+
+def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
+    allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
+    return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
+
+
+def linearisation_rows(found: Linearisation) -> tuple[tuple[str, str], ...]:
+    """Return a linearisation as text: quantities and their values."""
+    if isinstance(found, NoLinearisationPart):
+        return (("the plant, linearised", "none: x is not its whole state, or it is not smooth"),)
+    slowest = max(real for real, _ in found.eigenvalues)
+    worst, where = max(
+        (abs(entry), f"{name}[{i}, {j}]")
+        for name, off in (("A", found.off_A), ("B", found.off_B))
+        for i, row in enumerate(off, 1)
+        for j, entry in enumerate(row, 1)
+    )
+    box = {True: ", inside the box", False: ", outside the box", None: ""}[found.in_box]
+    return (
+        ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
+        ("  largest difference to the model", f"{where}, by {worst:.3g}{box}"),
+    )

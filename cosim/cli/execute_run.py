@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
     from cosim.output.figure_format import FigureFiles
-    from cosim.record.run_ending import RunEnding
+    from cosim.record.run_directory import RunEnding
     from cosim.studies.campaign.campaign_file import Campaign
     from cosim.studies.campaign.finished_campaign import FinishedCampaign
     from noack.config.scenario import Scenario

@@ -26,7 +26,7 @@ from zenoh.handlers import FifoChannel
 
 from cosim.live.launcher import needed_bytes
 from cosim.output.viewer.live_viewer import has_display
-from cosim.record.environment import environment
+from cosim.record.run_directory import environment
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why

@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cosim.analysis.value_reduction import decimate_all
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.align import align_tables
 from cosim.record.data_frames import events, samples
-from cosim.record.decimate import decimate_all
 from cosim.record.run_record import load_record
 from cosim.simulation.continuous import (
     ContinuousRun,

@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.condition_reader import READ
+from cosim.analysis.claims.condition_reader import READ, AssumptionMonitor
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
-from cosim.record.divergence import GrowthMonitor
-from cosim.record.loop_rows import rows_by_loop
+from cosim.record.record_source import rows_by_loop
+from cosim.record.run_events import GrowthMonitor
 from cosim.record.run_record import Rows
 from noack.config.resolution import resolved_loops, tables_of
 from noack.config.scenario import Scenario, phases_ns

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.claims.claims_by_part import claims_of
+from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.fidelity import fidelity_for_summary
-from cosim.analysis.loss_statistics import list_violations
-from cosim.analysis.model_comparison import linearisation
+from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import Outcome, summarise
+from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
     ExitPart,
     LoopSummary,
@@ -34,12 +33,12 @@ from cosim.record.run_directory import (
     REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
+    RunEnding,
     file_of_loop,
     finished_run,
     read_object,
     refuse_links,
 )
-from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError

@@ -30,7 +30,7 @@ from noack.runtime.command_line import TICKET_ON_STDIN
 
 _COMMON = (
     "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
-    "noack.config.resolution", "noack.core.random_streams", "cosim.record.environment",
+    "noack.config.resolution", "noack.core.random_streams", "cosim.record.run_directory",
 )  # fmt: skip
 """What the processes and the launcher import."""
 _IMPORTS = (

@@ -21,16 +21,17 @@ from typing import TYPE_CHECKING, Any
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ForkServer, fork_server
-from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,
+    EndingFile,
+    RunEnding,
     active_run,
     new_run_dir,
     point_to_latest,
+    write_environment,
     write_scenario,
 )
-from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolve_run, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError

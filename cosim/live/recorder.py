@@ -18,11 +18,11 @@ import zenoh
 from numpy.typing import NDArray
 from zenoh.handlers import FifoChannel, RingChannel
 
+from cosim.analysis.value_reduction import is_long
 from cosim.live.telemetry_store import TelemetryStore
-from cosim.record.decimate import is_long
-from cosim.record.packet_outcomes import updates_in
-from cosim.record.process_reports import report_of, write_reports
+from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
+from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone

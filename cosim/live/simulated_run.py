@@ -4,14 +4,15 @@ import secrets
 import shutil
 from pathlib import Path
 
-from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
+    EndingFile,
+    RunEnding,
     active_run,
     new_run_dir,
     point_to_latest,
+    write_environment,
     write_scenario,
 )
-from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import write_run
 from cosim.simulation.virtual_time import Progress, simulate_loops
 from noack.config.resolution import resolve_run

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CONTROLLER_DELIVERY

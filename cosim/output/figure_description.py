@@ -14,7 +14,7 @@ import numpy as np
 
 from cosim.output import palette
 from cosim.output.palette import Colour
-from cosim.record.decimate import Reals
+from cosim.record.align import Reals
 from noack.core.linear_systems import Matrix
 
 TIME = "time t [s]"

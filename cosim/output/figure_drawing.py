@@ -24,6 +24,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
+from cosim.analysis.value_reduction import decimate
 from cosim.output import palette
 from cosim.output.figure_description import (
     LARGEST,
@@ -45,7 +46,7 @@ from cosim.output.figure_description import (
     finite,
 )
 from cosim.output.figure_style import PAPER, NotebookFigure, layout, rgb, styled
-from cosim.record.decimate import Reals, decimate
+from cosim.record.align import Reals
 
 Shown = tuple[Artist, str]
 """A drawn object and its label in the legend."""

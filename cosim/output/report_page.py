@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from cosim.analysis.over_time import worst_loop
+from cosim.analysis.network_summary import worst_loop
 from cosim.analysis.summary_model import LoopSummary, RunSummary
 from cosim.output import glossary
 from cosim.output.figure_description import FigureDescription

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.claims_by_part import claims_of
-from cosim.analysis.over_time import LoopsOverTime, loops_over_time, quantiles
-from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.loop_statistics import latency_us, lateness_parts
+from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary_model import InFlightPart, RunSummary
-from cosim.analysis.timing_statistics import latency_us, lateness_parts
+from cosim.analysis.value_reduction import QuantileSketch, decimate, decimate_all
 from cosim.output import palette, signal_figures
 from cosim.output.figure_description import (
     Axis,
@@ -34,9 +34,8 @@ from cosim.output.figure_description import (
     time_axis,
 )
 from cosim.output.signal_figures import ClockErrors, LossPanel
-from cosim.record.align import AlignedRun, aligned_parts
-from cosim.record.decimate import Reals, decimate, decimate_all
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.align import AlignedRun, Reals, aligned_parts
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S

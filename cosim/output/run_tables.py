@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.analysis.fidelity import is_against
-from cosim.analysis.model_comparison import linearisation_rows
+from cosim.analysis.run_summary import linearisation_rows
 from cosim.analysis.summary_model import (
     ChangePart,
     Claim,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.fidelity import Fidelity
-from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.value_reduction import QuantileSketch
 from cosim.output import palette
 from cosim.output.figure_description import (
     DASHES,
@@ -36,7 +36,7 @@ from cosim.output.figure_description import (
     time_axis,
 )
 from cosim.output.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
-from cosim.record.decimate import Reals
+from cosim.record.align import Reals
 
 Flags = NDArray[np.bool_]
 

@@ -3,10 +3,11 @@
 At each measurement time t:
 
 * x(t) and x_s(t) are the sensor's values; at an event x_s is the value after its reset. x is
-  measured or estimated by the sensor. With noise or an observer it is not the plant's state, and
-  e_c is the controller's error relative to this x. :mod:`cosim.record.estimation_error` computes
-  the difference between this x and the plant's state;
-* x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')}.
+  measured or estimated by the sensor. With noise or an observer it is not the plant's state
+  (:func:`true_states`), and e_c is the controller's error relative to this x;
+* x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')};
+* :class:`IdentityResidual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
+  known at the newest event.
 
 If a controller dies, there is no x_c until the restarted controller has its first update.
 """
@@ -17,13 +18,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.estimation_error import true_states
 from cosim.record.record_source import joined
-from cosim.record.recorded_changes import model_flow_of
+from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, loop_of, steady_state
 from noack.config.scenario import Scenario
-from noack.core.linear_systems import ModelFlow, row_norms
+from noack.core.linear_systems import ModelFlow, Propagator, row_norms
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -291,3 +291,87 @@ def identity_residual(scenario: Scenario, aligned: AlignedRun, missed: Reals) ->
         return np.full(len(aligned.t_ns), np.nan)
     residual = np.abs(aligned.x_c - aligned.x_s - missed).max(axis=1)
     return np.where(in_common(scenario, aligned), residual, np.nan)
+
+
+def true_states(steps: Rows, t_ns: NDArray[np.int64], column: str = "x") -> Reals:
+    """Return the plant's own state at some times, (k, n); NaN if its row is missing.
+
+    ``column`` of ``plant_step`` is ``x``, or ``z`` for the whole state of a nonlinear plant.
+    """
+    found = np.full((len(t_ns), steps[column].shape[1]), np.nan)
+    if len(steps):
+        place = np.searchsorted(steps["t_ns"], t_ns).clip(max=len(steps) - 1)
+        there = steps["t_ns"][place] == t_ns
+        found[there] = steps[column][place[there]]
+    return found
+
+
+def expected_rms(resolved: Scenario) -> float:
+    """Return the steady-state RMS of ‖x̂ − x‖ from noise and disturbances, for an exact model."""
+    return float(np.sqrt(np.trace(steady_state(resolved).covariance)))
+
+
+class SizeStatistics:
+    """Root mean square and maximum of finite norms, part by part."""
+
+    def __init__(self) -> None:
+        self._squares, self._count = 0.0, 0
+        self.max: float | None = None
+
+    def add(self, norms: Reals) -> None:
+        """Add norms, (k,); those that are not finite are ignored."""
+        norms = norms[np.isfinite(norms)]
+        if len(norms):
+            self._squares += float(np.square(norms).sum())
+            self._count += len(norms)
+            largest = float(norms.max())
+            self.max = largest if self.max is None else max(self.max, largest)
+
+    @property
+    def rms(self) -> float | None:
+        """Their root mean square; None without values."""
+        return float(np.sqrt(self._squares / self._count)) if self._count else None
+
+
+UNKNOWN = 2**62
+"""Number of missing events where sensor and controller share no update."""
+
+
+class SinceEvent(NamedTuple):
+    """The newest event t_k at each of some measurements."""
+
+    age_s: Reals
+    """t − t_k, (k,); NaN before the first event."""
+    predicted: Reals
+    """e^{(A+BK)(t−t_k)} x(t_k), with the x that the sensor knows, (k, n); NaN before."""
+    missing: NDArray[np.int64]
+    """Number of events after the newest one that the controller has received, (k,)."""
+
+
+class EventFollower:
+    """Follows the newest event of a run of a resolved scenario."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        loop = loop_of(scenario)
+        self._scenario = scenario
+        self._propagate = Propagator(loop.A + loop.B @ loop.K)
+        self._x = np.full(loop.n, np.nan)
+        self._event_ns = 0
+        self._event = NO_SEQUENCE
+
+    @np.errstate(all="ignore")  # a run may diverge
+    def take(self, rows: Rows, aligned: AlignedRun) -> SinceEvent:
+        """Return what follows from the newest event, at the next measurements."""
+        new = np.flatnonzero(rows["event"] != NO_SEQUENCE)
+        events = np.append(self._event, rows["event"][new])
+        event_ns = np.append(self._event_ns, rows["t_ns"][new])
+        x = np.concatenate([self._x[None], rows["x"][new]])
+        newest = np.searchsorted(new, np.arange(len(rows)), "right")
+        period_ns = self._scenario.timing.measurement_period_ns
+        age_ns = rows["t_ns"] - event_ns[newest]
+        predicted = self._propagate.leaps(x[newest], age_ns // period_ns, period_ns)
+        age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
+        shared = in_common(self._scenario, aligned)
+        missing = np.where(shared, events[newest] - aligned.received, UNKNOWN)
+        self._event, self._event_ns, self._x = int(events[-1]), int(event_ns[-1]), x[-1]
+        return SinceEvent(age_s, predicted, missing)

@@ -5,7 +5,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosim.record.align import align_tables
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (

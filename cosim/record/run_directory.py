@@ -1,18 +1,28 @@
-"""The run directory: the names of its files, and the search for the newest one."""
+"""The run directory: its files, the search for the newest one, how and where a run took place.
+
+:class:`EndingFile` stores how the run ended as soon as it ends. The file is created blank when the
+run begins. This reserves its space on the disk, so the reason can be stored even if the disk is
+full or no longer writable. :func:`write_environment` stores versions, computer and command.
+"""
 
 import contextlib
 import json
 import os
+import platform
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from datetime import datetime
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from noack.core.errors import CallerError, MachineError, why
-from noack.core.file_access import copy_whole, locked, read_regular, write_whole
+from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
+from noack.core.file_access import copy_whole, locked, open_growing, read_regular, write_whole
+from noack.core.process_limits import cores
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
@@ -231,3 +241,130 @@ def _locked(run_dir: Path, *, shared: bool = False) -> Iterator[bool]:
         except OSError as error:
             raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
         yield alone
+
+
+_RESERVED_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class RunEnding:
+    """How a run ended."""
+
+    run_dir: Path
+    run_id: int
+    status: ExitStatus
+    reason: str
+    startup_s: float | None = None
+    """Wall time from the launch to simulated time 0; None if unknown."""
+
+
+class EndingFile:
+    """The file in which a run's launcher stores how the run ends.
+
+    As a context manager it stores the error that leaves the context, unless an end is stored.
+
+    Raises:
+        MachineError: the file cannot be written.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._is_blank = True
+        try:
+            self._file = os.fdopen(open_growing(run_dir / ENDING_FILE), "wb", buffering=0)
+            self._file.write(b" " * _RESERVED_BYTES)
+        except OSError as error:
+            raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        error: BaseException | None,
+        _traceback: TracebackType | None,
+    ) -> None:
+        if self._is_blank and isinstance(error, NoackError):
+            self.store(error.exit_status, str(error))
+        self._file.close()
+
+    def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
+        """Store how the run ended, under the keys of its summary."""
+        self._is_blank = False
+        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        text = json.dumps(found).encode().ljust(_RESERVED_BYTES)
+        with contextlib.suppress(OSError):  # the terminal also shows the ending
+            self._file.seek(0)
+            self._file.write(text)
+            self._file.truncate()
+
+
+Kind = Literal["live", "simulated"]
+"""Whether a run used processes (live) or virtual time (simulated)."""
+
+_PACKAGES = ("noack", "numpy", "scipy", "eclipse-zenoh", "rerun-sdk", "pyarrow", "pydantic")
+_ARITHMETIC = ("noack", "numpy", "scipy")
+
+
+def environment(kind: Kind) -> dict[str, Any]:
+    """Return the content of ``environment.json``."""
+    return {
+        "kind": kind,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "system": platform.platform(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": cores(),
+    }
+
+
+def write_environment(run_dir: Path, kind: Kind, run_name: str | None = None) -> None:
+    """Write ``environment.json`` into a run directory; ``run_name`` is a live run's."""
+    content = environment(kind) | ({} if run_name is None else {"run_name": run_name})
+    write_whole(run_dir / ENVIRONMENT_FILE, json.dumps(content, indent=2))
+
+
+def kind_of(run_dir: Path) -> Kind:
+    """Return the kind of a run from its environment file; live if the file is missing."""
+    stored = read_object(run_dir / ENVIRONMENT_FILE)
+    return "simulated" if stored.get("kind") == "simulated" else "live"
+
+
+def changed_since(run_dir: Path) -> list[str]:
+    """Return the changes since the run that may affect its arithmetic, in words."""
+    return _changes(run_dir, ("python", "machine", "processor"), _ARITHMETIC)
+
+
+def all_changes_since(run_dir: Path) -> list[str]:
+    """Return all changes of versions and machine since the run, in words."""
+    return _changes(run_dir, ("python", "system", "machine", "processor", "cores"), _PACKAGES)
+
+
+def _changes(run_dir: Path, keys: Sequence[str], names: Sequence[str]) -> list[str]:
+    then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
+    packages = then.get("packages")
+    packages = packages if isinstance(packages, dict) else {}
+    pairs = [
+        *((key, then.get(key), now[key]) for key in keys),
+        *((name, packages.get(name), now["packages"][name]) for name in names),
+    ]
+    return [f"{name} was {old}, is {new}" for name, old, new in pairs if old != new]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor()

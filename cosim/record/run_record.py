@@ -12,28 +12,35 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.environment import Kind, kind_of
-from cosim.record.loop_rows import LoopTables, NetworkRows, count_of, with_loop
-from cosim.record.process_lives import Life, LifeNumbers, RowCounts, generations, lives_of
-from cosim.record.process_reports import (
+from cosim.record.processes import (
+    LIFE_COLUMNS,
+    Life,
+    LifeNumbers,
+    RowCounts,
     entries_of_loop,
+    generations,
     joint_reports,
+    lives_of,
     report_entries,
     valid_reports,
 )
 from cosim.record.record_source import (
     BATCH_ROWS,
     DerivedRows,
+    LoopTables,
+    NetworkRows,
     RecordSource,
     RowsInMemory,
     Slice,
+    count_of,
     joined,
     packed,
     slices,
     with_columns,
+    with_loop,
 )
 from cosim.record.record_source import Rows as Rows
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
 from noack.config.resolution import (
     LoopMatrices,
     is_of_network,
@@ -139,8 +146,15 @@ class RunRecord:
 
         A part holds at most ``BATCH_ROWS`` steps of the plant; a short run is one part.
         """
-        columns = (*columns, "now_ns") if columns else ()
-        return slices(self.source, tables or [*self.tables], self._slice_ns, columns)
+        names, columns = tables or [*self.tables], (*columns, "now_ns") if columns else ()
+        if any(self.count(table) > BATCH_ROWS for table in names):
+            yield from slices(self.source, names, self._slice_ns, columns)
+        elif any(map(self.count, names)):
+            types = {table: with_columns(self.source.types[table], columns) for table in names}
+            yield {
+                table: joined([*self.source.batches(table, columns)], dtype)
+                for table, dtype in types.items()
+            }
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -184,10 +198,9 @@ class RunRecord:
     def lives(self, role: str) -> list[Life]:
         """The generations of a process, in order."""
         if role not in self._lives:
-            self._lives[role] = lives_of(
-                self.source, self.owned_by(role), self.life_numbers(role), self._reports_of(role),
-                self._slice_ns,
-            )  # fmt: skip
+            tables, reports = self.owned_by(role), self._reports_of(role)
+            parts = self.slices(*tables, columns=LIFE_COLUMNS) if tables else ()
+            self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
         return self._lives[role]
 
     def row_counts(self, role: str) -> list[RowCounts]:

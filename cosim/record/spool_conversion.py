@@ -1,14 +1,21 @@
-"""Converts the spool of a run to its record: all spools merged, without duplicate rows."""
+"""Converts the spool of a run to its record: all spools merged, without duplicate rows.
+
+A spool is nearly sorted: batches follow each other, except those that were sent again. It is read
+in segments of consecutive batches, in the order of their first inputs. The rows of one loop are
+merged in bounded memory; of several loops, as many are sorted at once as fit into memory.
+"""
 
 import json
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.record.process_reports import add_kept_reports
-from cosim.record.record_source import Rows
+from cosim.record.processes import add_kept_reports
+from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
 from cosim.record.run_record import (
     RecordedRun,
@@ -17,7 +24,6 @@ from cosim.record.run_record import (
     vector_names,
     write_tables,
 )
-from cosim.record.spool_merge import by_loop, merged, spool_segments
 from noack.config.resolution import has_loop, run_tables
 from noack.config.scenario import loop_names
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
@@ -26,7 +32,101 @@ from noack.core.file_access import remove_folder
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.spool import SPOOL, spool_files, stored_lines
+from noack.runtime.spool import SPOOL, batch_bytes, batches_in, spool_files, stored_lines
+
+_SEGMENT_BYTES = 1024 * 1024
+
+
+class Segment(NamedTuple):
+    """Rows of a table that can be read at once; the numbers of their inputs."""
+
+    first: int
+    last: int
+    read: Callable[[], Rows]
+
+    def of_loop(self, number: int) -> "Segment":
+        """Return the rows of a loop."""
+
+        def read() -> Rows:
+            rows = self.read()
+            return rows.compress(rows[LOOP] == number)
+
+        return self._replace(read=read)
+
+
+def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
+    """Yield the segments of a table in a spool."""
+    for path in spool_files(spool, table):
+        for begin, end, rows in _parts(path, dtype):
+            if len(rows):
+                read = partial(_read, path, begin, end, dtype)
+                yield Segment(int(rows["input"].min()), int(rows["input"].max()), read)
+
+
+def _parts(
+    path: Path, dtype: np.dtype[np.void], begin: int = 0, end: int | None = None
+) -> Iterator[tuple[int, int, Rows]]:
+    """Yield begin, end and rows of consecutive batches of a file, about a segment at a time."""
+    with path.open("rb", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END) if end is None else end
+        while begin < end:
+            file.seek(begin)
+            data = memoryview(file.read(min(_SEGMENT_BYTES, end - begin)))
+            batches, complete = batches_in(data)
+            if not complete:  # a large batch, or the last one, which is incomplete or damaged
+                length = batch_bytes(data)
+                if length is None or begin + length > end:
+                    return
+                file.seek(begin)
+                batches, complete = batches_in(memoryview(file.read(length)))
+            # Rows of a damaged batch cannot be located.
+            whole = [rows for rows in batches if len(rows) % dtype.itemsize == 0]
+            yield begin, begin + complete, np.frombuffer(b"".join(whole), dtype)
+            begin += complete
+
+
+def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:
+    return joined([rows for _, _, rows in _parts(path, dtype, begin, end)], dtype)
+
+
+def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
+    """Yield the rows in the order of the machine's inputs, without duplicates.
+
+    Of several rows with the same input of a loop, the first one is taken.
+    """
+    ordered = sorted(segments, key=lambda segment: segment.first)
+    waiting: list[Rows] = []
+    for segment, after in zip(ordered, [*ordered[1:], None], strict=False):
+        waiting.append(segment.read())
+        if after is not None and sum(map(len, waiting)) < BATCH_ROWS:
+            continue
+        rows = in_order(joined(waiting, dtype))
+        ready = len(rows) if after is None else int(np.searchsorted(rows["input"], after.first))
+        if ready:
+            yield rows[:ready]
+        waiting = [rows[ready:]]
+
+
+def in_order(rows: Rows) -> Rows:
+    """Return rows in the order of their inputs, without duplicates."""
+    inputs = rows["input"]
+    if (np.diff(inputs) > 0).all():
+        return rows
+    loops = rows[LOOP] if LOOP in (rows.dtype.names or ()) else np.zeros(len(rows), np.uint16)
+    order = np.lexsort((loops, inputs))  # stable
+    again = (np.diff(inputs[order]) == 0) & (np.diff(loops[order]) == 0)
+    return np.asarray(rows.take(order[np.append(True, ~again)]))
+
+
+def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range) -> list[Rows]:
+    """Return the rows of each of some loops, each in order and without duplicates."""
+    read = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
+    own = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in read]
+    rows = joined(own, dtype)
+    rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
+    ends = np.searchsorted(rows[LOOP], np.arange(loops.start, loops.stop), "right")
+    return [in_order(rows[first:end]) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
+
 
 _BLOCK_BYTES = 64 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
@@ -74,14 +174,18 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     path = run_dir / RECORD / f"{table}.parquet"
     segments = [*group_segments(path, dtype)] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
-    if loops == 1 or not has_loop(table):
+    if not has_loop(table):
         yield from merged(segments, dtype)
         return
     paths = [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
     all_bytes = sum(one.stat().st_size for one in paths)
     at_once = max(loops * _BLOCK_BYTES // max(all_bytes, _BLOCK_BYTES), 1)
     for first in range(0, loops, at_once):
-        yield from by_loop(segments, dtype, range(first, min(first + at_once, loops)))
+        block = range(first, min(first + at_once, loops))
+        if len(block) > 1:
+            yield from by_loop(segments, dtype, block)
+        else:
+            yield from merged([segment.of_loop(first) for segment in segments], dtype)
 
 
 def remove_spool(run_dir: Path) -> None:

@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cosim.record.loop_rows import without_loop
 from cosim.record.record_source import (
     BATCH_ROWS,
     RecordSource,
@@ -24,8 +23,9 @@ from cosim.record.record_source import (
     RowsInMemory,
     joined,
     with_columns,
+    without_loop,
 )
-from cosim.record.spool_merge import Segment
+from cosim.record.spool_conversion import Segment
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
@@ -309,11 +309,11 @@ def _arrays(rows: Rows) -> dict[str, Any]:
     return columns
 
 
-def _array(values: NDArray[Any]) -> pa.Array:
+def _array(values: NDArray[Any]) -> Any:
     """Return numbers or bytes as an Arrow array; ``pa.array`` would import pandas."""
     kind, width = values.dtype, values.dtype.itemsize
     type_ = pa.binary(width) if kind.kind == "V" else pa.from_numpy_dtype(kind)
-    data = pa.py_buffer(np.ascontiguousarray(values).view(np.uint8))
+    data = pa.py_buffer(np.ascontiguousarray(values).data.cast("B"))
     return pa.Array.from_buffers(type_, len(values), [None, data])
 
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.divergence import Divergence, divergence
+from cosim.record.run_events import Divergence, divergence
 from cosim.simulation.exact_simulation import (
     DIVERGED,
     OK,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import controllers_of
-from cosim.record.loop_rows import NetworkRows, without_loop
+from cosim.record.record_source import NetworkRows, without_loop
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.parameter_changes import change_notice, scheduled

@@ -1,10 +1,10 @@
 """Live control of a running emulator: its file, by which commands find it, and its queries.
 
 While an emulator runs, its file is in the user's runtime directory
-(:mod:`noack.runtime.private_folder`), beside the Unix socket on which it listens, which only its user can reach. Below ``netem/NAME`` it
-answers ``report``, ``settings`` and ``change``, and publishes ``statistics`` once a second, as
-docs/netem-control.md describes, in a thread of its own. A query with a mistake is answered with one
-line, and changes nothing.
+(:mod:`noack.runtime.private_folder`), beside the Unix socket on which it listens, which only its
+user can reach. Below ``netem/NAME`` it answers ``report``, ``settings`` and ``change``, and
+publishes ``statistics`` once a second, as docs/netem-control.md describes, in a thread of its own.
+A query with a mistake is answered with one line, and changes nothing.
 """
 
 import json

@@ -19,8 +19,7 @@ import noack
 from cosim.cli import app
 from cosim.measurement.live.probe_rows import ProbeRows
 from cosim.output.viewer.recording import RecordingFile
-from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, finished_run
-from cosim.record.run_ending import EndingFile
+from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter
 from netem.fates import FateRecorder
 from netem.relay_links import LinkSpec

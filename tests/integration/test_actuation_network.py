@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP

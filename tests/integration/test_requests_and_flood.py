@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.record.recorded_changes import changes_of
+from cosim.record.run_events import changes_of
 from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime import run_registry

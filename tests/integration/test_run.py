@@ -285,7 +285,7 @@ def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> 
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [
         {e.label: e.values for e in envelopes if e.quantity == "x"}[label]
-        for label in (CERTIFIED, "certified from the newest event")
+        for label in (CERTIFIED, "bound, given x at the last event")
     ]
     chunks = read(finished.run_dir / "recording.rrd")
     t_ns, drawn = series(chunks, blueprint.ERROR)

@@ -10,7 +10,7 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import read_summary
 from cosim.output.run_tables import network_rows
-from cosim.record.packet_outcomes import updates_in
+from cosim.record.run_events import updates_in
 from cosim.record.run_record import RunRecord, load_record, load_run
 from noack.config.scenario import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate

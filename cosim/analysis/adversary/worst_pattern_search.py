@@ -3,8 +3,8 @@
 The search first evaluates regular and random patterns, improves each by changes of single
 decisions, and runs a beam search. Then it searches all patterns, depth first, up to a number of
 nodes. If this covers all patterns, the result is exact: no admissible pattern is worse. In
-continuous time this is so within the resolution of :mod:`cosim.analysis.adversary.segments`, and
-the reference simulator has to confirm the value.
+continuous time this is so within the resolution of :mod:`cosim.analysis.adversary.loop_flows`,
+and the reference simulator has to confirm the value.
 """
 
 import math
@@ -14,18 +14,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from cosim.analysis.adversary.beam_search import search_beam
-from cosim.analysis.adversary.cost_bound import cost_ceiling
-from cosim.analysis.adversary.loss_patterns import guess, improve
-from cosim.analysis.adversary.objective import Objective, measure_of
-from cosim.analysis.adversary.pattern_tree import search_tree
-from cosim.analysis.adversary.sampled_flow import SampledFlow
-from cosim.analysis.adversary.sampled_run import SampledRun, run_of
-from cosim.analysis.adversary.search_nodes import Pattern, PatternSearch, SearchReport
-from cosim.analysis.adversary.segments import SegmentFlow, evaluate
-from cosim.analysis.adversary.worst_disturbance import Bounds, bounds_of, worst_causes
-from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
+from cosim.analysis.adversary.loop_flows import (
+    SampledFlow,
+    SampledRun,
+    SegmentFlow,
+    evaluate,
+    run_of,
+)
+from cosim.analysis.adversary.objective import Objective, Pattern, measure_of, weight_of
+from cosim.analysis.adversary.pattern_search import (
+    Ceiling,
+    Nodes,
+    PatternSearch,
+    SearchReport,
+    guess,
+    improve,
+    search_beam,
+    search_tree,
+)
+from cosim.analysis.adversary.worst_run import (
+    Bounds,
+    Worst,
+    bounds_of,
+    certified_value,
+    reported,
+    worst_causes,
+)
 from cosim.simulation.continuous import (
+    ContinuousLoop,
     ContinuousRun,
     continuous_loop_of,
     network_fates,
@@ -33,7 +49,10 @@ from cosim.simulation.continuous import (
 )
 from cosim.simulation.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
+from noack.core.linear_systems import Vector
 from noack.core.random_streams import stream
+from noack.theory.bounds.enclosure import NotDecayingError, response
+from noack.theory.bounds.gains import ErrorGains, Output
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
@@ -193,3 +212,56 @@ def _search(search: PatternSearch, own: Pattern, beam: int, most_nodes: int) -> 
     search.step = "changes"
     improve(search, search.pattern, search.value, _NODES_TO_IMPROVE)
     return False
+
+
+def cost_ceiling(
+    system: ContinuousLoop, longest_burst: int | None, horizon_s: float
+) -> Ceiling | None:
+    """Return an upper bound of what the rest of a run adds to ∫‖x‖².
+
+    From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞),
+
+        ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B U‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
+
+    by Young's inequality for the convolution, with K = U R. By identity (I1) every pattern has
+    ‖R e_c‖ ≤ D level(t): D sums the gains of the present e_s and of the longest burst of missed
+    ones, at any distance. The bound is cheap and prunes the late part of the search tree. There is
+    no comparable bound for suprema: they may occur at any time.
+
+    None if A + BK is not stable, or bursts may be of any length.
+    """
+    from scipy.linalg import solve_continuous_lyapunov
+
+    if longest_burst is None:
+        return None
+    loop, trigger = system.loop, system.decaying
+    closed = loop.A + loop.B @ loop.K
+    models = _models(system)
+    missing = models.now(Output.GAIN) + models.missing(Output.GAIN, longest_burst, 0.0)
+    try:
+        pushed = response(closed, loop.B @ models.split_K[0])
+    except NotDecayingError:
+        return None
+    gain = pushed.through(np.eye(loop.n)).integral() * missing
+    P = solve_continuous_lyapunov(closed.T, -np.eye(loop.n))
+    rate, beta = 2 * models.alpha_per_s, trigger.beta
+
+    def ceiling(nodes: Nodes) -> Vector:
+        x, rest_s = nodes.z[:, : loop.n], horizon_s - nodes.t_s
+        own = np.einsum("ai,ij,aj->a", x, P, x)
+        faded = -np.expm1(-rate * rest_s) / rate if rate else rest_s
+        level = beta**2 * np.exp(-rate * nodes.t_s) * faded + trigger.floor**2 * rest_s
+        return np.asarray((np.sqrt(own) + gain * np.sqrt(level)) ** 2)
+
+    return ceiling
+
+
+def _models(system: ContinuousLoop) -> ErrorGains:
+    """Return the gains at the threshold's rate if the models decay faster, otherwise at rate 0."""
+    loop, weight = system.loop, weight_of(system)
+    gains = ErrorGains(loop.H, loop.K, weight, system.decaying.alpha_per_s)
+    try:
+        gains.missing(Output.GAIN, 1, 0.0)
+    except NotDecayingError:
+        return ErrorGains(loop.H, loop.K, weight, 0.0)
+    return gains

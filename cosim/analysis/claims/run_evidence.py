@@ -1,4 +1,8 @@
-"""The data that claims are checked against: signals, observed conditions, certificates."""
+"""The data that claims are checked against: signals, observed conditions, certificates.
+
+Theorem 1's Δ (:func:`trajectory_delta`) depends on the trajectory and on the true plant, so it can
+be computed only after a run. It is the largest one over all intervals between two deliveries.
+"""
 
 import math
 import sys
@@ -22,18 +26,24 @@ from cosim.analysis.claims.observed_conditions import (
     earliest,
     guarantee_causes,
 )
-from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.analysis.signal_statistics import (
+from cosim.analysis.loop_statistics import (
     SampleFacts,
     SampleFactsReader,
     shares_update,
     signal_statistics,
 )
-from cosim.record.align import AlignedRun, aligned_parts, identity_residual
+from cosim.record.align import (
+    UNKNOWN,
+    AlignedRun,
+    EventFollower,
+    SinceEvent,
+    aligned_parts,
+    identity_residual,
+)
 from cosim.record.run_record import RunRecord
-from cosim.record.since_event import UNKNOWN, EventFollower, SinceEvent
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.bounds.terms import NetworkConditions
@@ -49,7 +59,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.scenario_certificates import certify, certify_box
 from noack.theory.paper.error_bounds import ErrorMonitor
-from noack.theory.paper.theorems import Theorem2, theorem_2
+from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
@@ -297,3 +307,102 @@ def scheduled_certificates(
         conditions, error = conditions._replace(start_s=0.0), start_error
     found = [certify(scenario, conditions, error), certify_box(scenario, conditions, error)]
     return [certificate for certificate in found if certificate is not None]
+
+
+class _Start(NamedTuple):
+    """An event from which an interval starts."""
+
+    event: int
+    received: int
+    """The controller's newest update at that time."""
+
+
+def trajectory_delta(record: RunRecord, until_s: float = math.inf) -> float | None:
+    """Return Theorem 1's Δ from a recorded trajectory; None if there is none, or if W ≠ I.
+
+    The theorem's assumptions hold until ``until_s``.
+    """
+    loop, trigger = record.loop, record.scenario.decaying
+    if loop.weight is not None:
+        return None
+    kappa = _model_decay(record)
+    starts, longest_s = [], []
+    for start, interval in _intervals(record, until_s):
+        starts.append(start)
+        longest_s.append(longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, kappa))
+    if not starts:
+        return None
+    # Δ increases with the interval: only the longest interval from each event is needed.
+    stretches: dict[int, int] = {}
+    first = 0  # index of the first missed event
+    for index, start in enumerate(starts):
+        while first <= index and starts[first].event <= start.received:
+            first += 1
+        if first <= index and start.received != NO_SEQUENCE:
+            stretches[first] = index + 1
+    found = [
+        theorem_1(loop.H, trigger.alpha_per_s, missed_s)
+        for missed_s in undominated([longest_s[first:end] for first, end in stretches.items()])
+    ]
+    delta = max(found, default=1.0)
+    return delta if math.isfinite(delta) else None
+
+
+def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
+    """Return the sequences that no other one dominates: only they can have the largest Δ.
+
+    Δ increases with every δ̃_k, the sum of a sequence from its interval k on.
+    """
+    most = max(map(len, stretches), default=0)
+    reaches = np.zeros((len(stretches), most))
+    for row, stretch in zip(reaches, stretches, strict=True):
+        row[: len(stretch)] = np.cumsum(stretch[::-1])[::-1]
+    largest: list[int] = []
+    for place in np.argsort(-reaches.sum(axis=1), kind="stable").tolist():
+        if not (reaches[largest] >= reaches[place]).all(axis=1).any():
+            largest.append(place)
+    return [stretches[place] for place in largest]
+
+
+def _model_decay(record: RunRecord) -> float:
+    """Return κ, a decay rate of the model: α if the model decays at least that fast."""
+    H = record.loop.H
+    if not H.any():
+        return 0.0
+    return min(record.scenario.decaying.alpha_per_s, max(-spectral_abscissa(H), 0.0))
+
+
+def _intervals(record: RunRecord, until_s: float) -> Iterator[tuple[_Start, Interval]]:
+    """Yield the trajectory from every event before ``until_s`` to the next event."""
+    propagate = Propagator(record.loop.H)
+
+    def interval(t_ns: NDArray[np.int64], x: Matrix) -> Interval:
+        model = [propagate(x[0], int(age_ns)) for age_ns in t_ns - t_ns[0]]
+        return Interval(
+            np.asarray(t_ns * 1e-9),
+            np.linalg.norm(x, axis=1),
+            np.linalg.norm(np.array(model), axis=1),
+        )
+
+    start: _Start | None = None
+    t_ns, x = np.zeros(0, np.int64), np.zeros((0, record.loop.n))
+    for part in aligned_parts(record):
+        joined, event = part.aligned, part.rows["event"]
+        before = len(t_ns)
+        t_ns, x = np.append(t_ns, joined.t_ns), np.concatenate([x, joined.x])
+        first = 0
+        for place in np.flatnonzero(event != NO_SEQUENCE).tolist():
+            if start is not None:
+                yield (
+                    start,
+                    interval(t_ns[first : before + place + 1], x[first : before + place + 1]),
+                )
+            start, first = None, before + place
+            if joined.t_ns[place] * 1e-9 >= until_s:
+                return
+            start = _Start(int(event[place]), int(joined.received[place]))
+        if start is None:
+            first = len(t_ns)
+        t_ns, x = t_ns[first:], x[first:]
+    if start is not None:
+        yield start, interval(t_ns, x)

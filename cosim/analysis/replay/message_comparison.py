@@ -10,8 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.replay.input_replay import NONE_SENT, Numbers, SentMessages, received_vectors
-from cosim.analysis.replay.machine_replay import MachineReplay
+from cosim.analysis.replay.machine_replay import (
+    NONE_SENT,
+    MachineReplay,
+    Numbers,
+    SentMessages,
+    received_vectors,
+)
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord

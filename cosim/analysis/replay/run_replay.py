@@ -2,11 +2,38 @@
 
 from collections.abc import Iterable, Sequence
 
-from cosim.analysis.replay import Replay, replay
-from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay
+import numpy as np
+
+from cosim.analysis.replay.machine_replay import MachineReplay
+from cosim.analysis.replay.message_comparison import MessageComparison
+from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.run_record import RecordedRun
+from cosim.record.run_record import RecordedRun, RunRecord
 from noack.protocol.topology import LOOP_ROLES
+
+
+def replay(record: RunRecord) -> Replay:
+    """Replay a run and compare it with its record; a process is replayed up to its first gap.
+
+    In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
+    the network, or that of a loop, whose network is not replayed. The record is read part by part,
+    so that memory does not grow with the length of the run.
+    """
+    roles = ("netem",) if record.is_network else LOOP_ROLES
+    machines = {
+        role: MachineReplay(role, record)
+        for role in roles
+        if record.number is None or role != "netem"
+    }
+    messages = None if record.is_network else MessageComparison(record, machines)
+    with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
+        for part in record.slices():
+            for machine in machines.values():
+                machine.take(part)
+            if messages is not None:
+                messages.take(part)
+    results = tuple(result for one in machines.values() for result in one.results)
+    return Replay(processes=results, messages=() if messages is None else messages.results())
 
 
 def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:

@@ -140,10 +140,10 @@ def replay(
     json: cli.JsonOption = False,
 ) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit."""
-    from cosim.analysis.replay.replay_table import print_replay
+    from cosim.analysis.replay.replay_result import print_replay
     from cosim.analysis.replay.run_replay import replay_run
     from cosim.live.progress import PatientConsole
-    from cosim.record.environment import changed_since
+    from cosim.record.run_directory import changed_since
     from cosim.record.run_record import load_run
 
     path = chosen_run(run_dir, runs)

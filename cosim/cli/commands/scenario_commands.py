@@ -165,7 +165,7 @@ def _check_loops(scenario: "Scenario", *, json: bool) -> int:
 def _print_plant(console: "Console", resolved: "Scenario") -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from controller_node.controller import law_of
-    from cosim.analysis.model_comparison import linearisation, linearisation_rows
+    from cosim.analysis.run_summary import linearisation, linearisation_rows
     from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:

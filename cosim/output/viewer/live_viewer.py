@@ -34,7 +34,7 @@ from types import FrameType
 from typing import IO, Any, Self
 from urllib.parse import parse_qs, quote
 
-from cosim.analysis.over_time import worst_loop
+from cosim.analysis.network_summary import worst_loop
 from cosim.analysis.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import (

@@ -20,7 +20,7 @@ from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
 from cosim.record.align import AlignedRun
-from cosim.record.environment import Kind
+from cosim.record.run_directory import Kind
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError, why

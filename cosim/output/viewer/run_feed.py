@@ -14,12 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.network_summary import counts_inside, times_inside
-from cosim.analysis.over_time import INTERVALS, add_link_bytes, empty_over_time, places
+from cosim.analysis.network_summary import (
+    INTERVALS,
+    add_link_bytes,
+    counts_inside,
+    empty_over_time,
+    places,
+    times_inside,
+)
 from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.run_recording import ERROR, SIZE, NetworkRecording
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
-from cosim.record.loop_rows import rows_by_loop
+from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
 from noack.config.resolution import loop_of, resolved_loops, tables_of
 from noack.config.scenario import Scenario, phases_ns

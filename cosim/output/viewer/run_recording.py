@@ -33,8 +33,15 @@ from matplotlib import colormaps
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from cosim.analysis.over_time import QUANTILES, WorstLoop, loops_over_time, quantiles, worst_loop
+from cosim.analysis.network_summary import (
+    QUANTILES,
+    WorstLoop,
+    loops_over_time,
+    quantiles,
+    worst_loop,
+)
 from cosim.analysis.summary_model import RunSummary
+from cosim.analysis.value_reduction import Reals, is_long
 from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
@@ -49,9 +56,7 @@ from cosim.output.viewer.recording import (
     about,
 )
 from cosim.output.viewer.table_feed import ViewFeed, log_level
-from cosim.record.decimate import Reals, is_long
-from cosim.record.environment import Kind
-from cosim.record.run_directory import RECORDING_FILE, file_of_loop
+from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.config.resolution import loop_of, resolved_loops
 from noack.config.scenario import Scenario, loop_names, phases_ns

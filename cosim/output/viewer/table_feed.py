@@ -7,22 +7,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.value_reduction import decimate_all
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.recording import RunView
 from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
+    EventFollower,
     controller_track,
     in_common,
     initial_track,
     join,
+    true_states,
 )
-from cosim.record.decimate import decimate_all
-from cosim.record.estimation_error import true_states
-from cosim.record.packet_outcomes import updates_in
-from cosim.record.recorded_changes import claimed_until_s, model_flow
+from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
-from cosim.record.since_event import EventFollower
 from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S

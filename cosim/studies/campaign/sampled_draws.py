@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from cosim.record.align import align_tables, in_common
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch import ROW
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS

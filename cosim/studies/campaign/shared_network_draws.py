@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.batch import ROW

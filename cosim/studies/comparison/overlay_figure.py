@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cosim.analysis.value_reduction import Reals
 from cosim.output import palette
 from cosim.output.figure_description import (
     TIME,
@@ -24,7 +25,6 @@ from cosim.output.figure_description import (
 from cosim.output.figure_files import FIGURE_SUFFIXES, save_figure
 from cosim.output.page_kit import templates
 from cosim.record.align import AlignedRun, align_tables
-from cosim.record.decimate import Reals
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError

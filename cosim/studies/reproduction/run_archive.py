@@ -16,7 +16,6 @@ from typing import IO, Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cosim.live.finalize import reopen
-from cosim.record.environment import Kind, kind_of
 from cosim.record.run_directory import (
     ENDING_FILE,
     ENVIRONMENT_FILE,
@@ -24,6 +23,8 @@ from cosim.record.run_directory import (
     REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
+    Kind,
+    kind_of,
 )
 from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load

@@ -15,9 +15,8 @@ from cosim.analysis.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.output.run_tables import network_rows
-from cosim.record.environment import Kind, all_changes_since, kind_of
 from cosim.record.record_source import Slice
-from cosim.record.run_directory import SCENARIO_FILE
+from cosim.record.run_directory import SCENARIO_FILE, Kind, all_changes_since, kind_of
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
 from cosim.studies.comparison.run_comparison import compare_runs
 from cosim.studies.reproduction.run_archive import MANIFEST, outside_files, unpack

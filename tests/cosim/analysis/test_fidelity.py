@@ -9,8 +9,13 @@ from typing import Any
 import pytest
 
 import cosim.analysis.fidelity
-from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
-from cosim.analysis.step_schedule import IncomparableError, live_run
+from cosim.analysis.fidelity import (
+    Fidelity,
+    IncomparableError,
+    compute_fidelity,
+    fidelity_for_summary,
+    live_run,
+)
 from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.output.run_tables import fidelity_rows
 from cosim.record.run_record import RunRecord

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.claims_by_part import RunClaims
-from cosim.analysis.quantile_sketch import EXACT, RESOLUTION, QuantileSketch
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.value_reduction import EXACT, RESOLUTION, QuantileSketch
 from cosim.record import run_record
 from cosim.record.align import align_tables
 from cosim.record.run_directory import write_scenario

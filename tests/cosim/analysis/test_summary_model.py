@@ -18,8 +18,7 @@ from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.output.report_page import Report, page
 from cosim.output.run_verdict import print_outcome
-from cosim.record.environment import changed_since, kind_of
-from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, changed_since, kind_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve

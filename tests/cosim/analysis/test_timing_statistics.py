@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.timing_statistics import lateness_us
+from cosim.analysis.loop_statistics import lateness_us
 
 
 def test_an_unknown_arrival_at_the_network_has_no_lateness() -> None:

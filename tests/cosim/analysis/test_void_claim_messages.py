@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cosim.analysis.claims.claims_by_part import RunClaims
-from cosim.analysis.loss_statistics import list_violations
+from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.run_summary import summarise
 from cosim.live.progress import progress_line
 from cosim.live.recorder import Recorder
-from cosim.record.loop_rows import with_loop
+from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.spool_conversion import finish_record

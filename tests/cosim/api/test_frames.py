@@ -11,7 +11,7 @@ import pytest
 import noack
 from cosim.analysis.replay.replay_result import rows_differ
 from cosim.record.align import align_tables
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import load_record
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.condition_reader import AssumptionMonitor
 from cosim.live.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops

@@ -11,17 +11,18 @@ import pytest
 
 import cosim.live.finalize
 from cosim.live.finalize import finalize, reopen
-from cosim.record.environment import write_environment
-from cosim.record.loop_rows import with_loop
-from cosim.record.process_reports import write_reports
+from cosim.record.processes import write_reports
+from cosim.record.record_source import with_loop
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
     REPORTS_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
+    EndingFile,
+    RunEnding,
+    write_environment,
 )
-from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.shipped_files import find_shipped

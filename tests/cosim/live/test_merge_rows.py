@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.spool_merge import Segment, merged
+from cosim.record.spool_conversion import Segment, merged
 
 ROW = np.dtype([("input", "<i8"), ("value", "<f8")])
 
@@ -28,7 +28,7 @@ def merge_rows(batches: list[np.ndarray]) -> np.ndarray:
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 12)), max_size=12), st.integers(1, 30))
 def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]], at_once: int) -> None:
     """Batches in any order, overlapping, repeated, empty; gaps stay gaps."""
-    with patch("cosim.record.spool_merge.BATCH_ROWS", at_once):
+    with patch("cosim.record.spool_conversion.BATCH_ROWS", at_once):
         rows = merge_rows([batch(first, first + n) for first, n in ranges])
     present = sorted({k for first, n in ranges for k in range(first, first + n)})
     assert rows["input"].tolist() == present

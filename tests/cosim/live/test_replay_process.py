@@ -13,9 +13,7 @@ import cosim.live.replay_process
 from cosim.analysis.replay import replay
 from cosim.live.finalize import finalize
 from cosim.live.replay_process import ReplayProcess
-from cosim.record.environment import write_environment
-from cosim.record.run_directory import SUMMARY_FILE, write_scenario
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_directory import SUMMARY_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import load_record, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate

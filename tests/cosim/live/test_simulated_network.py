@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner, Result
 
-from cosim.analysis.network_summary import in_flight
-from cosim.analysis.over_time import (
+from cosim.analysis.network_summary import (
     INTERVALS,
     QUANTILES,
     LoopsOverTime,
+    in_flight,
     loops_over_time,
     quantiles,
     worst_loop,

@@ -15,7 +15,7 @@ from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
 from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
-from cosim.record.environment import write_environment
+from cosim.record.run_directory import write_environment
 from cosim.record.run_record import RecordedRun, load_record
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.measurement.run_source import updates_trace
 from cosim.measurement.trace_sources import SourceOptions, read_source
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
 from netem.fates import description
 from noack.config.resolution import resolve

@@ -14,7 +14,7 @@ from matplotlib.legend import Legend
 from PIL import ImageColor
 
 import noack
-from cosim.analysis.quantile_sketch import QuantileSketch
+from cosim.analysis.value_reduction import QuantileSketch
 from cosim.output import palette, signal_figures
 from cosim.output.figure_description import Bound, BoundKind, FigureDescription
 from cosim.output.figure_drawing import draw

@@ -21,8 +21,7 @@ from cosim.output.figure_files import markup_of
 from cosim.output.figure_style import settings
 from cosim.output.report_page import Report, page, write_report
 from cosim.output.run_figures import BOUNDED, run_figures
-from cosim.record.run_directory import REPORT_FILE
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError

@@ -10,11 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.loss_statistics import missing_rows
+from cosim.analysis.loop_statistics import missing_rows
 from cosim.record.collection import collect
-from cosim.record.environment import write_environment
-from cosim.record.loop_rows import with_loop
-from cosim.record.run_directory import PROCESSES_FILE, REPORTS_FILE, write_scenario
+from cosim.record.record_source import with_loop
+from cosim.record.run_directory import (
+    PROCESSES_FILE,
+    REPORTS_FILE,
+    write_environment,
+    write_scenario,
+)
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate

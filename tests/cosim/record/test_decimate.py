@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cosim.record.decimate import decimate
+from cosim.analysis.value_reduction import decimate
 
 VALUES = arrays(
     np.float64,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.run_summary import summarise
-from cosim.record.divergence import GROWTH, Divergence, divergence
+from cosim.record.run_events import GROWTH, Divergence, divergence
 from cosim.simulation.continuous import run_continuous, summary
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claim_evaluation import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import align_tables
-from cosim.record.recorded_changes import changes_of
+from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from netem.channel import Datagram, channel_of

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.record.environment import write_environment
-from cosim.record.run_directory import REPORTS_FILE, write_scenario
+from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, Rows, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate_loops

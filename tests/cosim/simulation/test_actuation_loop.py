@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.analysis.loss_statistics import from_controller, unintended_losses
+from cosim.analysis.loop_statistics import from_controller, unintended_losses
 from cosim.analysis.replay import replay
-from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.resolution import loop_of, resolve

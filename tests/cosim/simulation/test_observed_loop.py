@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.analysis.fidelity import live_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.step_schedule import live_run
-from cosim.record.align import align_tables
-from cosim.record.estimation_error import expected_rms, true_states
+from cosim.record.align import align_tables, expected_rms, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of

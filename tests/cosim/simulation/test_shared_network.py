@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.loop_rows import NetworkRows
+from cosim.record.record_source import NetworkRows
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.parameter_changes import LATE

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import linearisation
 from cosim.analysis.summary_model import NoLinearisationPart
 from cosim.cli import app
 from cosim.live.finalize import finalize

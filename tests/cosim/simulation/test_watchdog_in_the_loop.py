@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from cosim.analysis.fidelity import IncomparableError, live_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
 from noack.config.resolution import resolve

@@ -19,15 +19,16 @@ from cosim.analysis.run_summary import Outcome, summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
 from cosim.output.run_verdict import print_outcome
-from cosim.record.environment import changed_since, environment
-from cosim.record.loop_rows import with_loop
+from cosim.record.record_source import with_loop
 from cosim.record.run_directory import (
     ENVIRONMENT_FILE,
     RECORD,
     SCENARIO_FILE,
     SUMMARY_FILE,
+    RunEnding,
+    changed_since,
+    environment,
 )
-from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record.spool_merge import merged, spool_segments
+from cosim.record.spool_conversion import merged, spool_segments
 from noack.core.errors import MachineError
 from noack.runtime.spool import SpoolWriter, read_chunks
 

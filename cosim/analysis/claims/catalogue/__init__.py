@@ -1,1 +1,1 @@
-"""The claims: one per file."""
+"""The claims: the definitions of :mod:`cosim.analysis.claims.claim_definition` in the modules."""

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from cosim.analysis.adversary.objective import Objective, measure_of
-from cosim.analysis.adversary.search_nodes import Pattern
-from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.analysis.adversary.loop_flows import SegmentFlow
+from cosim.analysis.adversary.objective import Objective, Pattern, measure_of
 from cosim.simulation.continuous import ContinuousRun, continuous_loop_of, simulate_continuous
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

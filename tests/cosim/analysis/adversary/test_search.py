@@ -12,11 +12,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from cosim.analysis.adversary import Objective, Worst
-from cosim.analysis.adversary.beam_search import search_beam
-from cosim.analysis.adversary.cost_bound import cost_ceiling
-from cosim.analysis.adversary.pattern_tree import search_tree
-from cosim.analysis.adversary.search_nodes import Nodes, PatternSearch
-from cosim.analysis.adversary.segments import evaluate
+from cosim.analysis.adversary.loop_flows import evaluate
+from cosim.analysis.adversary.pattern_search import Nodes, PatternSearch, search_beam, search_tree
+from cosim.analysis.adversary.worst_pattern_search import cost_ceiling
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

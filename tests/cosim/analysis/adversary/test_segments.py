@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from scipy.integrate import quad
 
-from cosim.analysis.adversary.loss_patterns import follow
+from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.objective import Objective, measure_of
-from cosim.analysis.adversary.segments import evaluate
+from cosim.analysis.adversary.pattern_search import follow
 from cosim.simulation.continuous import LoopState
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LossAutomaton

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.claims_by_part import RunClaims
-from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
+from cosim.analysis.claims.condition_reader import (
+    AssumptionMonitor,
+    ConditionReader,
+    read_conditions,
+)
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import Claim, ClaimVerdict
-from cosim.record.loop_rows import rows_by_loop
+from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
@@ -159,6 +161,6 @@ def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
     table, phases_ns = CLOCK_TABLES[0], (0, 7)
     rows = np.zeros(2, tables(1, 1, clocks=True)[table])
     rows["t_ns"] = 10, 20
-    found = dict(rows_by_loop(table, rows, phases_ns))
+    found = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
     assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
     assert rows["t_ns"].tolist() == [10, 20]

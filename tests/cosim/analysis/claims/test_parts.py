@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.claims_by_part import (
+from cosim.analysis.claims.claim_evaluation import (
+    ClaimEvaluation,
     RunClaims,
     _start_error,
     common_end_ns,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.trajectory_delta import trajectory_delta, undominated
+from cosim.analysis.claims.run_evidence import trajectory_delta, undominated
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate

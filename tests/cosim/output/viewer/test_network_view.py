@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.analysis.network_summary import summarise_run
-from cosim.analysis.over_time import INTERVALS, QUANTILES, loops_over_time
+from cosim.analysis.network_summary import INTERVALS, QUANTILES, loops_over_time, summarise_run
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.output.viewer import blueprint as bp
@@ -20,8 +19,7 @@ from cosim.output.viewer.run_recording import (
     write_view,
 )
 from cosim.record.align import align_tables
-from cosim.record.environment import write_environment
-from cosim.record.run_directory import RECORDING_FILE, write_scenario
+from cosim.record.run_directory import RECORDING_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops

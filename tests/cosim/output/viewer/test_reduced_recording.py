@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cosim.analysis.value_reduction import decimate
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording import ViewError
 from cosim.output.viewer.run_recording import write_loop_view
-from cosim.record import decimate, run_record
-from cosim.record.environment import write_environment
-from cosim.record.run_directory import RECORDING_FILE, write_scenario
-from cosim.record.run_ending import RunEnding
+from cosim.record import run_record
+from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import RunRecord, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate

@@ -5,8 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.analysis.network_summary import counts_inside, times_inside
-from cosim.analysis.over_time import INTERVALS, loops_over_time, quantiles
+from cosim.analysis.network_summary import (
+    INTERVALS,
+    counts_inside,
+    loops_over_time,
+    quantiles,
+    times_inside,
+)
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.run_feed import NetworkFeed
 from cosim.output.viewer.run_recording import (

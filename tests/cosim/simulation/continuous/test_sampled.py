@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from cosim.analysis.step_schedule import live_run
+from cosim.analysis.fidelity import live_run
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule

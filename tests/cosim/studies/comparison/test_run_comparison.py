@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
-from cosim.record.environment import write_environment
+from cosim.record.run_directory import write_environment
 from cosim.studies.comparison.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
 

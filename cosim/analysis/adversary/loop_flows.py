@@ -1,0 +1,339 @@
+"""The two loops of the search, followed from event to event with the objective's value on the way.
+
+:class:`SegmentFlow` is the paper's loop in continuous time. The core computes events and values
+(native/exact/): they are those of an exact run. A supremum is at most a share of 1e-10 above the
+returned value, which is attained.
+
+:class:`SampledFlow` is the loop as the processes run it: every policy, sampled, held and delayed.
+Disturbances and noise are those that the scenario's seeds draw. The suprema are those at the
+plant's steps; the integral is a sum over them.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.adversary.objective import (
+    Flags,
+    Measure,
+    Objective,
+    Pattern,
+    Segments,
+    weight_of,
+)
+from cosim.simulation.continuous import ContinuousLoop, ContinuousRun
+from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
+from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales
+from noack.core.core_library import core
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+
+_GRAMIAN_POINTS = 12
+_MEASURES = {
+    Objective.ERROR: core.NOACK_EXACT_ERROR,
+    Objective.STATE: core.NOACK_EXACT_STATE,
+    Objective.COST: core.NOACK_EXACT_COST,
+    Objective.INTER_EVENT: core.NOACK_EXACT_TIMES,
+}
+
+
+class Valued(NamedTuple):
+    """The value of a run."""
+
+    value: float
+    at_s: float | None
+    """Where a supremum is reached, or the later of the two closest events."""
+
+
+class SegmentFlow:
+    """Follows states to their next events, at most to the horizon.
+
+    With ``known_start``, sensor and controller start from x(0), so there is no event at t = 0.
+    """
+
+    def __init__(
+        self, system: ContinuousLoop, measure: Measure, horizon_s: float, *, known_start: bool
+    ) -> None:
+        self.system, self.measure, self.horizon_s = system, measure, horizon_s
+        self.known_start = known_start
+        self._gramians: dict[float, Matrix] = {}
+
+    @property
+    def objective(self) -> Objective:
+        """The objective."""
+        return self.measure.objective
+
+    @cached_property
+    def _simulation(self) -> ExactSimulation:
+        """The loop, with the objective as its measure: ∫‖x‖² needs no weight of the input."""
+        measure, m = self.measure, len(self.system.loop.K)
+        until_s = math.inf
+        if measure.floor and measure.rate_per_s:
+            until_s = math.log(measure.beta / measure.floor) / measure.rate_per_s
+        return self.system.simulation(
+            self.horizon_s, known_start=True, R=np.zeros((m, m)),
+            measure=_MEASURES[measure.objective], fading_per_s=measure.rate_per_s,
+            fading_until_s=until_s,
+        )  # fmt: skip
+
+    def start(self) -> Segments:
+        """As :meth:`PatternFlow.start`: sensor and controller have x(0)."""
+        x0, zero = self.system.loop.x0, np.zeros(1)
+        z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
+        return Segments(zero, z, zero > 0, zero + self.objective.nothing)
+
+    def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
+        """As :meth:`PatternFlow.after_events`: e_s ← 0, and e_c ← 0 if the update arrives."""
+        z, n = z.copy(), z.shape[1] // 3
+        z[:, n : 2 * n] = 0.0
+        z[delivered, 2 * n :] = 0.0
+        return z
+
+    def features(self, t_s: Vector, z: Matrix) -> Matrix:
+        """As :meth:`PatternFlow.features`."""
+        scaled = z / self.measure.level(t_s)[:, None]
+        return np.asarray(scaled / (np.abs(scaled).max() or 1.0))
+
+    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+        """As :meth:`PatternFlow.promise`: the integral of the output's square."""
+        if window_s not in self._gramians:
+            self._gramians[window_s] = _gramian(self.system, self.measure, window_s)
+        scaled = z / self.measure.level(t_s)[:, None]
+        return np.asarray(np.einsum("ai,ij,aj->a", scaled, self._gramians[window_s], scaled))
+
+    def __call__(self, t_s: Vector, z: Matrix, known: float = -math.inf) -> Segments:
+        """As :meth:`PatternFlow.__call__`, with z = (x, e_s, e_c), (N, 3n).
+
+        Raises:
+            CallerError: an event or a supremum cannot be decided.
+        """
+        loop, measure, n = self.system.loop, self.measure, self.system.loop.n
+        found = self._simulation.segments(loop.A, loop.B, t_s, z.reshape(-1, 3, n))
+        if not np.isin(found.statuses, (OK, DIVERGED)).all():
+            raise CallerError(
+                "trigger: an error stays too close to a level to decide when it passes"
+            )
+        diverged, is_event = found.statuses == DIVERGED, found.events == 1
+        z = found.states.reshape(-1, 3 * n)
+        if measure.objective is Objective.INTER_EVENT:
+            between_events = is_event & ((t_s > 0) | (not self.known_start))
+            value = np.where(between_events, t_s - found.t_s, -math.inf)
+        else:
+            value = found.values / (measure.beta if measure.objective is Objective.ERROR else 1.0)
+        value = np.where(diverged, math.inf, value)
+        return Segments(found.t_s, z, is_event & ~diverged, value, found.at_s)
+
+
+def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
+    """Return the objective along a run; infinite if the run diverged.
+
+    The inter-event time has the sign of the objective: negative, or −∞ with fewer than two events.
+    """
+    if measure.output is None:
+        between_s = np.diff(run.event_s)
+        if not len(between_s):
+            return Valued(-math.inf, None)
+        shortest = int(between_s.argmin())
+        return Valued(-float(between_s[shortest]), float(run.event_s[shortest + 1]))
+    if run.diverged_at_s is not None:
+        return Valued(math.inf, run.diverged_at_s)
+    # With a first packet the run starts at event 0.
+    first = 1 if len(run.event_s) and run.event_s[0] == 0.0 else 0
+    t_s, starts = np.array([0.0, *run.event_s])[first:], run.starts[first:]
+    flow = SegmentFlow(run.system, measure, run.horizon_s, known_start=True)
+    found = flow(t_s, starts.reshape(len(starts), -1))
+    if measure.objective is Objective.COST:
+        return Valued(float(found.value.sum()), None)
+    highest = int(found.value.argmax())
+    assert found.at_s is not None
+    return Valued(float(found.value[highest]), float(found.at_s[highest]))
+
+
+def _gramian(system: ContinuousLoop, measure: Measure, window_s: float) -> Matrix:
+    """Return ∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
+    n = system.loop.n
+    if measure.output is None:  # the initial speed of e_s
+        speed = weight_of(system) @ system.generator[n : 2 * n]
+        return np.asarray(speed.T @ speed)
+    from scipy.linalg import expm
+
+    generator = system.generator + measure.rate_per_s * np.eye(3 * n)
+    points, weights = np.polynomial.legendre.leggauss(_GRAMIAN_POINTS)
+    total = np.zeros_like(generator)
+    for s, weight in zip((points + 1) / 2 * window_s, weights / 2 * window_s, strict=True):
+        y = measure.output @ expm(generator * s)
+        total += weight * (y.T @ y)
+    return total
+
+
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class SampledFlow:
+    """A :class:`PatternFlow`; values are relative to the shape of a certificate's bounds.
+
+    The bound of ‖x‖ is X(0) · level(t), with level(0) = 1; the value is sup ‖x‖ / level(t). That of
+    ‖W e_c‖ likewise. Without a certificate the level is 1.
+    """
+
+    loop: SampledLoop
+    objective: Objective
+    certificate: ScenarioCertificate
+    _scales: Scales = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Compute the levels."""
+        scales = Scales(
+            self.loop.weight,
+            *(
+                bound[0] / np.maximum(bound, _TINY) if bound[0] > 0 else np.ones(len(bound))
+                for bound in (self._bound(True), self._bound(False))
+            ),
+        )
+        object.__setattr__(self, "_scales", scales)
+
+    @property
+    def horizon_s(self) -> float:
+        """End of the runs."""
+        return self.loop.last * self.loop.step_s
+
+    @property
+    def certified(self) -> float | None:
+        """The certificate's bound of the objective; None without one."""
+        if self.certificate.constants is None:
+            return None
+        if self.objective is Objective.INTER_EVENT:
+            return self.certificate.inter_event_s
+        bound = self._bound(self.objective is Objective.ERROR)
+        if self.objective is Objective.COST:
+            return float((bound[1:] ** 2).sum() * self.loop.step_s)
+        return float(bound[0])
+
+    def start(self) -> Segments:
+        """As :meth:`PatternFlow.start`."""
+        runs = self.loop.start()
+        value = self.objective.nothing
+        if self.objective is Objective.STATE:
+            value = float(np.linalg.norm(runs.x[0]))
+        return Segments(self._time(runs.step), _packed(runs), runs.is_event, np.array([value]))
+
+    def after_events(self, t_s: Vector, z: Matrix, delivered: Flags) -> Matrix:
+        """As :meth:`PatternFlow.after_events`."""
+        runs = self._runs(t_s, z)
+        self.loop.update(runs, delivered)
+        return _packed(runs)
+
+    def __call__(self, t_s: Vector, z: Matrix, known: float = -np.inf) -> Segments:
+        """As :meth:`PatternFlow.__call__`."""
+        runs = self._runs(t_s, z)
+        self.loop.follow(runs, self._scales, np.full(len(t_s), self.loop.last))
+        end_s = at_s = self._time(runs.step)
+        value = self._value(runs)
+        if self.objective is Objective.INTER_EVENT:
+            value = np.where(runs.is_event & (t_s >= 0.0), t_s - end_s, -np.inf)
+        elif not self.objective.additive:
+            of_error = self.objective is Objective.ERROR
+            at_s = self._time(runs.error_at if of_error else runs.state_at)
+        return Segments(end_s, _packed(runs), runs.is_event, value, at_s)
+
+    def promise(self, t_s: Vector, z: Matrix, window_s: float) -> Vector:
+        """As :meth:`PatternFlow.promise`: the value over the window without events.
+
+        Large errors of the controller lead to early events.
+        """
+        runs = self._runs(t_s, z)
+        until = np.minimum(runs.step + round(window_s / self.loop.step_s), self.loop.last)
+        self.loop.follow(runs, self._scales, until, tests=False)
+        return self._value(runs)
+
+    def features(self, t_s: Vector, z: Matrix) -> Matrix:
+        """As :meth:`PatternFlow.features`."""
+        runs = self._runs(t_s, z)
+        step = np.maximum(runs.step, 0)
+        state, error = self._scales.state[step, None], self._scales.error[step, None]
+        parts = [
+            runs.x * state, (runs.x_s - runs.y) * error, (runs.x_c - runs.y) * error,
+            runs.u * state, runs.updates.reshape(len(z), -1) * state,
+            runs.sent, runs.auxiliary[:, None],
+        ]  # fmt: skip
+        return np.hstack([part / (np.abs(part).max(initial=0.0) or 1.0) for part in parts])
+
+    def _time(self, step: Numbers) -> Vector:
+        return np.asarray(step * self.loop.step_s, dtype=np.float64)
+
+    def _value(self, runs: Runs) -> Vector:
+        """Return the value of segments, (N,)."""
+        if self.objective is Objective.STATE:
+            return runs.state
+        return runs.cost if self.objective is Objective.COST else runs.error
+
+    def _bound(self, of_error: bool) -> Vector:
+        """Return the bound of ‖W e_c‖ or of ‖x‖ at each step; 1 without a certificate."""
+        t_s = self._time(np.arange(self.loop.last + 1))
+        if self.certificate.constants is None:
+            return np.ones(len(t_s))
+        return self.certificate.controller_error(t_s) if of_error else self.certificate.state(t_s)
+
+    def _runs(self, t_s: Vector, z: Matrix) -> Runs:
+        """Return runs with a copy of states in rows, (N, entries)."""
+        runs = self.loop.empty(len(t_s))
+        step: Numbers = np.rint(t_s / self.loop.step_s).astype(np.int64)
+        runs.step[:] = step
+        begin = 0
+        for part in _states(runs):
+            columns = math.prod(part.shape[1:])
+            part[:] = z[:, begin : begin + columns].reshape(part.shape)
+            begin += columns
+        return runs
+
+
+def _states(runs: Runs) -> tuple[Matrix, ...]:
+    """Return the arrays of which a run's state consists."""
+    return (
+        runs.x, runs.y, runs.x_s, runs.x_c, runs.u, runs.u_next, runs.sent, runs.updates,
+        runs.auxiliary,
+    )  # fmt: skip
+
+
+def _packed(runs: Runs) -> Matrix:
+    """Return the states in rows, (N, entries)."""
+    count = len(runs.step)
+    return np.hstack([part.reshape(count, math.prod(part.shape[1:])) for part in _states(runs)])
+
+
+class SampledRun(NamedTuple):
+    """A run of the loop, by its events."""
+
+    value: float
+    at_s: float | None
+    """Time of the supremum, or of the later of the two closest events."""
+    delivered: Pattern
+    """Whether the update of each event is delivered."""
+    event_s: tuple[float, ...]
+
+
+def run_of(flow: SampledFlow, delivered: Callable[[int], bool]) -> SampledRun:
+    """Run the loop; ``delivered`` returns the fate of each update."""
+    now = flow.start()
+    value, at_s = float(now.value[0]), 0.0
+    event_s = [] if flow.loop.known_start else [0.0]
+    fates = [True] * len(event_s)
+    while True:
+        now = flow(now.end_s, now.z)
+        found = float(now.value[0])
+        if now.at_s is not None and found > value:
+            at_s = float(now.at_s[0])
+        value = float(flow.objective.joined(np.array(value), np.array(found)))
+        if not now.is_event[0]:
+            break
+        fates.append(delivered(len(event_s)))
+        event_s.append(float(now.end_s[0]))
+        now = now._replace(z=flow.after_events(now.end_s, now.z, np.array(fates[-1:])))
+    known = flow.objective is not Objective.COST and value > -np.inf
+    return SampledRun(value, at_s if known else None, tuple(fates), tuple(event_s))

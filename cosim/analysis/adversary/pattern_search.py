@@ -1,0 +1,381 @@
+"""Searches for the worst pattern of losses, many runs at a time.
+
+* :class:`PatternSearch` continues :class:`Nodes`, runs that end at an event, by both outcomes of
+  that event's update, and keeps the worst run.
+* :func:`search_tree` goes through all admissible patterns, depth first.
+* :func:`search_beam` continues only the most promising runs if there are too many patterns. All
+  runs pass through the same time windows; at the end of each window, the runs are thinned out. Of
+  runs that nearly coincide, one remains. The runs are grouped by the state of the guarantee's
+  automaton and their part of the window; from each group first the best run is selected, then the
+  second best, and so on. One half of the selection ranks runs by their value so far, the other half
+  by their promise: what the loop would reach over the next window without events.
+* :func:`guess` values given patterns, and :func:`improve` changes single decisions of one.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.adversary.objective import Flags, Pattern, PatternFlow, Segments
+from cosim.simulation.continuous import MAX_EVENTS, TooManyEventsError
+from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
+
+Indices = NDArray[np.int64]
+SearchReport = Callable[[str, int, float], None]
+"""Receives the current search step, the segments computed so far, and the largest value so far."""
+
+START = -1
+"""The entry of a run without any decision."""
+
+
+class Nodes(NamedTuple):
+    """N runs, each just after an event and the delivery or loss of its update."""
+
+    t_s: Vector
+    """(N,)"""
+    z: Matrix
+    """The states, as the flow has them, (N, entries)."""
+    state: Indices
+    """State of the guarantee's automaton, (N,); under a cap alone, the consecutive losses."""
+    value: Vector
+    """The objective's value of the run up to ``t_s``, (N,)."""
+    entry: Indices
+    """Index of the last decision in the log, (N,)."""
+
+    def take(self, which: Indices | Flags | slice) -> "Nodes":
+        """Return a selection of the runs."""
+        columns: Sequence[Any] = self
+        return Nodes(*(column[which] for column in columns))
+
+
+def root(flow: PatternFlow) -> Nodes:
+    """Return the start of all runs."""
+    start, zero = flow.start(), np.zeros(1, int)
+    return Nodes(start.end_s, start.z, zero, start.value, zero + START)
+
+
+def together(parts: Sequence[Nodes]) -> Nodes:
+    """Return several groups as one."""
+    return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+class DecisionLog:
+    """A log of decisions; each entry refers to the decision before it."""
+
+    def __init__(self) -> None:
+        self._parents: list[Indices] = []
+        self._delivered: list[Flags] = []
+        self._length = 0
+
+    def add(self, parents: Indices, delivered: Flags) -> Indices:
+        """Append decisions; return their indices."""
+        self._parents.append(parents)
+        self._delivered.append(delivered)
+        self._length += len(parents)
+        return np.arange(self._length - len(parents), self._length)
+
+    def decisions(self, entry: int) -> Pattern:
+        """Return whether the update of each event up to this entry was delivered."""
+        starts = np.cumsum([0, *map(len, self._parents)])
+        found: list[bool] = []
+        while entry != START:
+            block = int(np.searchsorted(starts, entry, side="right")) - 1
+            row = entry - int(starts[block])
+            found.append(bool(self._delivered[block][row]))
+            entry = int(self._parents[block][row])
+        return tuple(reversed(found))
+
+
+class PatternSearch:
+    """A search through the loss patterns that a guarantee allows."""
+
+    def __init__(
+        self,
+        flow: PatternFlow,
+        guarantee: LossGuarantee,
+        report: SearchReport = lambda step, nodes, value: None,
+    ) -> None:
+        self.flow, self.guarantee = flow, guarantee
+        self.automaton = LossAutomaton(guarantee)
+        self.step = ""
+        """Name of the current step, for the report."""
+        self.value = -np.inf
+        """The largest value so far."""
+        self.nodes = 0
+        """Segments between events that were computed."""
+        self.runs = 0
+        """Runs that were computed up to the horizon."""
+        self._report = report
+        self._log = DecisionLog()
+        self._entry: int | None = None
+        self._pattern: Pattern = ()
+
+    @property
+    def pattern(self) -> Pattern:
+        """A pattern that reaches the largest value, at least up to the time of that value."""
+        return self._pattern if self._entry is None else self._log.decisions(self._entry)
+
+    def offer(self, value: float, pattern: Pattern, nodes: int = 0) -> None:
+        """Take the value of a pattern that was computed elsewhere, from ``nodes`` segments."""
+        self.nodes += nodes
+        if value > self.value or not self.pattern:
+            self.value, self._pattern, self._entry = value, pattern, None
+        self._report(self.step, self.nodes, self.value)
+
+    def successors(self, nodes: Nodes) -> Nodes:
+        """Follow runs to their next events; return each with a lost and a delivered update.
+
+        Raises:
+            TooManyEventsError: two events at the same time.
+        """
+        objective = self.flow.objective
+        segments = self.flow(nodes.t_s, nodes.z, self.value)
+        value = objective.joined(nodes.value, segments.value)
+        # A sum is compared only when the run is complete.
+        candidates = np.where(segments.is_event & objective.additive, -np.inf, value)
+        top = int(candidates.argmax())
+        if candidates[top] > self.value:
+            self.value, self._entry = float(candidates[top]), int(nodes.entry[top])
+        self.nodes += len(nodes.t_s)
+        self.runs += int((~segments.is_event).sum())
+        self._report(self.step, self.nodes, self.value)
+        events = np.flatnonzero(segments.is_event)
+        after_loss = self.automaton.after_loss(nodes.state[events])
+        may = after_loss >= 0
+        these = np.concatenate([events[may], events])
+        delivered = np.repeat([False, True], [int(may.sum()), len(events)])
+        after_delivery = self.automaton.after_delivery(nodes.state[events])
+        state = np.concatenate([after_loss[may], after_delivery])
+        return after_events(self.flow, nodes, segments, value, these, delivered, state, self._log)
+
+
+def after_events(
+    flow: PatternFlow, nodes: Nodes, segments: Segments, value: Vector, these: Indices,
+    delivered: Flags, state: Indices, log: DecisionLog,
+) -> Nodes:  # fmt: skip
+    """Return the runs ``these``, (k,), just after the events at the end of their segments.
+
+    ``delivered``, (k,), tells whether the update of each run arrives; the ``log`` receives that.
+    ``state``, (k,), is the automaton's state after it. ``value``, (N,), has the values of the runs
+    at the end of the segments.
+
+    Raises:
+        TooManyEventsError: two events at the same time.
+    """
+    t_s = segments.end_s[these]
+    stuck = t_s <= nodes.t_s[these]
+    if (stuck & (nodes.entry[these] != START)).any():
+        raise TooManyEventsError(f"trigger: the events accumulate at {t_s[stuck][0]:.9g} s")
+    z = flow.after_events(t_s, segments.z[these], delivered)
+    return Nodes(t_s, z, state, value[these], log.add(nodes.entry[these], delivered))
+
+
+Ceiling = Callable[[Nodes], Vector]
+"""Returns an upper bound on the value that the rest of each run can add, (N,)."""
+_BLOCK = 4096
+
+
+def search_tree(search: PatternSearch, most_nodes: int, ceiling: Ceiling | None = None) -> bool:
+    """Search all patterns; return whether every one was covered within ``most_nodes`` nodes.
+
+    The ``ceiling`` prunes branches that cannot exceed the largest value so far.
+
+    Raises:
+        TooManyEventsError: two events at the same time.
+    """
+    search.step, most_nodes, before = "all patterns", most_nodes + search.nodes, search.runs
+    pile = [root(search.flow)]
+    while pile and search.value < float("inf"):
+        nodes = _top(pile)
+        if ceiling is not None:
+            nodes = nodes.take(nodes.value + ceiling(nodes) > search.value)
+        if search.nodes + len(nodes.t_s) > most_nodes:
+            return False
+        if len(nodes.t_s):
+            pile.append(search.successors(nodes))
+    search.runs -= before  # each pattern counts once
+    return True
+
+
+def _top(pile: list[Nodes]) -> Nodes:
+    """Pop a block of nodes from the stack, the deepest first."""
+    parts, room = [], _BLOCK
+    while pile and room > 0:
+        nodes = pile.pop()
+        if len(nodes.t_s) > room:
+            pile.append(nodes.take(slice(None, -room)))
+            nodes = nodes.take(slice(-room, None))
+        parts.append(nodes)
+        room -= len(nodes.t_s)
+    return together(parts)
+
+
+_ALIKE = 1e-4
+_PARTS = 2
+_CROWD = 8
+
+
+def search_beam(search: PatternSearch, width: int, window_s: float) -> None:
+    """Search for a large value; ``width`` runs continue from one window to the next.
+
+    A window has about the length of an inter-event time.
+
+    Raises:
+        TooManyEventsError: two events at the same time.
+    """
+    search.step = "beam search"
+    choice = _Choice(search.flow, window_s)
+    waiting, until_s = root(search.flow), 0.0
+    while len(waiting.t_s) and search.value < np.inf:
+        until_s = max(until_s, float(waiting.t_s.min())) + window_s
+        now = waiting.t_s < until_s
+        active, later = waiting.take(now), [waiting.take(~now)]
+        while len(active.t_s):
+            following = search.successors(active)
+            now = following.t_s < until_s
+            later.append(following.take(~now))
+            active = choice.thin(following.take(now), _CROWD * width)
+        waiting = choice.thin(together(later), width)
+
+
+class _Choice:
+    """The selection of the runs that continue."""
+
+    def __init__(self, flow: PatternFlow, window_s: float) -> None:
+        self._flow, self._window_s = flow, window_s
+
+    def thin(self, nodes: Nodes, width: int) -> Nodes:
+        """Return at most ``width`` of the runs."""
+        if len(nodes.t_s) <= width:
+            return nodes
+        nodes = nodes.take(self._distinct(nodes))
+        kind = self._kind(nodes)
+        promise = self._flow.promise(nodes.t_s, nodes.z, self._window_s)
+        if self._flow.objective.additive:
+            return nodes.take(_turns(nodes.value + promise, kind)[:width])
+        by_value = _turns(nodes.value, kind, promise)[: width // 2]
+        by_promise = _turns(promise, kind)
+        chosen = np.concatenate([by_value, by_promise[~np.isin(by_promise, by_value)]])
+        return nodes.take(chosen[:width])
+
+    def _kind(self, nodes: Nodes) -> Indices:
+        since_s = nodes.t_s - nodes.t_s.min()
+        part = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
+        return np.asarray(nodes.state * (_PARTS + 1) + part)
+
+    def _distinct(self, nodes: Nodes) -> Indices:
+        """Return, for each group of nearly equal runs, the one with the largest value."""
+        alike = self._flow.features(nodes.t_s, nodes.z)
+        features = np.column_stack([nodes.t_s / self._window_s, alike, nodes.state])
+        order = np.argsort(-nodes.value, kind="stable")
+        _, first = np.unique(np.round(features[order] / _ALIKE), axis=0, return_index=True)
+        return np.asarray(order[np.sort(first)])
+
+
+def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
+    """Return indices in selection order: first the best of each kind, then the second best, etc."""
+    then = score if then is None else then
+    order = np.lexsort((-then, -score, kind))
+    starts = np.flatnonzero(np.diff(kind[order], prepend=-1))
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
+    return np.asarray(np.lexsort((-then, -score, rank)))
+
+
+_RANDOM = 64
+_IMPROVED = 3
+_NODES_FOR_A_GUESS = 20_000
+_LONGEST = 1000
+_PERIODS = 24
+"""Longest period of the regular patterns of a constraint."""
+
+
+def follow(
+    flow: PatternFlow, automaton: LossAutomaton, patterns: list[Pattern]
+) -> tuple[Vector, list[Pattern]]:
+    """Run patterns to the horizon; return their values and the applied decisions.
+
+    An update is delivered if the guarantee does not allow its loss.
+
+    Raises:
+        TooManyEventsError: a run has more than 100,000 events, or two at the same time.
+    """
+    count, log = len(patterns), DecisionLog()
+    longest = max(map(len, patterns), default=0)
+    wanted = np.ones((count, longest + 1), dtype=bool)
+    for row, pattern in zip(wanted, patterns, strict=True):
+        row[: len(pattern)] = pattern
+    nodes = together([root(flow)] * count)
+    run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
+    for event in range(MAX_EVENTS):
+        segments = flow(nodes.t_s, nodes.z)
+        value[run] = flow.objective.joined(nodes.value, segments.value)
+        last[run] = nodes.entry
+        going = np.flatnonzero(segments.is_event)
+        if not len(going):
+            return value, [log.decisions(int(entry)) for entry in last]
+        after_loss = automaton.after_loss(nodes.state[going])
+        delivered = wanted[run[going], min(event, longest)] | (after_loss < 0)
+        state = np.where(delivered, automaton.after_delivery(nodes.state[going]), after_loss)
+        following = after_events(flow, nodes, segments, value[run], going, delivered, state, log)
+        run, nodes = run[going], following
+    raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
+
+
+def guess(search: PatternSearch, own: Pattern, rng: np.random.Generator) -> float:
+    """Try the pattern ``own``, regular and random patterns; return an inter-event time in s."""
+    search.step = "guesses"
+    flow, automaton = search.flow, search.automaton
+    events = len(follow(flow, automaton, [(False,) * _LONGEST])[1][0])
+    tried = [own, *_candidates(search.guarantee, events, rng)]
+    values, patterns = follow(flow, automaton, tried)
+    search.nodes += events + sum(map(len, patterns))
+    search.runs += len(patterns)
+    for i in np.argsort(-values, kind="stable")[:_IMPROVED]:
+        improve(search, patterns[i], float(values[i]), _NODES_FOR_A_GUESS)
+    return flow.horizon_s / (events + 1)
+
+
+def _candidates(guarantee: LossGuarantee, events: int, rng: np.random.Generator) -> list[Pattern]:
+    """Return patterns of that many events: without losses, regular ones, random ones.
+
+    A regular pattern loses the first updates of each period; with a further constraint, the period
+    may be its window.
+    """
+    most = events if guarantee.longest_burst is None else guarantee.longest_burst
+    if most == 0:
+        return [()]
+    others = [window.packets for window in guarantee.windows[1:] if window.packets <= _PERIODS]
+    regular = [
+        tuple((i + phase) % period >= lost for i in range(events))
+        for lost in range(1, most + 1)
+        for period in (lost + 1, *(one for one in others if one > lost + 1))
+        for phase in range(period)
+    ]
+    share = rng.uniform(size=(_RANDOM, 1))
+    random = rng.uniform(size=(_RANDOM, events)) < share
+    return [(), *regular, *(tuple(row) for row in random.tolist())]
+
+
+def improve(search: PatternSearch, pattern: Pattern, value: float, most_nodes: int) -> None:
+    """Change single decisions of a pattern of that value as long as this increases the objective.
+
+    It stops after ``most_nodes`` nodes.
+    """
+    flow, automaton = search.flow, search.automaton
+    # A pattern may end at the time of its largest value; complete it up to the horizon.
+    pattern = follow(flow, automaton, [pattern])[1][0]
+    visited = len(pattern)
+    while pattern and visited + len(pattern) ** 2 <= most_nodes:
+        changed = [(*pattern[:i], not one, *pattern[i + 1 :]) for i, one in enumerate(pattern)]
+        values, patterns = follow(flow, automaton, changed)
+        visited += sum(map(len, patterns))
+        search.runs += len(patterns)
+        top = int(values.argmax())
+        if not values[top] > value:
+            break
+        value, pattern = float(values[top]), patterns[top]
+    search.offer(value, pattern, visited)

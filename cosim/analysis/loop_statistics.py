@@ -1,0 +1,495 @@
+"""What the record of a loop says of it: lateness, losses, and the sizes of its signals.
+
+* :func:`lateness` and :func:`latency`: wall times of the processes of a live run.
+* Losses: of updates in the network, of datagrams elsewhere (:func:`unintended_losses`), of rows of
+  the record (:func:`missing_rows`); and the violations that the processes reported.
+* :class:`SignalStatistics`: states and errors, in one pass over the aligned run;
+  :func:`disturbances`; :func:`watchdog_actions`.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.claims.observed_conditions import DROPOUTS, AssumptionViolation
+from cosim.analysis.summary_model import (
+    DisturbancePart,
+    EstimationPart,
+    FlowPart,
+    LatencyPart,
+    LatenessPart,
+    ViolationPart,
+    WatchdogPart,
+)
+from cosim.analysis.value_reduction import QuantileSketch
+from cosim.record.align import (
+    AlignedPart,
+    AlignedRun,
+    IdentityResidual,
+    Reals,
+    SizeStatistics,
+    aligned_parts,
+    expected_rms,
+    in_common,
+)
+from cosim.record.record_source import joined, with_columns
+from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
+from cosim.record.run_record import RunRecord
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import row_norms
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_ACKNOWLEDGEMENT,
+    SENSOR_MEASUREMENT,
+    Fate,
+    effective,
+)
+from noack.protocol.topology import ENDS, LOOP_ROLES
+from noack.protocol.wire_format import Flow
+from noack.runtime.life_cycle import HORIZON
+from plant_server.plant import too_old
+
+_STEPS = {
+    "plant": PLANT_STEP,
+    "sensor": SENSOR_MEASUREMENT,
+    "netem": NETEM_PACKET,
+    "controller": CONTROLLER_STEP,
+}
+
+
+def lateness_parts(record: RunRecord, role: str) -> Iterator[NDArray[np.float64]]:
+    """Yield the wall time between a process's actions and their nominal times in µs, in order.
+
+    The nominal time is the deadline for plant and controller, the time of the measurement for the
+    sensor, and the arrival of the datagram at its socket for the network. The plain engine of the
+    network does not know the arrival; its rows have ``now_ns`` there, and are left out.
+    """
+    for rows in record.source.batches(_STEPS[role], ("now_ns", "t_ns")):
+        late_ns = rows["now_ns"] - rows["t_ns"]
+        known = late_ns[late_ns != 0] if role == "netem" else late_ns
+        yield np.asarray(known / (1e3 * record.scenario.speed))
+
+
+def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
+    """Return the lateness of all actions of a process, (k,)."""
+    return np.concatenate([np.zeros(0), *lateness_parts(record, role)])
+
+
+def lateness(record: RunRecord, role: str) -> LatenessPart:
+    """Return quantiles of a process's lateness, and its number of steps late by over a period."""
+    timing = record.scenario.timing
+    period_ns = {
+        "plant": timing.plant_period_ns,
+        "sensor": timing.measurement_period_ns,
+        "controller": timing.controller_period_ns,
+        "netem": timing.plant_period_ns,
+    }[role]
+    sketch, late_steps = QuantileSketch(), 0
+    for late_us in lateness_parts(record, role):
+        sketch.add(late_us)
+        late_steps += int((late_us * 1e3 * record.scenario.speed > period_ns).sum())
+    return LatenessPart(**_quantiles(sketch), steps=sketch.count, late_steps=late_steps)
+
+
+def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the wall time from the sensor's event to the controller's update, one way.
+
+    Returns:
+        Event times in ns (d,) and latencies in µs (d,), of the delivered updates.
+    """
+    events = record.events()
+    deliveries = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
+    _, at_sensor, at_controller = np.intersect1d(
+        events["event"], deliveries["sequence"], return_indices=True
+    )
+    passed_ns = deliveries["now_ns"][at_controller] - events["now_ns"][at_sensor]
+    return events["t_ns"][at_sensor], passed_ns / (1e3 * record.scenario.speed)
+
+
+def latency(record: RunRecord) -> LatencyPart:
+    """Quantiles of the latency."""
+    _, passed_us = latency_us(record)
+    sketch = QuantileSketch()
+    sketch.add(passed_us)
+    return LatencyPart(**_quantiles(sketch), updates=len(passed_us))
+
+
+def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
+    shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+    return {key: sketch.quantile(share) for key, share in shares.items()}
+
+
+_ARRIVES_AFTER_END_S = 0.1
+VIOLATION = "violation"
+"""Level of a notice: a process detected that an assumption was violated."""
+
+
+def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
+    """Return the number of lost updates by cause, without causes of no losses."""
+    fates = outcomes.fate
+    causes = {one.name.lower(): int((fates == one).sum()) for one in Fate if not one.effective}
+    causes["delivered_out_of_order"] = int((effective(fates) & outcomes.lost).sum())
+    return {cause: n for cause, n in causes.items() if n}
+
+
+_SENT_RECEIVED = {
+    Flow.ACKNOWLEDGEMENT: (CONTROLLER_DELIVERY, SENSOR_ACKNOWLEDGEMENT),
+    Flow.ACTUATION: (CONTROLLER_STEP, PLANT_ACTUATION),
+}
+"""The tables with one row for each message sent, and for each message received."""
+
+
+def from_controller(record: RunRecord) -> dict[str, FlowPart]:
+    """The outcome of what the controller sends through the network, by its name."""
+    found = {}
+    for flow in record.scenario.network.flows[1:]:
+        outcomes, (sent, received) = packet_outcomes(record, flow), _SENT_RECEIVED[flow]
+        found[f"{flow.name.lower()}s"] = FlowPart(
+            sent=record.count(sent),
+            lost=int(outcomes.lost.sum()),
+            longest_loss_burst=outcomes.longest_loss_burst(),
+            received=record.count(received),
+        )
+    return found
+
+
+def unintended_losses(record: RunRecord) -> dict[str, int]:
+    """Return the number of datagrams lost without a decision of the emulator, by hop.
+
+    The processes receive for at least 150 ms of wall time beyond the horizon. A datagram that was
+    to leave the emulator less than 50 ms before this, or later, is not lost: its receiver may have
+    ended.
+    """
+    last_ns = record.scenario.timing.horizon_ns + _ARRIVES_AFTER_END_S * record.scenario.speed * 1e9
+    outcomes, events = packet_outcomes(record), record.events()["event"]
+    received = record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]
+    every = record.scenario.plant.measure_every
+    measured, actuated = _Unmatched(), _Unmatched()
+    tables = (PLANT_STEP, SENSOR_MEASUREMENT, CONTROLLER_STEP, PLANT_ACTUATION)
+    for part in record.slices(*tables, columns=("sequence",)):
+        sent = part[PLANT_STEP]["sequence"]
+        measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
+        actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])
+    legs = {
+        "measurement": measured,
+        "update to netem": _Unmatched().take(events, outcomes.sequence),
+        "update to controller": _Unmatched().take(_left_until(outcomes, last_ns), received),
+        "actuation": actuated,
+    }
+    for flow in record.scenario.network.flows[1:]:
+        name, answers = flow.name.lower(), packet_outcomes(record, flow)
+        sent, arrived = (
+            record.columns(table, "sequence")["sequence"] for table in _SENT_RECEIVED[flow]
+        )
+        legs.pop(name, None)
+        legs[f"{name} to netem"] = _Unmatched().take(sent, answers.sequence)
+        legs[f"{name} to {ENDS[flow].receiver}"] = _Unmatched().take(
+            _left_until(answers, last_ns), arrived
+        )
+    complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
+    return {leg: one.count(complete=complete) for leg, one in legs.items()}
+
+
+def _left_until(outcomes: PacketOutcome, last_ns: float) -> NDArray[np.int64]:
+    """Return the numbers of the datagrams that were forwarded, and were due until then."""
+    return outcomes.sequence[outcomes.forwarded & (outcomes.due_ns <= last_ns)]
+
+
+class _Unmatched:
+    """Finds the sent numbers that were not received, part by part; both ascend."""
+
+    def __init__(self) -> None:
+        self._sent = np.zeros(0, np.int64)
+        self._newest = -1
+
+    def take(self, sent: NDArray[np.int64], arrived: NDArray[np.int64]) -> "_Unmatched":
+        """Add the next numbers; one is received in the same part as it is sent, or later."""
+        self._newest = max(self._newest, int(arrived.max(initial=-1)))
+        self._sent = np.setdiff1d(np.concatenate([self._sent, sent]), arrived)
+        return self
+
+    def count(self, *, complete: bool) -> int:
+        """Return how many were lost; in a run that was stopped, one in flight is not lost."""
+        return int((complete | (self._sent <= self._newest)).sum())
+
+
+def missing_rows(record: RunRecord) -> Counter[str]:
+    """Return the number of rows that a process wrote and the record does not contain, by table.
+
+    For a process that died without a report: by process, from the gaps in its input numbers.
+    """
+    missing: Counter[str] = Counter()
+    for role in LOOP_ROLES:
+        for life in record.lives(role):
+            if life.report is None:
+                missing[role] += life.missing_inputs
+                continue
+            for table, count in life.rows.items():
+                missing[table] += life.report["rows"][table] - count
+    return missing
+
+
+def reported_violations(record: RunRecord) -> list[ViolationPart]:
+    """Return the violations that the processes reported, and a loss burst at the end of the run.
+
+    The burst at the end is computed here, because no process can detect it.
+    """
+    found = [
+        ViolationPart(
+            t_s=notice["t_ns"] * 1e-9,
+            process=notice["process"],
+            cause=_cause(notice["text"]),
+            what=notice["text"],
+        )
+        for notice in record.notices
+        if notice["level"] == VIOLATION
+    ]
+    outcomes = packet_outcomes(record)
+    delivered = np.flatnonzero(~outcomes.lost)
+    first = int(delivered[-1]) + 1 if len(delivered) else 0
+    mansd = _largest_mansd(record, int(outcomes.event_ns[first - 1]) if first else 0)
+    dropped = len(outcomes.lost) - first
+    if dropped > mansd:
+        what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
+        at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
+        found.append(ViolationPart(t_s=at_s, process="netem", cause=DROPOUTS, what=what))
+    return found
+
+
+def _cause(text: str) -> str:
+    """Return the cause of a violation from a process's message."""
+    if "a change" in text:
+        return "change"
+    rule, violated, _ = text.partition(" violated: ")
+    return rule if violated and rule != "MANSD" else DROPOUTS
+
+
+def list_violations(
+    reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
+) -> list[ViolationPart]:
+    """Return all violations of a run: those reported by processes, then those found in the record.
+
+    A violation of M − 1 that a process reported is not repeated.
+    """
+    known = {one.cause for one in reported}
+    return [*reported] + [
+        ViolationPart(t_s=one.t_s, process="recorder", cause=one.cause, what=one.text)
+        for one in observed
+        if one.cause not in known
+    ]
+
+
+def _largest_mansd(record: RunRecord, since_ns: int) -> int:
+    """The largest M − 1 in force at any time from ``since_ns`` on."""
+    changes = changes_of(record)
+    caps = [record.scenario.network.mansd, *(one.scenario.network.mansd for one in changes)]
+    ends_ns = [*(one.everywhere_ns for one in changes), NEVER_NS]
+    return max(cap for cap, end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)
+
+
+def _larger(before: float | None, values: Reals) -> float | None:
+    """Return the largest of the values and of those before; NaN if one is NaN."""
+    if not len(values):
+        return before
+    largest = values.max()
+    return float(largest if before is None else np.maximum(before, largest))
+
+
+class SampleFacts(NamedTuple):
+    """What claims need to know about all samples of a run before they are checked."""
+
+    any_in_common: bool = False
+    gap_s: float | None = None
+    """First time at which the controller's error is not known, although it was before."""
+    largest_state: float = 0.0
+    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
+    longest_update_ns: int = 0
+    """Longest time between two updates of the controller, or to the end of the run."""
+
+
+class SampleFactsReader:
+    """Reads these facts, part by part of an aligned run; the claims end at ``until_s``."""
+
+    def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
+        self._scenario, self._until_s = scenario, until_s
+        self._found = SampleFacts()
+        self._fresh_ns: int | None = None
+        self._newest, self._last_ns = -1, 0
+
+    def take(self, joined: AlignedRun) -> None:
+        """Add the next measurements."""
+        if not len(joined.t_ns):
+            return
+        found, common, t_s = self._found, shares_update(self._scenario, joined), joined.t_ns * 1e-9
+        started = np.logical_or.accumulate(common) | found.any_in_common
+        gaps = np.flatnonzero(started & ~common)
+        gap_s = float(t_s[gaps[0]]) if found.gap_s is None and len(gaps) else found.gap_s
+        until = t_s < self._until_s
+        both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
+        largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
+        changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
+        ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
+        longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
+        self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
+        self._newest, self._last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
+        self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
+
+    @property
+    def facts(self) -> SampleFacts:
+        """What is known after the last part."""
+        if self._fresh_ns is None:
+            return self._found
+        since_ns = self._last_ns - self._fresh_ns
+        longest_ns = max(self._found.longest_update_ns, since_ns)
+        return self._found._replace(longest_update_ns=longest_ns)
+
+
+def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
+    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
+    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
+    return np.asarray(finite & in_common(scenario, joined))
+
+
+class SignalStatistics:
+    """Reads the signals of a run once, aligned."""
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._sup_e_s: float | None = None
+        self._sup_e_c: float | None = None
+        self._sup_e_c_at_s: float | None = None
+        self._residual: float | None = None
+        self._sup_true_e_c: float | None = None
+        self._errors, self._late_errors = SizeStatistics(), SizeStatistics()
+        self._scale, self._read = 0.0, 0
+        self._half = record.count(SENSOR_MEASUREMENT) // 2
+        facts = SampleFactsReader(record.scenario)
+        residual = IdentityResidual(record.scenario)
+        for part in aligned_parts(record):
+            self._add(part)
+            facts.take(part.aligned)
+            left = residual.take(part)
+            self._residual = _larger(self._residual, left[~np.isnan(left)])
+            self._estimation_error(part)
+            self._read += len(part.rows)
+        self.facts = facts.facts
+        """What claims need to know before they are checked."""
+
+    def _add(self, part: AlignedPart) -> None:
+        aligned = part.aligned
+        common = aligned.since_delivery(self._record.scenario)
+        t_s, e_c = aligned.t_ns[common] * 1e-9, aligned.e_c_norm[common]
+        self._sup_e_s = _larger(self._sup_e_s, aligned.e_s_norm)
+        if len(e_c) and (self._sup_e_c is None or e_c.max() > self._sup_e_c):
+            self._sup_e_c, self._sup_e_c_at_s = float(e_c.max()), float(t_s[np.argmax(e_c)])
+        self._scale = float(np.maximum(self._scale, np.abs(aligned.x_s).max(initial=0.0)))
+
+    def _estimation_error(self, part: AlignedPart) -> None:
+        if part.true_x is None:
+            return
+        # ‖x_c − x‖_W with the plant's own x, from the controller's first update on
+        aligned, weight = part.aligned, self._record.loop.weight
+        e_c = aligned.x_c - part.true_x
+        norms = row_norms(e_c if weight is None else e_c @ weight.T)
+        counted = np.isfinite(norms) & aligned.since_delivery(self._record.scenario)
+        self._sup_true_e_c = _larger(self._sup_true_e_c, norms[counted])
+        errors = row_norms(part.rows["x"] - part.true_x)
+        self._errors.add(errors)
+        self._late_errors.add(errors[max(self._half - self._read, 0) :])
+
+    def for_summary(self) -> dict[str, Any]:
+        """Return norms of the state, of the errors, and of the residual of (I1)."""
+        first, last = None, None
+        for steps in self._record.source.batches(PLANT_STEP, ("x",)):
+            first = float(row_norms(steps["x"][:1])[0]) if first is None else first
+            last = float(row_norms(steps["x"][-1:])[0])
+        scale = max(self._scale, float(np.finfo(float).tiny))
+        return {
+            "initial_state_norm": first,
+            "final_state_norm": last,
+            "sup_e_s_norm": self._sup_e_s,
+            "sup_e_c_norm": self._sup_e_c,
+            "sup_e_c_at_s": self._sup_e_c_at_s,
+            "identity_residual_max": self._residual,
+            "identity_residual_relative": None
+            if self._residual is None
+            else self._residual / scale,
+        }
+
+    def estimation(self) -> EstimationPart | None:
+        """Return the estimation error; None if the sensor measures x itself."""
+        scenario = self._record.scenario
+        if scenario.coverage.knows_state:
+            return None
+        return EstimationPart(
+            observer=None if scenario.observer is None else scenario.observer.kind,
+            outputs=scenario.message_sizes.outputs,
+            noise_std=np.sqrt(scenario.plant.measurement.variance(self._record.loop.n)).tolist(),
+            rms=self._errors.rms,
+            rms_second_half=self._late_errors.rms,
+            expected_rms=expected_rms(scenario),
+            max=self._errors.max,
+            sup_e_c_norm=self._sup_true_e_c,
+        )
+
+
+@lru_cache(maxsize=1)
+@np.errstate(all="ignore")  # a run may diverge
+def signal_statistics(record: RunRecord) -> "SignalStatistics":
+    """Read the signals of a run; the summary and the claims use the same ones."""
+    return SignalStatistics(record)
+
+
+def disturbances(record: RunRecord) -> list[DisturbancePart]:
+    """The disturbances of u and of ẋ."""
+    found = []
+    for place, column in (("input", "d"), ("state", "w")):
+        if column not in (record.tables[PLANT_STEP].names or ()):
+            continue
+        sizes = SizeStatistics()
+        for steps in record.source.batches(PLANT_STEP, (column,)):
+            sizes.add(row_norms(steps[column]))
+        kinds = [one.kind for one in record.scenario.plant.disturbances if one.at == place]
+        found.append(DisturbancePart(at=place, kinds=kinds, rms=sizes.rms, max=sizes.max))
+    return found
+
+
+def watchdog_actions(record: RunRecord) -> WatchdogPart:
+    """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
+    timing = record.scenario.timing
+    names = ("now_ns", "sequence", "t_ns", "actuation")
+    received = np.zeros(0, with_columns(record.tables[PLANT_ACTUATION], names))
+    trips, steps_old, first_s, was_old = 0, 0, None, False
+    for part in record.slices(PLANT_STEP, PLANT_ACTUATION, columns=names):
+        steps = part[PLANT_STEP]
+        received = joined([received, part[PLANT_ACTUATION]], received.dtype)
+        found = np.searchsorted(received["sequence"], steps["actuation"])
+        there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
+        newest_ns = np.where(
+            steps["actuation"] != NO_SEQUENCE, np.append(received["t_ns"], 0)[found], 0
+        )
+        # If an actuation is not recorded, its age is unknown.
+        old = there & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
+        begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
+        if len(begun) and first_s is None:
+            first_s = float(steps["t_ns"][begun[0]]) * 1e-9
+        trips, steps_old = trips + len(begun), steps_old + int(old.sum())
+        if len(steps):  # a later step has the newest of these actuations, or a later one
+            was_old, received = bool(old[-1]), received[int(found[-1]) :]
+    return WatchdogPart(
+        policy=record.scenario.plant.watchdog.policy,
+        timeout_s=timing.actuation_timeout_ns * 1e-9,
+        trips=trips,
+        first_s=first_s,
+        total_s=steps_old * timing.plant_period_ns * 1e-9,
+    )
