@@ -9,19 +9,18 @@ from then on, as in a plant that diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, discretise
 from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import Role, set_machine
+from noack.machines.machine_parts import Role, alike_parts, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart
 from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
@@ -96,14 +95,16 @@ class Plant:
             "measure_every": self.measure_every, "reports_inputs": self.reports_inputs,
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
-            "x": np.array(self.system.x), "z": np.array(self.system.z), "u": np.zeros(m),
+            "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
             "applied": np.zeros(sources), "held": np.zeros((shown, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
         if isinstance(self.system, LinearSystem):
-            Ad, Bd = discretise(self.system.A, self.system.B, self.period_ns)
-            memory.fill(plant, {"system": core.NOACK_LINEAR, "Ad": Ad, "Bd": Bd})
+            memory.fill(plant, {
+                "system": core.NOACK_LINEAR, "Ad": np.zeros((n, n)), "Bd": np.zeros((n, sources)),
+            })  # fmt: skip
+        self.redraw(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measuring is not None and self.measuring.is_noisy
@@ -113,6 +114,14 @@ class Plant:
             signal = getattr(plant, name)
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
+
+    def redraw(self, plant: Any, memory: CoreMemory) -> None:
+        """Set the state, and the matrices of a linear system."""
+        n, system = plant.machine.n, self.system
+        reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
+        if isinstance(system, LinearSystem):
+            Ad, Bd = discretise(system.A, system.B, self.period_ns)
+            reals_at(plant.Ad, n, n)[:], reals_at(plant.Bd, n, plant.sources)[:] = Ad, Bd
 
     def answer(self, question: int, plant: Any) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""
@@ -166,7 +175,8 @@ def plants_of(
     loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, numbered: bool = False
 ) -> LoopMachines:
     """Return the plants of resolved loops as the machines of a process."""
-    return LoopMachines([_part(one) for one in loops], phases_ns, numbered=numbered)
+    parts, alike = alike_parts(loops, _part, _redrawn)
+    return LoopMachines(parts, phases_ns, alike=alike, numbered=numbered)
 
 
 def _part(resolved: Scenario) -> Plant:
@@ -185,6 +195,13 @@ def _part(resolved: Scenario) -> Plant:
     )
 
 
+def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
+    return replace(
+        plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
+        measuring=measurement_model_of(resolved),
+    )  # fmt: skip
+
+
 def system_of(resolved: Scenario) -> PlantSystem:
     """Return the system of a resolved scenario's plant, at x(0).
 
@@ -195,9 +212,10 @@ def system_of(resolved: Scenario) -> PlantSystem:
         CallerError: a file or module that the system needs is missing, or differs from the
             settings.
     """
-    loop, plant = loop_of(resolved), resolved.plant
-    B: Matrix = loop.B
+    plant, model = resolved.plant, resolved.model
+    A: Matrix = np.array(model.A if plant.A is None else plant.A)
+    B: Matrix = np.array(model.B if plant.B is None else plant.B)
     if any(one.at == "state" for one in plant.disturbances):
-        B = np.hstack([B, np.eye(loop.n)])
-    start = PlantStart(np.array(plant.initial_state), loop.A, B, resolved.timing.plant_period_ns)
+        B = np.hstack([B, np.eye(len(A))])
+    start = PlantStart(np.array(plant.initial_state), A, B, resolved.timing.plant_period_ns)
     return plant.system.system(start)

@@ -124,6 +124,14 @@ class NetworkRows:
                 found["flow"] //= len(self._phases_ns)
         return own
 
+    def counts(self) -> dict[str, NDArray[np.int64]]:
+        """Return the number of rows of each loop by table, shape (loops,)."""
+        loops = len(self._phases_ns)
+        return {
+            table: np.diff(self._ends[table]) if table in self._ends else np.full(loops, len(rows))
+            for table, rows in self._rows.items()
+        }
+
     def count(self, table: str, generation: int) -> int:
         """Return the number of rows of a table and a generation of the emulator, of all loops."""
         key = table, generation

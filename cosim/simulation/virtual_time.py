@@ -7,18 +7,21 @@ of the network couple the loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import accumulate
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.record.loop_rows import NetworkRows
+from cosim.record.record_source import RecordSource, RowsInMemory
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
-from noack.config.loops import loops_of, phases_ns
+from noack.config.loops import phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
-from noack.config.resolution import network_tables, resolve, tables_of
+from noack.config.resolution import is_of_network, network_tables, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
@@ -41,6 +44,7 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
     "controller": controllers_of,
 }
 """In the order of ``noack_role``."""
+_REASONS = tuple(reason.value for reason in Rejection)
 _INPUTS_PER_PROGRESS = 2048
 _SENT_PLACES = 64
 
@@ -65,10 +69,28 @@ class RecordCollector:
         self._batches.setdefault(table, []).append(rows)
 
     def rows(self, table: str, dtype: np.dtype[np.void]) -> Rows:
-        """Return all rows of a table of this type."""
-        announced = np.array(self._settings.get(table, []), dtype)
-        batches = [rows for rows in self._batches.get(table, []) if rows.dtype == dtype]
-        return np.concatenate([announced, *batches])
+        """Return all rows of a table whose rows have this type."""
+        batches = self._batches.get(table, [])
+        return np.concatenate([np.array(self._settings.get(table, []), dtype), *batches])
+
+    def counts(self, table: str, loops: int) -> NDArray[np.int64]:
+        """Return the number of rows of each loop in a table of the machines, shape (loops,)."""
+        numbers = [rows[LOOP] for rows in self._batches.get(table, [])]
+        numbers.append(np.array([row[0] for row in self._settings.get(table, [])], np.uint16))
+        return np.bincount(np.concatenate(numbers), minlength=loops)
+
+    def take_by_loop(self, table: str, dtype: np.dtype[np.void]) -> dict[int, Rows]:
+        """Return the rows of each loop in a table of the machines, and keep them no longer.
+
+        The loops' rows may have different types; rows of settings have ``dtype``.
+        """
+        batches = self._batches.pop(table, [])
+        if settings := self._settings.pop(table, []):
+            batches = [np.array(settings, np.dtype([(LOOP, "<u2"), *dtype.descr])), *batches]
+        by_type: dict[np.dtype[np.void], list[Rows]] = {}
+        for rows in batches:
+            by_type.setdefault(rows.dtype, []).append(rows)
+        return dict(own for same in by_type.values() for own in _split(np.concatenate(same)))
 
     def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
@@ -97,7 +119,9 @@ class VirtualRun:
         network: Network | None = None,
     ) -> None:
         self._scenario = scenario
-        self.groups: Sequence[Sequence[int]] = [*_groups(loops)]
+        self.types = [tables_of(loop) for loop in loops]
+        """The types of each loop's rows, by table."""
+        self.groups: Sequence[Sequence[int]] = [*_groups(self.types)]
         """The numbers of the loops whose rows have the same columns."""
         self.phases_ns = phases = phases_ns(scenario)
         """When each loop begins."""
@@ -163,10 +187,10 @@ class VirtualRun:
         place = self.core.of_loop[loop]
         machine = self.machines[place.group][role].machines[place.place].machine
         counts = machine.acknowledgements if acknowledges else machine.received
-        rejected = zip(Rejection, counts.rejected, strict=True)
+        rejected = zip(_REASONS, counts.rejected, strict=True)
         return {
             "accepted": counts.accepted,
-            "rejected": {reason.value: count for reason, count in rejected if count},
+            "rejected": {reason: count for reason, count in rejected if count},
         }
 
     def _new_core(self, loops: int) -> Any:
@@ -202,10 +226,10 @@ class VirtualRun:
         self._sent = simulation.sent = larger
         simulation.sent_places, simulation.sent_first = 2 * places, 0
 
-    def _take(self, group: int, role: str) -> None:
+    def _take(self, group: int, role: str, *, last: bool = False) -> None:
         """Take the rows and notices of machines."""
         machines, numbers = self.machines[group][role], np.array(self.groups[group])
-        for table, rows in machines.take_rows():
+        for table, rows in machines.take_rows(last=last):
             if len(self.groups) > 1:
                 rows[LOOP] = numbers[rows[LOOP]]
             self.record.extend(table, rows)
@@ -215,7 +239,7 @@ class VirtualRun:
     def _take_all(self) -> None:
         for group, machines in enumerate(self.machines):
             for role in machines:
-                self._take(group, role)
+                self._take(group, role, last=True)
         for table, rows in self.channel.take_rows():
             self.record.extend(table, rows)
 
@@ -256,8 +280,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
-    loops = [resolve(loop) for loop in loops_of(scenario)]
-    return _simulated(scenario, loops, None, progress)
+    return _simulated(scenario, resolved_loops(scenario), None, progress)
 
 
 def _simulated(
@@ -272,72 +295,118 @@ def _simulated(
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
     packets = NetworkRows(of_network, run.phases_ns)
-    own = [dict[str, Rows]() for _ in loops]
-    for numbers in run.groups:
-        for table, dtype in tables_of(loops[numbers[0]]).items():
-            if OWNER[table] != "netem":
-                rows = run.record.rows(table, np.dtype([(LOOP, "<u2"), *dtype.descr]))
-                for number, of_loop in _split(rows, dtype, numbers):
-                    own[number][table] = of_loop
+    by_table: dict[str, dict[int, Rows]] = {}
+    counts = packets.counts() | {
+        table: run.record.counts(table, len(loops))
+        for table in {table for types in run.types for table in types}
+        if not is_of_network(table)
+    }
     records = []
     for number, loop in enumerate(loops):
-        found = own[number] | packets.of_loop(number)
-        # Nothing in virtual time compares clocks: these tables are empty.
-        tables = {
-            table: found.get(table, np.zeros(0, dtype)) for table, dtype in tables_of(loop).items()
-        }
-        reports = _reports(run, tables, scenario, number)
+        rows = _LoopRows(run.record, by_table, packets, number, run.types[number])
+        own_counts = {table: int(counts[table][number]) for table in run.types[number]}
+        reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         shared = number if len(loops) > 1 else None
-        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=shared))
-    reports = {"netem": _report("netem", of_network, {"rejected": {}})}
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=shared))
+    of_all = {table: len(rows) for table, rows in of_network.items()}
+    reports = {"netem": _report("netem", of_all, {"rejected": {}})}
     common = RunRecord(
         scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
     )
     return RecordedRun(common, records)
 
 
-def _groups(loops: Sequence[Scenario]) -> Iterator[list[int]]:
+class _LoopRows(RecordSource):
+    """The rows of a loop. A table of the run is split by loops when one of them is first read.
+
+    Args:
+        record: the rows of the run's machines.
+        by_table: the tables that have been split, of all loops.
+        packets: the rows of the network.
+        number: the number of the loop.
+        types: the types of its rows.
+    """
+
+    def __init__(
+        self,
+        record: RecordCollector,
+        by_table: dict[str, dict[int, Rows]],
+        packets: NetworkRows,
+        number: int,
+        types: Mapping[str, np.dtype[np.void]],
+    ) -> None:
+        super().__init__(types)
+        self._record, self._by_table, self._packets, self._number = (
+            record,
+            by_table,
+            packets,
+            number,
+        )
+
+    @cached_property
+    def _of_network(self) -> Mapping[str, Rows]:
+        return self._packets.of_loop(self._number)
+
+    def whole(self, table: str) -> Rows:
+        """Return all rows of a table."""
+        if is_of_network(table):
+            return self._of_network[table]
+        if table not in self._by_table:
+            self._by_table[table] = self._record.take_by_loop(table, self.types[table])
+        # Nothing in virtual time compares clocks: these tables are empty.
+        return self._by_table[table].get(self._number, np.zeros(0, self.types[table]))
+
+    def count(self, table: str) -> int:
+        """Return the number of rows of a table."""
+        return len(self.whole(table))
+
+    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
+        """Yield the rows of a table in order."""
+        yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
+
+
+def _groups(types: Sequence[Mapping[str, np.dtype[np.void]]]) -> Iterator[list[int]]:
     """Yield the numbers of the loops whose rows have the same columns."""
     groups: list[tuple[Mapping[str, np.dtype[np.void]], list[int]]] = []
-    for number, loop in enumerate(loops):
-        types = tables_of(loop)
-        same = next((numbers for known, numbers in groups if known == types), None)
+    for number, own in enumerate(types):
+        same = next((numbers for known, numbers in groups if known == own), None)
         if same is None:
-            groups.append((types, [number]))
+            groups.append((own, [number]))
         else:
             same.append(number)
     yield from (numbers for _, numbers in groups)
 
 
-def _split(
-    rows: Rows, dtype: np.dtype[np.void], numbers: Sequence[int]
-) -> Iterator[tuple[int, Rows]]:
-    """Yield the number and the rows of each loop, without the column of its number."""
-    loops = rows[LOOP]
-    order = np.argsort(loops, kind="stable") if len(numbers) > 1 else slice(None)
-    counts = np.bincount(loops, minlength=max(numbers) + 1)
+def _split(rows: Rows) -> Iterator[tuple[int, Rows]]:
+    """Yield the number and the rows of each loop that has some, without the loop's number."""
+    (_, *names), loops = rows.dtype.names or (), rows[LOOP]
+    own = np.dtype([(name, rows.dtype[name]) for name in names])
+    ends = np.cumsum(np.bincount(loops)).tolist()
+    order = np.argsort(loops, kind="stable") if len(ends) > 1 else slice(None)
     data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
-    own = np.ascontiguousarray(data).view(dtype).reshape(-1)
-    ends = [*accumulate(counts.tolist(), initial=0)]
-    for number in numbers:
-        yield number, own[ends[number] : ends[number + 1]]
+    ordered = np.ascontiguousarray(data).view(own).reshape(-1)
+    for number, (first, last) in enumerate(pairwise([0, *ends])):
+        if last > first:
+            yield number, ordered[first:last]
 
 
 def _reports(
-    run: VirtualRun, rows: Mapping[str, Rows], scenario: Scenario, loop: int = 0
+    run: VirtualRun, counts: Mapping[str, int], scenario: Scenario, loop: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the final report of each role, as of a loop."""
+    """Return the final report of each role, as of a loop with these numbers of rows."""
     reports = {
-        role: _report(role, rows, run.reception(role, loop) if role in _ROLES else {"rejected": {}})
+        role: _report(
+            role, counts, run.reception(role, loop) if role in _ROLES else {"rejected": {}}
+        )
         for role in LOOP_ROLES
     }
     if scenario.protocol.acknowledges:
-        counts = run.reception("sensor", loop, acknowledges=True)
-        reports["sensor"]["channel"]["acknowledgements"] = counts
+        received = run.reception("sensor", loop, acknowledges=True)
+        reports["sensor"]["channel"]["acknowledgements"] = received
     return reports
 
 
-def _report(role: str, rows: Mapping[str, Rows], channel: dict[str, Any]) -> dict[str, Any]:
-    owned = {table: len(found) for table, found in rows.items() if OWNER[table] == role}
+def _report(role: str, counts: Mapping[str, int], channel: dict[str, Any]) -> dict[str, Any]:
+    owned = {table: count for table, count in counts.items() if OWNER[table] == role}
     return {"ended": HORIZON, "channel": channel, "rows": owned}

@@ -32,6 +32,8 @@ class LoopMachines:
     Args:
         parts: the machine of each loop.
         phases_ns: when each loop begins, in the run's time; by default 0.
+        alike: the number of the first loop, for each loop, from which it differs in draws only; by
+            default its own.
         numbered: whether rows begin with the number of their loop.
         rows: rows of each table until they must be taken; by default as many as suit the loops.
 
@@ -44,6 +46,7 @@ class LoopMachines:
         parts: Sequence[MachinePart],
         phases_ns: Sequence[int] | None = None,
         *,
+        alike: Sequence[int] | None = None,
         numbered: bool = False,
         rows: int | None = None,
     ) -> None:
@@ -57,7 +60,7 @@ class LoopMachines:
         self._notices: list[Notice] = []
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
-        self._fill_machines()
+        self._fill_machines(alike or range(len(self.parts)))
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
@@ -68,7 +71,7 @@ class LoopMachines:
             raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")
         core.noack_process_begin(self.core)
 
-    def _fill_machines(self) -> None:
+    def _fill_machines(self, alike: Sequence[int]) -> None:
         process, count, keep = self.core, len(self.parts), self._memory.keep
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
@@ -77,8 +80,17 @@ class LoopMachines:
         process.heap = keep(ffi.new("int64_t[]", count))
         self.machines: Any = machines
         """(loops,) The structures of the machines."""
-        for part, structure, phase_ns in zip(self.parts, machines, self.phases_ns, strict=True):
-            part.fill(structure, self._memory)
+        copies: dict[int, list[int]] = {}
+        for number, first in enumerate(alike):
+            copies.setdefault(first, []).append(number)
+        for first, (_, *others) in copies.items():
+            mark = self._memory.size
+            self.parts[first].fill(machines[first], self._memory)
+            if others:
+                self._memory.copy(machines, first, others, mark)
+            for number in others:
+                self.parts[number].redraw(machines[number], self._memory)
+        for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
     def _fill_tables(self, rows: int) -> None:
@@ -104,13 +116,21 @@ class LoopMachines:
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
 
-    def take_rows(self) -> list[tuple[str, Rows]]:
-        """Return the rows since the last call, by table, and empty the core's tables."""
+    def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
+        """Return the rows since the last call, by table, and empty the core's tables.
+
+        ``last``: the machines make no more steps.
+        """
         taken: list[tuple[str, Rows]] = []
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
-                found, table.count = rows[: table.count].copy(), 0
+                found, table.count = rows[: table.count], 0
+                if not last and 2 * len(found) < len(rows):
+                    found = found.copy()
+                elif not last:
+                    self._tables[number] = np.empty(len(rows), rows.dtype)
+                    table.rows = pointer_to(self._tables[number], "uint8_t *")
                 name = self.role.tables[number]
                 assert name is not None
                 taken.append((name, found))

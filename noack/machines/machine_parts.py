@@ -4,13 +4,14 @@ A *part* is the description of one loop's machine: it fills the core's structure
 questions at which a step stops (``enum noack_question`` in native/noack.h).
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule
+from noack.config.parameter_changes import ChangeSchedule, settings_key
+from noack.config.scenario import Scenario
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory
 from noack.protocol.machine_interface import Notice
@@ -62,6 +63,10 @@ class MachinePart(Protocol):
         """Fill the core's structure, at the start of the machine's work."""
         ...
 
+    def redraw(self, structure: Any, memory: CoreMemory) -> None:
+        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
+        ...
+
     def answer(self, question: int, structure: Any) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
         ...
@@ -73,6 +78,29 @@ class MachinePart(Protocol):
     def note(self, structure: Any, note: Any) -> Notice:
         """Return the line for the log that a step has asked for by a ``noack_note``."""
         ...
+
+
+Part = TypeVar("Part", bound=MachinePart)
+
+
+def alike_parts(
+    loops: Sequence[Scenario],
+    make: Callable[[Scenario], Part],
+    redrawn: Callable[[Part, Scenario], Part],
+) -> tuple[list[Part], list[int]]:
+    """Return the part of each loop, and the number of the first loop that is alike.
+
+    Loops are alike if they differ in their draws only. ``make`` makes the part of the first of
+    them, ``redrawn`` one with the draws of another loop.
+    """
+    parts: list[Part] = []
+    alike: list[int] = []
+    firsts: dict[tuple[int, ...], int] = {}
+    for number, loop in enumerate(loops):
+        first = firsts.setdefault(settings_key(loop), number)
+        parts.append(make(loop) if first == number else redrawn(parts[first], loop))
+        alike.append(first)
+    return parts, alike
 
 
 def set_machine(
