@@ -115,7 +115,7 @@ class SampledWork:
         block = expm(block * (record.scenario.timing.plant_period_ns / NS_PER_S))
         over_a_step = block[size:, size:].T @ block[:size, size:]
         z = np.hstack([steps[name] for name in ("x", *inputs)])[:-1]
-        return float(np.einsum("ki,ij,kj->", z, over_a_step, z))
+        return float(np.einsum("kj,kj->", z @ over_a_step, z))
 
     def _trapezoid(self, record: RunRecord) -> float:
         x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"][:-1]
