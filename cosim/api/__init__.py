@@ -12,6 +12,7 @@ from cosim.api.certificates import certify as certify
 from cosim.api.certificates import margin as margin
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
+from cosim.api.measurements import Measurement as Measurement
 from cosim.api.measurements import measure as measure
 from cosim.api.result_files import save_tables as save_tables
 from cosim.api.runs import Run as Run
@@ -23,7 +24,6 @@ from cosim.api.runs import simulate as simulate
 from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import with_settings as with_settings
-from cosim.measurement.network_measurement import Measurement as Measurement
 from cosim.output.all_certificates import Certificates as Certificates
 from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError

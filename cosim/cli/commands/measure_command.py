@@ -9,7 +9,7 @@ from noack.traces.shipped_traces import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
-    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.live.probe_ends import ProbeResult
     from cosim.measurement.network_measurement import MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
 
@@ -104,7 +104,7 @@ def _result(
         receive_live,
         send_live,
     )
-    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.live.probe_ends import ProbeResult
     from cosim.measurement.trace_sources import FILE_OPTIONS, read_source, refuse_unused
 
     if listen is not None:
@@ -145,8 +145,8 @@ def _share(text: str) -> float:
 def _options(
     deadline: str | None, shares: list[str] | None, window: list[int] | None, outage: str | None
 ) -> "MeasurementOptions":
-    from cosim.measurement.burst_statistics import WINDOWS
     from cosim.measurement.live.live_measurement import time_s_of
+    from cosim.measurement.loss_bursts import WINDOWS
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 
     return MeasurementOptions(
