@@ -31,7 +31,7 @@ def archive(
     `noack reproduce` repeats it.
     """
     from cosim.live.progress import PatientConsole
-    from cosim.studies.reproduction.run_archive import SUFFIX, write_archive
+    from cosim.studies.run_archive import SUFFIX, write_archive
 
     chosen = chosen_run(run_dir, runs)
     path = out or Path(f"{chosen.resolve().name}{SUFFIX}")

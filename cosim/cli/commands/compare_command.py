@@ -41,7 +41,7 @@ def compare(
 ) -> int:
     """Compare runs: key numbers, settings that differ, curves overlaid."""
     from cosim.live.progress import PatientConsole
-    from cosim.studies.comparison.run_comparison import compare_runs
+    from cosim.studies.run_comparison import compare_runs
 
     with PatientConsole(stderr=True).status("comparing"):
         found = compare_runs(directories)

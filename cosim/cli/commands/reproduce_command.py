@@ -39,8 +39,7 @@ def reproduce(
     Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
     """
     from cosim.live.progress import PatientConsole
-    from cosim.studies.reproduction.repetition_table import print_repetition
-    from cosim.studies.reproduction.run_repetition import repeat_archive
+    from cosim.studies.run_repetition import print_repetition, repeat_archive
 
     with PatientConsole(stderr=True).status("repeating"):
         found = repeat_archive(file, run_code=run_code, long=long, into=into)

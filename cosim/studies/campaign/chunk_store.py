@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
-from cosim.studies.campaign.campaign_workers import Chunk
-from cosim.studies.campaign.worker_identity import arithmetic, difference
+from cosim.studies.campaign.campaign_workers import Chunk, arithmetic, difference
 from noack.core.errors import CallerError, MachineError, shortened, why
 from noack.core.file_access import PARTIAL, locked, write_whole
 

@@ -17,7 +17,7 @@ from cosim.output.report.axes import finish, legend, logarithmic, plain, single
 from cosim.output.report.figure_files import inline, save_figures
 from cosim.output.report.figure_style import printed, styled
 from cosim.output.report.report_page import templates
-from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
+from cosim.studies.design.candidates import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus

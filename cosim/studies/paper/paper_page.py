@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cosim.studies.campaign.draw_statistics import paired, quartiles
+from cosim.studies.campaign.metrics import paired, quartiles
 from cosim.studies.paper.draw_measures import MODES, STEP_S
 from cosim.studies.paper.paper_campaign import BASE, OTHER_EXAMPLES, settings_of
 from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims

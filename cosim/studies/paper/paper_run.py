@@ -11,7 +11,7 @@ from cosim.output.report.figure_files import save_figure
 from cosim.simulation.continuous.continuous_report import run_continuous
 from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import local
-from cosim.studies.campaign.draw_statistics import quartiles
+from cosim.studies.campaign.metrics import quartiles
 from cosim.studies.paper.draw_measures import MODES, resolved_draw
 from cosim.studies.paper.paper_campaign import BASE, load_campaign, run_parts
 from cosim.studies.paper.paper_claims import PaperVerdict, claims

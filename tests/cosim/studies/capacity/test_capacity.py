@@ -25,7 +25,7 @@ from cosim.studies.capacity.capacity_criteria import (
     carried,
 )
 from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
-from cosim.studies.capacity.loop_mixture import kinds_of, policies_of, smallest_mixture
+from cosim.studies.capacity.capacity_plan import kinds_of, policies_of, smallest_mixture
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import Fate
 

@@ -16,7 +16,7 @@ from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.decimate import Reals
-from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
+from cosim.studies.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole

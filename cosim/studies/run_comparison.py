@@ -106,7 +106,7 @@ class RunComparison:
 
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
-        from cosim.studies.comparison.overlay_figure import overlay_figure
+        from cosim.studies.comparison_figure import overlay_figure
 
         return overlay_figure(self.runs)
 
@@ -121,7 +121,7 @@ class RunComparison:
             CallerError: the name has another ending, or there is no such width.
             MachineError: the file cannot be written.
         """
-        from cosim.studies.comparison.overlay_figure import write_overlay
+        from cosim.studies.comparison_figure import write_overlay
 
         write_overlay(self, path, width)
 
