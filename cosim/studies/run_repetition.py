@@ -1,4 +1,4 @@
-"""The repetition of an archived run, and what differs."""
+"""The repetition of an archived run, and what differs, as a result and as a table."""
 
 import tempfile
 from collections.abc import Iterator, Sequence

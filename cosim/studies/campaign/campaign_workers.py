@@ -1,4 +1,8 @@
-"""The code, libraries and arithmetic on which a campaign's results depend, bit by bit."""
+"""Computes the chunks of a campaign: in processes of this machine or on a Dask cluster.
+
+Chunks are independent of each other. Only this process writes results. They depend bit by bit on
+code, libraries and arithmetic, so workers must have the same; this comes first.
+"""
 
 import logging
 import math

@@ -1,4 +1,11 @@
-"""The metrics of the runs of a campaign, and the certified bound of ‖e_c‖."""
+"""The metrics of the runs of a campaign, and their estimates with confidence intervals.
+
+Means have Student's confidence intervals, ± t s/√k. Mean and interval use the finite values only.
+The median's interval uses order statistics (binomial, for any distribution). It includes infinite
+values: a run that never settles counts as later than all others. Beside the metrics are the
+certified bound of ‖e_c‖, and how often runs exceed M − 1 consecutive losses if the network does not
+enforce the guarantee.
+"""
 
 import math
 from collections.abc import Mapping, Sequence

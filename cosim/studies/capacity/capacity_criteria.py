@@ -12,6 +12,11 @@ A run reaches a limit if
 The capacity of a draw is the largest number of loops of the study up to which no run reaches the
 limit: 0 if one loop reaches it, infinite if none does. The estimate is the median over the draws,
 with the 95 % confidence interval of order statistics.
+
+How long a study takes is estimated before it starts. The time of a run is proportional to its loops
+and its steps. The time per loop and simulated second is measured with a short run on this machine,
+as processor time, so that other programs that run meanwhile do not count. Loops that overload the
+link take up to twice as long.
 """
 
 import time
@@ -27,7 +32,7 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_summary import CampaignSummary, runs_at
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import Metric, quantile_interval, quartiles
-from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
+from cosim.studies.campaign.sampled_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_plan import (
     DISTURBANCE,
     LOOPS,

@@ -1,8 +1,14 @@
-"""The kinds of loops of a capacity study, and what each of them becomes under a policy.
+"""The campaign of a capacity study: policies × numbers of loops × disturbances.
 
-The entries of [[loops]] are the kinds; a scenario without them has one. A study keeps the
-proportions of their counts: all numbers of loops are multiples of the smallest mixture. A kind that
-is periodic in the scenario stays as it is under every policy, and has its own period.
+First come the kinds of loops. The entries of [[loops]] are the kinds; a scenario without them has
+one. A study keeps the proportions of their counts: all numbers of loops are multiples of the
+smallest mixture. A kind that is periodic in the scenario stays as it is under every policy, and has
+its own period.
+
+The draws have common random numbers: loop k of draw i is the same for any policy. If all loops are
+of one kind, it is the same for any number of loops, too, and the reference of their cost is that of
+one loop. The reference of loops of several kinds is the same loops on a link that is as many times
+as fast as there are loops.
 """
 
 import math
@@ -14,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
-from cosim.studies.campaign.shared_network_draws import cost_of
+from cosim.studies.campaign.sampled_draws import cost_of
 from noack.config.loops import loop_scenario
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario

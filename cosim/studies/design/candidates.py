@@ -1,4 +1,7 @@
-"""Measures of a candidate: transmissions and settling over draws, and certified bounds."""
+"""Measures of a candidate (transmissions, settling, certified bounds), and the result of a design.
+
+Transmissions and settling are those of draws.
+"""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,7 @@
-"""The candidates of a design: families of loops with a gain and a norm, each with α and β."""
+"""The candidates of a design: families of loops with a gain and a norm, each with α and β.
+
+The gains and norms among which a design chooses are at the end.
+"""
 
 import itertools
 import math

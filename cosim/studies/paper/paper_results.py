@@ -1,4 +1,10 @@
-"""The page's data: all draws, as in ``paper.json``, and the format of their numbers."""
+"""The page's data: all draws, as in ``paper.json``, the format of their numbers, and the claims.
+
+The claims are those of the paper's text, each with a verdict from the draws. A claim is confirmed
+if it holds in at least 95 % of the draws, both in the base ensemble and in every variation of a
+setting that the paper does not specify. It is partly confirmed if it holds in at least half of the
+draws of the base ensemble. Otherwise it is not confirmed.
+"""
 
 import json
 import math
@@ -9,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from cosim.studies.campaign.metrics import quartiles
-from cosim.studies.paper.draw_measures import MODES
-from cosim.studies.paper.paper_campaign import BASE, COLUMNS, EnsemblePart
+from cosim.studies.paper.paper_campaign import BASE, COLUMNS, MODES, EnsemblePart
 from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5
