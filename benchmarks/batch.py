@@ -22,19 +22,19 @@ from scipy.integrate import solve_ivp
 
 from benchmarks._report import Benchmark, Goal, Peer, Rounds, Row, median, say
 from cosim.cli import find_scenario
-from cosim.simulation.batch.batch_interface import (
+from cosim.simulation.batch import (
     Population,
     Setting,
     run_batch,
     run_events,
     setting_of,
 )
-from cosim.simulation.continuous.network_fates import network_fates
-from noack.config.feature_kinds import POLICIES
+from cosim.simulation.continuous import network_fates
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.config.sections.run_sections import SeedsSection
+from noack.config.sections import POLICIES
 from noack.core.linear_systems import Vector
 
 Mode = Literal["model", "zoh"]

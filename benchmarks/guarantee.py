@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
-from noack.impairments.kept_loss import expected_loss
+from noack.impairments.loss_prediction import expected_loss
 
 Outcomes = NDArray[np.bool_]
 

@@ -20,15 +20,15 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
-from noack.config.feature_kinds import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
+from noack.config.sections import PLANTS
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.real_time_settings import realtime
-from plant_server.plant import plant_of
+from plant_server.plant import plants_of
 
 STEPS = 7500
 """Maximum number: the whole scenario of the vehicles, whose slow steps are at its end."""
@@ -70,7 +70,7 @@ class Steps:
             self.resolved.horizon_s, count * self.resolved.timing.plant_period_ns / NS_PER_S
         )
         record = simulate(self.resolved.model_copy(update={"horizon_s": horizon_s}))
-        self._plant = plant_of(self.resolved)
+        self._plant = plants_of((self.resolved,))
         self._period_ns = self.resolved.timing.plant_period_ns
         self._inputs = iter(record[PLANT_STEP]["u"])
         self._step = 0

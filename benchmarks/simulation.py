@@ -18,18 +18,16 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from benchmarks.batch import integrated
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
-from cosim.simulation.batch.batch_interface import Population, setting_of
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.sampled.sampled_loop import SampledLoop, Scales
+from cosim.simulation.batch import Population, setting_of
+from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
+from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 
 ROUNDS = 5
 _RTOL = 1e-10

@@ -17,8 +17,8 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import Matrix
-from noack.theory.scenario_certificates import certify
-from noack.theory.weight import choose_weight
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.certificates.weight import choose_weight
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")

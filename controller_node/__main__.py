@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_controllers(process: RunProcess) -> None:
     """Make the controller of each loop, and run them."""
-    machines = controllers_of(process.loops, process.phases_ns, start=process.start, numbered=True)
+    machines = controllers_of(process.loops, process.phases_ns, start=process.start)
     run_machines(process, machines)
 
 

@@ -4,7 +4,7 @@ This file turns a scenario into the core's controller, whose steps are in native
 At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late update still restores x_c = x_s. At every
 tick the controller sends the input of its control law: u = K(x_c − x_r) + u_r, unless the scenario
 names another law. Before its first update it sends a declared safe input, unless x(0) is given.
-Losses are compared with the network's guarantee from the recorded rows (``loss_check.py``).
+Losses are compared with the network's guarantee from the recorded rows.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.loss_check import LossCheck
 from noack.config.parameter_changes import ChangeSchedule
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
@@ -25,9 +24,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.loss_guarantee import LossGuarantee
-from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import Role, alike_parts, set_machine, take_changes
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
+from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -41,9 +39,107 @@ CONTROLLER = Role(
     "controller", "noack_controller", Flow.UPDATE, (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),
     CONTROLLER_SETTING,
 )  # fmt: skip
-
 Setpoint = tuple[Vector, Vector]
 """x_r and u_r, shapes (n,) and (m,)."""
+
+
+class LossCheck:
+    """The losses of a flow's updates.
+
+    After a change of the guarantee, the rules other than the limit of consecutive losses begin
+    anew, with the first update after one that was sent under the new guarantee.
+
+    Args:
+        guarantee: more losses violate the assumption.
+        schedule: the announced changes of settings; None if there are none.
+        known_start: whether the controller needs no first update.
+    """
+
+    def __init__(
+        self, guarantee: LossGuarantee, schedule: ChangeSchedule | None, *, known_start: bool
+    ) -> None:
+        self._schedule = schedule
+        self._known_start = known_start
+        self._guarantee = guarantee
+        self._since_ns = 0
+        self._further = _further(guarantee)
+        self._history = LossHistory(self._further)
+        self._newest_ns = 0
+
+    def reach(self, t_ns: int) -> None:
+        """Use the guarantee that is in force at a time of the controller's model."""
+        if self._schedule is not None:
+            now = self._schedule.at(t_ns)
+            self._change(now.scenario.network.guarantee, now.since_ns)
+
+    @property
+    def counts_every_update(self) -> bool:
+        """Whether updates without a loss before them matter, too."""
+        return bool(self._further) or (self._schedule is not None and self._schedule.has_changes)
+
+    def _change(self, guarantee: LossGuarantee, since_ns: int) -> None:
+        """Use another guarantee for what is sent from ``since_ns`` on."""
+        if guarantee != self._guarantee:
+            self._guarantee, self._since_ns = guarantee, since_ns
+            self._further = _further(guarantee)
+            self._history = LossHistory(self._further)
+
+    def add(
+        self, sequence: int, newest: int | None, losses: int, event_ns: int, now_ns: int
+    ) -> Sequence[Notice]:
+        """Add an update that follows ``losses`` losses; return the violations.
+
+        ``newest`` is the number of the update before; −1 for none, None if it is not known.
+        """
+        newest_ns, self._newest_ns = self._newest_ns, event_ns
+        found = self._consecutive(sequence, losses, newest_ns, max(now_ns, event_ns))
+        if not found and newest == -1 and losses > 0 and not self._known_start:
+            found = f"no delivered t_0: {losses} updates were lost before the first delivery"
+        texts = [found] if found else []
+        if newest_ns >= self._since_ns:
+            texts += self._windows(sequence, losses)
+        return [Notice(event_ns, "violation", text) for text in texts]
+
+    def _consecutive(self, sequence: int, losses: int, newest_ns: int, now_ns: int) -> str:
+        """Compare with the largest limit in force since the update before."""
+        allowed = _cap(self._guarantee)
+        if losses > allowed and self._schedule is not None:
+            scenarios = self._schedule.between(newest_ns, now_ns)
+            allowed = max(_cap(one.network.guarantee) for one in scenarios)
+        if losses <= allowed:
+            return ""
+        return (
+            f"MANSD violated: {losses} successive dropouts before update {sequence}, at most "
+            f"{allowed} assumed"
+        )
+
+    def _windows(self, sequence: int, losses: int) -> list[str]:
+        """Follow the other rules; return the violations, of each rule the largest."""
+        if not self._further:
+            return []
+        worst: dict[LossRule, int] = {}
+        # After a whole window of losses, one more changes nothing.
+        for lost in (True,) * min(losses, self._longest) + (False,):
+            for rule, value in self._history.add(lost):
+                if lost:
+                    worst[rule] = max(worst.get(rule, 0), value)
+        return [
+            f"{rule.name} violated: {rule.violation(value)}, before update {sequence}"
+            for rule, value in worst.items()
+        ]
+
+    @property
+    def _longest(self) -> int:
+        return max(window.packets for window in self._guarantee.windows)
+
+
+def _further(guarantee: LossGuarantee) -> tuple[LossRule, ...]:
+    return tuple(rule for rule in guarantee.rules if not isinstance(rule, LongestBurst))
+
+
+def _cap(guarantee: LossGuarantee) -> int:
+    """The limit of consecutive losses that is set, not what follows from other rules."""
+    return min(rule.limit for rule in guarantee.rules if isinstance(rule, LongestBurst))
 
 
 @dataclass
@@ -204,27 +300,11 @@ class Controller:
         self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 
 
-def law_of(resolved: Scenario) -> ControlLaw:
-    """Return the control law of a resolved scenario.
-
-    Raises:
-        CallerError: the user's class does not exist, raises, or lacks a required method.
-    """
-    loop, period_s = loop_of(resolved), resolved.timing.controller_period_ns / NS_PER_S
-    return resolved.controller.law(ControlModel(loop.A_model, loop.B_model, loop.K, period_s))
-
-
-def controller_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the controller of a resolved scenario as a machine."""
-    return controllers_of((resolved,), start=start)
-
-
 def controllers_of(
     loops: Sequence[Scenario],
     phases_ns: Sequence[int] | None = None,
     *,
     start: Start = BEGINNING,
-    numbered: bool = False,
 ) -> LoopMachines:
     """Return the controllers of resolved loops as the machines of a process.
 
@@ -232,13 +312,24 @@ def controllers_of(
     """
     parts, alike = alike_parts(loops, partial(_part, start), _redrawn)
     if not start.is_restart:
-        return LoopMachines(parts, phases_ns, alike=alike, numbered=numbered)
+        return LoopMachines(parts, phases_ns, alike=alike)
     phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks
     parts = [
         replace(part, start=start._replace(from_ns=start.from_ns - phase_ns))
         for part, phase_ns in zip(parts, phases, strict=True)
     ]
-    return LoopMachines(parts, phases, numbered=numbered)
+    return LoopMachines(parts, phases)
+
+
+def _redrawn(controller: Controller, resolved: Scenario) -> Controller:
+    """Return a controller as another one, whose plant has other draws."""
+    law, schedule = controller.law, controller.schedule
+    return replace(
+        controller,
+        law=law if isinstance(law, LinearFeedback) else law_of(resolved),
+        x0=None if controller.x0 is None else np.array(resolved.plant.initial_state),
+        schedule=None if schedule is None else schedule.of_alike(resolved),
+    )
 
 
 def _part(start: Start, resolved: Scenario) -> Controller:
@@ -264,12 +355,11 @@ def _part(start: Start, resolved: Scenario) -> Controller:
     )
 
 
-def _redrawn(controller: Controller, resolved: Scenario) -> Controller:
-    """Return a controller as another one, whose plant has other draws."""
-    law, schedule = controller.law, controller.schedule
-    return replace(
-        controller,
-        law=law if isinstance(law, LinearFeedback) else law_of(resolved),
-        x0=None if controller.x0 is None else np.array(resolved.plant.initial_state),
-        schedule=None if schedule is None else schedule.of_alike(resolved),
-    )
+def law_of(resolved: Scenario) -> ControlLaw:
+    """Return the control law of a resolved scenario.
+
+    Raises:
+        CallerError: the user's class does not exist, raises, or lacks a required method.
+    """
+    loop, period_s = loop_of(resolved), resolved.timing.controller_period_ns / NS_PER_S
+    return resolved.controller.law(ControlModel(loop.A_model, loop.B_model, loop.K, period_s))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from noack.core.errors import CallerError, did_you_mean, shortened
+from noack.core.file_access import shipped_folder
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""
@@ -57,7 +58,7 @@ def find_shipped(name: str, folder: str) -> Path:
 
 def shipped_names(folder: str) -> list[str]:
     """Return the names of the scenarios or campaigns that come with noack."""
-    return sorted(file.stem for file in _place(folder).glob("*.toml"))
+    return sorted(file.stem for file in shipped_folder(folder).glob("*.toml"))
 
 
 def all_shipped(folder: str) -> list[ShippedFile]:
@@ -88,11 +89,5 @@ def text_of(name: str) -> str:
 
 def _path_of(name: str, folder: str) -> Path:
     """Return the path of a shipped file, relative to the working directory if inside it."""
-    path = _place(folder) / f"{name}.toml"
+    path = shipped_folder(folder) / f"{name}.toml"
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def _place(folder: str) -> Path:
-    """Return their folder: in the installed package, or beside it in the repository."""
-    here = Path(__file__).parent
-    return here / folder if (here / folder).is_dir() else here.parent / folder

@@ -300,6 +300,12 @@ void noack_product(
 /* The Euclidean norm of a vector, without overflow of squares. */
 double noack_norm(int64_t count, const double *vector);
 
+/* e^x, e^x - 1, ln x, and the cube root of x >= 0. See native/elementary.h. */
+double noack_exp(double x);
+double noack_expm1(double x);
+double noack_log(double x);
+double noack_cube_root(double x);
+
 /* result = e^M, (n, n); scratch: (10, n, n). See native/loop/exponential.c. */
 void noack_exponential(int64_t n, const double *matrix, double *result, double *scratch);
 
@@ -547,10 +553,19 @@ enum noack_table_number { /* sensor: no ticks */
     NOACK_TABLES
 };
 
+enum { NOACK_LOOP_BYTES = 2 }; /* of the number of its loop, with which a row begins */
+
+enum noack_missing_word { /* in a row of a loop whose vectors are shorter than the table's */
+    NOACK_MISSING_NAN = -1,
+    NOACK_MISSING_ZERO = -2
+};
+
 typedef struct { /* rows of a table of the record, packed as numpy has them */
-    int64_t prefix_bytes; /* 2: a row begins with the number of its loop */
     int64_t row_bytes, places, count;
-    uint8_t *rows; /* (places, row_bytes) */
+    uint8_t *rows;     /* (places, row_bytes) */
+    int64_t **layouts; /* (loops,) for each word of a row: which word of the loop's own row it is, or
+                          a noack_missing_word; NULL: the rows of this loop, or of all loops, are
+                          those of the table */
 } noack_table;
 
 typedef struct { /* the machines of one role, of all loops */
@@ -706,7 +721,7 @@ enum noack_driver_reason { /* why noack_drive returned; after what Python does, 
 
 enum noack_opened { NOACK_NOT_OPENED, NOACK_OPENED, NOACK_NOT_AUTHENTIC };
 
-typedef struct { /* the other end of a flow */
+typedef struct { /* where messages come from */
     int64_t name_bytes; /* 0: there is none */
     uint8_t name[32];
     int64_t received; /* datagrams from this address */
@@ -720,8 +735,9 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
     int64_t receiver_count;
     int64_t receivers[2]; /* sockets; the first is read first */
-    int64_t sender;       /* socket, not connected */
-    noack_peer sources[2], destinations[2];
+    int64_t senders[2];   /* sockets, connected to where the flows go; -1: none */
+    int64_t timer;        /* a timerfd */
+    noack_peer sources[2];
     int64_t foreign; /* datagrams from other addresses */
     int64_t sent;
     int64_t errors[256]; /* datagrams that could not be sent, by errno */
@@ -737,8 +753,9 @@ int64_t noack_driver_scratch_bytes(void);
 /* Return NULL, or what is wrong with the numbers of a driver; its process has been checked. */
 const char *noack_driver_check(const noack_driver *driver);
 
-/* Prepare the scratch. */
-void noack_driver_open(noack_driver *driver);
+/* Prepare the scratch and the timer; return 0 or errno. */
+int64_t noack_driver_open(noack_driver *driver);
+void noack_driver_close(noack_driver *driver);
 
 /* Work until a time of the run, or until Python is needed; return a noack_driver_reason. After
    until_ns it goes on for a while if a tick is near. INT64_MIN: do what is due, and do not wait. */
@@ -747,6 +764,10 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns);
 /* Add a datagram as if it had just been received; then noack_drive must be called. */
 void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[32], const uint8_t *data, int64_t size_bytes);
+
+/* Let woken processes run before the calling thread, whose time slice becomes 100 ms, where Linux has
+   time slices of threads (since 6.12). */
+void noack_prefer_others(void);
 
 /* ---- The relay: waits for, receives, decides, sends ------------------------------------------ */
 
@@ -862,7 +883,7 @@ typedef struct { /* a row of the record's table netem_release */
 typedef struct { /* times are simulated and count from the relay's start, unless stated otherwise */
     int64_t links;
     int64_t epoll;
-    int64_t only_socket;     /* the one that is watched, if receiving from it waits; -1: epoll waits */
+    int64_t only_socket;     /* the one that it waits for, by receiving; -1: epoll waits for sockets */
     int64_t receive_wait_ns; /* how long it waits (SO_RCVTIMEO) */
     noack_clock clock; /* its epoch is the relay's start */
     int64_t unix_ns;   /* Unix time at the relay's start */
@@ -874,9 +895,9 @@ typedef struct { /* times are simulated and count from the relay's start, unless
     int64_t segment_below; /* the kernel does not segment datagrams of this size */
     int64_t taps;          /* 0: none; 1: without data; 2: with data */
     int64_t records;       /* 1: write rows of the record */
-    int64_t loops;         /* of a run: its loops; the rows of their clients begin at 0 */
-    int64_t by_loop;       /* 1: a datagram has its loop's number in its header */
-    int64_t no_loop;       /* datagrams refused because of this number */
+    int64_t loops;   /* of a run: its loops, whose numbers are in the headers; their clients' rows
+                        begin at 0; 0: not of a run */
+    int64_t no_loop; /* datagrams refused because of this number */
     int64_t inputs;        /* number of the next row of the record */
     int64_t first_number;  /* number of the first packet in the record */
     int64_t no_memory;     /* 1: no memory for more delayed datagrams */
@@ -1019,15 +1040,6 @@ void noack_channel_latest(const noack_channel *channel, int64_t direction, int64
 
 /* ---- Simulation in virtual time ----------------------------------------------------------------- */
 
-typedef struct { /* loops whose rows have the same columns */
-    noack_process *processes[3]; /* by enum noack_role */
-    int64_t *numbers;            /* (loops,) of these loops in the run, ascending */
-} noack_loop_group;
-
-typedef struct {
-    int64_t group, place; /* place: its number in the group */
-} noack_loop_place;
-
 enum noack_destination { /* beyond enum noack_role */
     NOACK_NETWORK = 3
 };
@@ -1043,17 +1055,15 @@ enum noack_simulation_reason { /* besides NOACK_DONE and the questions of who as
 };
 
 typedef struct {
-    int64_t groups, loops;
-    noack_loop_group *of_group; /* (groups,) */
-    noack_loop_place *of_loop;  /* (loops,) */
+    int64_t loops;
+    noack_process *processes[3]; /* by enum noack_role: the machines of all loops */
     noack_channel *channel;
     noack_wire wire;
     int64_t directions[5]; /* in which direction each flow crosses the network; -1: it does not */
     int64_t now_ns;
     int64_t steps_left;   /* inputs of machines until it returns */
-    int64_t asking;       /* enum noack_role or NOACK_NETWORK: who asks */
-    int64_t asking_group; /* of which group */
-    int64_t sent_places;  /* a power of 2 */
+    int64_t asking;      /* enum noack_role or NOACK_NETWORK: who asks */
+    int64_t sent_places; /* a power of 2 */
     int64_t sent_first, sent_count;
     noack_sent_datagram *sent; /* (sent_places,) a ring, in the order of sending */
 } noack_simulation;

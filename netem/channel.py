@@ -16,8 +16,7 @@ from netem.link_state import LinkState
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_records import NEVER_NS
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
-from noack.impairments.kept_loss import with_kept_loss
-from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, Counters, LinkSettings, RecordedDecision
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
+from noack.impairments.loss_prediction import with_kept_loss
 
 Integers = NDArray[np.int64]
 _COUNTED = dtype_of("noack_counters").names or ()

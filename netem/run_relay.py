@@ -1,8 +1,8 @@
 """The network emulator's sockets in a run: the core forwards surviving datagrams.
 
 It accepts datagrams from the sensor's address and, with a second direction, from the controller's.
-In a run of several loops, it reads the loop's number in the header, and no more. Surviving
-datagrams leave from the port at which they arrived.
+It reads the loop's number in the header, and no more. Surviving datagrams leave from the port at
+which they arrived.
 """
 
 import socket
@@ -46,17 +46,17 @@ class NetworkChannel(CountingSocket):
     ) -> None:
         self._directions = {source: number for number, (source, _) in enumerate(ways)}
         destinations = [destination for _, destination in ways]
-        super().__init__(endpoint, destinations[0], list(self._directions))
+        super().__init__(endpoint, destinations, list(self._directions))
         self._loops = loops
         self._foreign = self._of_no_loop = 0
         self._network, self._passed_on = network, [0, 0]
         receivers = dict(zip(self._directions, self.peer_sockets, strict=True))
-        network.open(clock, endpoint, receivers, destinations, spin_ns)
+        network.open(clock, self.senders[0], receivers, destinations, spin_ns)
 
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass on a datagram that a peer sent before its socket was open; count others."""
         direction = self._directions.get(source[:2])
-        loop = loop_number(data) if self._loops > 1 else 0
+        loop = loop_number(data)
         if direction is None:
             self._foreign += 1
         elif loop is None or loop >= self._loops:

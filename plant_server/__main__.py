@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_plants(process: RunProcess) -> None:
     """Make the plant of each loop, and run them."""
-    machines = plants_of(process.loops, process.phases_ns, numbered=True)
+    machines = plants_of(process.loops, process.phases_ns)
     run_machines(process, machines)
 
 

@@ -2,36 +2,157 @@
 
 This file turns a scenario into the core's plant, whose steps are in native/loop/plant.c: at grid
 time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}; then it
-measures, and latches the newest actuation received. The scenario defines the system
-(``noack.plants``), its disturbance from t_k until t_{k+1} (``disturbance_signal.py``), its
-measurement (``measurement.py``), and its watchdog (``watchdog.py``). If the system fails, x is NaN
-from then on, as in a plant that diverges, and a notice gives the reason.
+measures, and latches the newest actuation received. If the system fails, x is NaN from then on, as
+in a plant that diverges, and a notice gives the reason.
+
+The scenario defines the system (``noack.plants``), the disturbance from t_k until t_{k+1}, the
+measurement, and the watchdog: the input when no actuation has arrived for too long. At t_k the
+newest actuation is too old if t_k − t > timeout. Here t is the time of the model state x_c from
+which the actuation was computed; before the first actuation, t = 0. Until then its inputs are
+applied. The policy then determines the input:
+
+* ``hold``: the last input of the newest actuation;
+* ``zero``: 0;
+* ``model``: a predictive actuator. It applies the controller's input for the case that no update
+  has arrived since t: u + K(x̂ − x_c) with x̂ = e^{H(t_k − t)} x_c. For this an actuation carries
+  [u; x_c]. Since u = K x_c, the input equals K x̂. Before the controller's first update, x_c = 0
+  and u is the safe input, so the input is the safe input. With zero-order hold (H = 0) it is u.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
-from noack.core.linear_systems import Matrix, discretise
-from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import Role, alike_parts, set_machine
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.random_streams import normals, uniforms
+from noack.disturbances.disturbance_settings import Place, SignalSource
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_parts, set_machine
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import PlantStart
-from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
+from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
 from noack.protocol.wire_format import Flow
-from plant_server.disturbance_signal import BLOCK, Disturbance, disturbance_of
-from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.watchdog import Watchdog, watchdog_notice, watchdog_of
 
 PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
+BLOCK = 256
+"""Number of steps computed at once. A random value depends on its step's number only."""
+Signal = Callable[[range], Matrix]
+"""Steps → the value added during each step, (k, entries)."""
+
+
+class Disturbance:
+    """The sum of all disturbances at the input, and of all at the state.
+
+    Args:
+        at_input: disturbances of u.
+        at_state: disturbances of ẋ.
+        widths: their entries, m and n; 0 where there is no disturbance.
+    """
+
+    def __init__(
+        self, at_input: list[Signal], at_state: list[Signal], widths: tuple[int, int]
+    ) -> None:
+        self._parts, self.widths = (at_input, at_state), widths
+
+    def block(self, first: int) -> tuple[Matrix, Matrix]:
+        """Return d, shape (k, m), and w, (k, n), of the ``BLOCK`` steps from ``first`` on.
+
+        The shape is (k, 0) where there is no disturbance.
+        """
+        return self.values(range(first, first + BLOCK))
+
+    def values(self, steps: range) -> tuple[Matrix, Matrix]:
+        """Return d, shape (k, m), and w, (k, n), of some steps; see :meth:`block`."""
+        d, w = (_sum(signals, steps) for signals in self._parts)
+        return d, w
+
+
+class MeasurementModel:
+    """Measures the state, with noise.
+
+    C has the shape (p, n); None is the identity, with exactly y = x + v. ``std`` is the standard
+    deviation of a normally distributed part of v, ``bound`` the bound of a uniform part, (p,) each.
+    """
+
+    def __init__(self, C: Matrix | None, std: Vector, bound: Vector, seed: int) -> None:
+        self.C = C
+        self._std, self._bound, self._seed = std, bound, seed
+        self.is_noisy = bool(std.any() or bound.any())
+
+    def noise(self, first: int, count: int = BLOCK) -> Matrix:
+        """Return v of the ``count`` measurements from number ``first`` on, (count, p)."""
+        rows, width = range(first, first + count), len(self._std)
+        name = ("plant", "measurement")
+        normal = normals(self._seed, *name, "normal", rows=rows, width=width)
+        unit = uniforms(self._seed, *name, "uniform", rows=rows, width=width)
+        noise: Matrix = self._std * normal + self._bound * (2.0 * unit - 1.0)
+        return noise
+
+
+INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
+"""The input that each policy applies, in words."""
+_POLICIES = {
+    "hold": core.NOACK_HOLD, "zero": core.NOACK_ZERO, "model": core.NOACK_PREDICT,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Watchdog:
+    """Settings of a plant's watchdog."""
+
+    timeout_ns: int = NEVER_NS
+    """The policy chooses the input if the newest actuation is older."""
+    policy: str = "hold"
+    notice_ns: int = 0
+    """Age from which a notice reports it; at least the timeout."""
+    H: Matrix | None = None
+    """The controller's model, (n, n), of policy ``model``."""
+    K: Matrix | None = None
+    """Its gain, (m, n)."""
+
+    @property
+    def is_predictive(self) -> bool:
+        """Whether actuations carry the controller's model state."""
+        return self.policy == "model"
+
+    def fill(self, plant: Any, memory: CoreMemory, period_ns: int) -> None:
+        """Fill the watchdog of a ``noack_plant`` with this step."""
+        memory.fill(plant, {
+            "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
+            "notice_ns": max(self.notice_ns, self.timeout_ns),
+            "carries_model": self.is_predictive, "K": self.K,
+        })  # fmt: skip
+        if self.H is not None:
+            memory.set_model(plant.fallback, memory.transitions(self.H, (period_ns,)))
+
+
+def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
+    """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``; also of arrays."""
+    return t_ns - newest_ns > timeout_ns
+
+
+def watchdog_notice(watchdog: Watchdog, note: Any) -> Notice:
+    """Return the line for the log of a ``noack_note``."""
+    t_ns, since_ns, newest_ns = (int(note[name]) for name in ("t_ns", "since_ns", "newest_ns"))
+    if since_ns >= 0:
+        lasted_s = (t_ns - since_ns) / NS_PER_S
+        text = f"actuations arrive again; there was none in time for {lasted_s:.4g} s"
+        return Notice(t_ns, "watchdog", text)
+    age_s, timeout_s = ((ns / NS_PER_S) for ns in (t_ns - newest_ns, watchdog.timeout_ns))
+    none = note["newest_sequence"] == NO_SEQUENCE
+    what = "no actuation for" if none else "the newest actuation is too old:"
+    name = INPUT_NAMES[watchdog.policy]
+    text = f"{what} {age_s:.4g} s, {timeout_s:.4g} s allowed; the input is {name}"
+    return Notice(t_ns, "watchdog", text)
 
 
 @dataclass
@@ -166,17 +287,18 @@ class Plant:
             reals_at(plant.noise.values, BLOCK, plant.noise.width)[:] = self.measuring.noise(number)
 
 
-def plant_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the plant of a resolved scenario as a machine; a plant cannot be restarted."""
-    return plants_of((resolved,))
-
-
 def plants_of(
-    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, numbered: bool = False
+    loops: Sequence[Scenario],
+    phases_ns: Sequence[int] | None = None,
+    *,
+    start: Start = BEGINNING,
 ) -> LoopMachines:
-    """Return the plants of resolved loops as the machines of a process."""
+    """Return the plants of resolved loops as the machines of a process.
+
+    A plant cannot be restarted during the run: ``start`` has no effect.
+    """
     parts, alike = alike_parts(loops, _part, _redrawn)
-    return LoopMachines(parts, phases_ns, alike=alike, numbered=numbered)
+    return LoopMachines(parts, phases_ns, alike=alike)
 
 
 def _part(resolved: Scenario) -> Plant:
@@ -219,3 +341,44 @@ def system_of(resolved: Scenario) -> PlantSystem:
         B = np.hstack([B, np.eye(len(A))])
     start = PlantStart(np.array(plant.initial_state), A, B, resolved.timing.plant_period_ns)
     return plant.system.system(start)
+
+
+def disturbance_of(resolved: Scenario) -> Disturbance | None:
+    """Return the disturbances of a resolved scenario's plant; None if it has none."""
+    if not resolved.plant.disturbances:
+        return None
+    signals: dict[Place, list[Signal]] = {"input": [], "state": []}
+    for number, one in enumerate(resolved.plant.disturbances):
+        name = ("plant", "disturbance", str(number))
+        source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
+        signals[one.at].append(partial(one.signal, source=source))
+    n, m = resolved.model.dimensions
+    widths = m * bool(signals["input"]), n * bool(signals["state"])
+    return Disturbance(signals["input"], signals["state"], widths)
+
+
+def _sum(signals: list[Signal], steps: range) -> Matrix:
+    if not signals:
+        return np.zeros((len(steps), 0))
+    return np.asarray(sum(signal(steps) for signal in signals))
+
+
+def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
+    """Return the measurement model of a resolved scenario; None if y is exactly x."""
+    settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
+    if settings.selects_all(n) and not settings.is_noisy:
+        return None
+    p = resolved.message_sizes.outputs
+    std, bound = (
+        np.zeros(p) if given is None else np.array(given)
+        for given in (settings.noise_std, settings.noise_bound)
+    )
+    C = None if settings.selects_all(n) else np.array(settings.C)
+    return MeasurementModel(C, std, bound, resolved.seeds.noise)
+
+
+def watchdog_of(resolved: Scenario) -> Watchdog:
+    """Return the watchdog of a resolved scenario's plant."""
+    timing, policy, loop = resolved.timing, resolved.plant.watchdog.policy, loop_of(resolved)
+    model = (loop.H, loop.K) if policy == "model" else ()
+    return Watchdog(timing.actuation_timeout_ns, policy, timing.missing_actuation_ns, *model)

@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def run_sensors(process: RunProcess) -> None:
     """Make the sensor of each loop, and run them."""
-    machines = sensors_of(process.loops, process.phases_ns, start=process.start, numbered=True)
+    machines = sensors_of(process.loops, process.phases_ns, start=process.start)
     run_machines(process, machines)
 
 

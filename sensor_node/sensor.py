@@ -5,7 +5,14 @@ measurement: propagate x_s → test → send at most one state update. x_s is re
 whether or not the network delivers the update: nothing is acknowledged. In the acknowledgement
 baseline, only an acknowledged update resets x_s.
 
-With an observer (``observer.py``) the trigger tests x̂ in place of x.
+With an observer the trigger tests x̂ in place of x. The observer needs the input that the plant
+applied. The sensor does not receive the actuations, and nothing is acknowledged. So the input is
+measured at the actuator, and a measurement carries [y; u of every step since the last measurement].
+Sensor and actuator are at the plant, the controller is on the other side of the network.
+Montestruque and Antsaklis (2003) place their observer likewise. Disturbances that enter after the
+actuator are not part of the measured input. At a measurement, x̂ is predicted over the plant's steps
+and corrected by y (native/loop/observer.c). If measurements are missing, the inputs of their steps
+are unknown, and the first known input is used.
 """
 
 from collections.abc import Sequence
@@ -17,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.config.parameter_changes import ChangeSchedule
-from noack.config.resolution import loop_of, policy_of, setpoint_of
+from noack.config.resolution import assumed_model, loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import Role, alike_parts, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
+from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
@@ -32,9 +39,7 @@ from noack.protocol.record_tables import (
     RecordShape,
 )
 from noack.protocol.wire_format import Flow
-from noack.trigger.core_rule import fill_rule, rule_rows
-from noack.trigger.trigger_policy import CodedPolicy, EventTrigger, Policy
-from sensor_node.observer import Observer, observer_of
+from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
 SENSOR = Role(
     "sensor", "noack_sensor", Flow.MEASUREMENT,
@@ -42,6 +47,47 @@ SENSOR = Role(
 )  # fmt: skip
 _SENT_PLACES = 64
 _ANY_TIME_NS = 2**60  # the latest horizon of a machine
+
+
+@dataclass
+class Observer:
+    """The observer of one loop's sensor.
+
+    Args:
+        settings: the kind of observer.
+        model: the model with the covariances that it assumes.
+        x: x̂ before the first measurement, (n,).
+        reported: entries of a measurement that are inputs.
+        period_ns: the plant's step.
+        knows_start: whether x̂ is the estimate at time 0; else at the first measurement.
+        restarted: a restarted sensor does not know the estimate of the sensor that it replaces.
+    """
+
+    settings: ObserverSettings
+    model: EstimationModel
+    x: Vector
+    reported: int
+    period_ns: int
+    knows_start: bool
+    restarted: bool = False
+
+    @property
+    def p(self) -> int:
+        """Number of measured outputs."""
+        return len(self.model.C)
+
+    def fill(self, sensor: Any, memory: CoreMemory) -> None:
+        """Fill the ``noack_observer`` of a sensor."""
+        self.settings.fill(sensor.observer, self.model, self.x, memory)
+        sensor.observer.t_ns = 0 if self.knows_start else -1
+        sensor.plant_period_ns = self.period_ns
+
+    def first_notice(self, t_ns: int) -> Sequence[Notice]:
+        """Return the line of a restarted observer at its first measurement."""
+        if not self.restarted:
+            return ()
+        self.restarted = False
+        return (Notice(t_ns, "info", "the observer restarts from its initial estimate"),)
 
 
 @dataclass
@@ -232,17 +278,11 @@ def _or_zero(setpoint: Vector | None) -> Vector:
     return np.zeros(1) if setpoint is None else setpoint
 
 
-def sensor_of(resolved: Scenario, start: Start = BEGINNING) -> LoopMachines:
-    """Return the sensor of a resolved scenario as a machine."""
-    return sensors_of((resolved,), start=start)
-
-
 def sensors_of(
     loops: Sequence[Scenario],
     phases_ns: Sequence[int] | None = None,
     *,
     start: Start = BEGINNING,
-    numbered: bool = False,
 ) -> LoopMachines:
     """Return the sensors of resolved loops as the machines of a process.
 
@@ -250,7 +290,7 @@ def sensors_of(
     measurement.
     """
     parts, alike = alike_parts(loops, partial(_part, start), partial(_redrawn, start))
-    return LoopMachines(parts, phases_ns, alike=alike, numbered=numbered)
+    return LoopMachines(parts, phases_ns, alike=alike)
 
 
 def _part(start: Start, resolved: Scenario) -> Sensor:
@@ -286,3 +326,21 @@ def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:
     """Return the parts of another scenario that a sensor needs: its set point and its policy."""
     setpoint = setpoint_of(resolved)
     return None if setpoint is None else setpoint[0], policy_of(resolved)
+
+
+def observer_of(resolved: Scenario, *, restarted: bool) -> Observer | None:
+    """Return the observer of a resolved scenario; None if it has none.
+
+    If the sensor restarts during the run, x(0) is not used.
+    """
+    settings, loop = resolved.observer, loop_of(resolved)
+    if settings is None:
+        return None
+    knows_start = resolved.network.initial_sync == "known_state" and not restarted
+    x = loop.x0 if knows_start else np.zeros(loop.n)
+    if settings.initial_estimate is not None:
+        x = np.array(settings.initial_estimate)
+    return Observer(
+        settings, assumed_model(resolved), x, resolved.message_sizes.inputs_reported,
+        resolved.timing.plant_period_ns, knows_start, restarted,
+    )  # fmt: skip

@@ -16,9 +16,9 @@ from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.words.words_to_settings import KEYWORDS
-from noack.config.feature_kinds import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
+from noack.config.sections import POLICIES, AnyDisturbance, AnyObserver
 from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.constraints import CONSTRAINTS

@@ -26,7 +26,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
-from sensor_node.sensor import sensor_of
+from tests.machine_parts import sensor_of
 from tests.wire_decoder import Decoder
 
 RUN, KEY = 7, bytes(32)

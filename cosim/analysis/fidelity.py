@@ -25,14 +25,15 @@ import numpy as np
 from cosim.analysis.step_schedule import IncomparableError, LiveRun, live_run
 from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_run import (
+from cosim.simulation.continuous import (
     MAX_EVENTS,
+    ContinuousLoop,
     ContinuousRun,
     TooManyEventsError,
+    continuous_loop_of,
     simulate_continuous,
 )
-from cosim.simulation.continuous.plant_grid_loop import SampledLoop, StepSchedule
+from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import percent
@@ -186,7 +187,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
     ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
     states, events_s = [ideal.at(t_s).x], [ideal.event_s]
-    loop = SampledLoop(system, schedule, known_start=known)
+    loop = PlantGridLoop(system, schedule, known_start=known)
     for delay, hold in ((False, False), (True, False), (True, True)):
         run = loop.run(delay=delay, hold=hold)
         states.append(run.x[schedule.measured])
@@ -234,7 +235,7 @@ def _require_stable_events(
 ) -> None:
     """Require that a change of x(0) by rounding changes ``x`` by less than ``limit``."""
     other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
-    nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known_start)
+    nudged = PlantGridLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known_start)
     moved = nudged.run(delay=True, hold=True).x[schedule.measured] - x
     if not _difference(moved).rms < limit:
         raise IncomparableError(

@@ -71,7 +71,8 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
     received = record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]
     every = record.scenario.plant.measure_every
     measured, actuated = _Unmatched(), _Unmatched()
-    for part in record.slices(PLANT_STEP, SENSOR_MEASUREMENT, CONTROLLER_STEP, PLANT_ACTUATION):
+    tables = (PLANT_STEP, SENSOR_MEASUREMENT, CONTROLLER_STEP, PLANT_ACTUATION)
+    for part in record.slices(*tables, columns=("sequence",)):
         sent = part[PLANT_STEP]["sequence"]
         measured.take(sent[sent % every == 0] // every, part[SENSOR_MEASUREMENT]["sequence"])
         actuated.take(part[CONTROLLER_STEP]["sequence"], part[PLANT_ACTUATION]["sequence"])

@@ -8,11 +8,11 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_process import loss_process
+from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.joint_spectral_radius import ACCURACY
-from noack.theory.loss_margin import LossMargin, Stability, capped
-from noack.theory.mean_square_growth import RandomGrowth
+from noack.theory.margins.joint_spectral_radius import ACCURACY
+from noack.theory.margins.loss_margin import LossMargin, Stability, capped
+from noack.theory.random_losses.mean_square_growth import RandomGrowth, random_growth
 
 MOST_M = 16
 
@@ -228,7 +228,7 @@ def _without_guarantee(
 ) -> RandomGrowth | str:
     progress("random losses")
     try:
-        return margin.random_growth(loss_process(resolved.network.link))
+        return random_growth(margin, loss_process(resolved.network.link))
     except NotPredictableError as error:
         return f"not known: {error}"
 

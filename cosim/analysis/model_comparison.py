@@ -8,8 +8,8 @@ from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
+from noack.plants.plant_settings import PlantSystem
 from noack.plants.systems.plant_linearisation import linearise
-from noack.plants.systems.plant_system import PlantSystem
 from plant_server.plant import system_of
 
 Linearisation = LinearisationPart | NoLinearisationPart

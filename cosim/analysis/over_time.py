@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from cosim.analysis.summary_model import Claim, LoopSummary
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows
-from noack.config.loops import phases_ns
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import row_norms
 from noack.core.number_format import number as shown

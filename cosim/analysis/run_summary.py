@@ -17,7 +17,7 @@ from cosim.analysis.loss_statistics import (
     reported_violations,
     unintended_losses,
 )
-from cosim.analysis.signal_statistics import SignalStatistics, disturbances, watchdog_actions
+from cosim.analysis.signal_statistics import disturbances, signal_statistics, watchdog_actions
 from cosim.analysis.summary_model import (
     AssumptionPart,
     ChangePart,
@@ -34,7 +34,7 @@ from cosim.record.run_record import RunRecord, no_such_loop
 from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
-from noack.impairments.kept_loss import expected_loss
+from noack.impairments.loss_prediction import expected_loss
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -45,7 +45,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.theory.assumptions import assumptions
+from noack.theory.certificates.assumptions import assumptions
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
     if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
         exit_status, reason = ExitStatus.FAILED, why
-    signals = SignalStatistics(record)
+    signals = signal_statistics(record)
     return LoopSummary(
         name=scenario.name,
         number=record.number or 0,

@@ -1,13 +1,24 @@
 """Sizes of a run's signals: states, errors, disturbances, part by part of the record."""
 
-from typing import Any
+import math
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.analysis.summary_model import DisturbancePart, EstimationPart, WatchdogPart
-from cosim.record.align import AlignedPart, IdentityResidual, aligned_parts
+from cosim.record.align import (
+    AlignedPart,
+    AlignedRun,
+    IdentityResidual,
+    aligned_parts,
+    in_common,
+)
 from cosim.record.estimation_error import Reals, SizeStatistics, expected_rms
+from cosim.record.record_source import joined, with_columns
 from cosim.record.run_record import RunRecord
+from noack.config.scenario import Scenario
 from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
     NO_SEQUENCE,
@@ -15,7 +26,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from plant_server.watchdog import too_old
+from plant_server.plant import too_old
 
 
 def _larger(before: float | None, values: Reals) -> float | None:
@@ -24,6 +35,68 @@ def _larger(before: float | None, values: Reals) -> float | None:
         return before
     largest = values.max()
     return float(largest if before is None else np.maximum(before, largest))
+
+
+class SampleFacts(NamedTuple):
+    """What claims need to know about all samples of a run before they are checked."""
+
+    any_in_common: bool = False
+    gap_s: float | None = None
+    """First time at which the controller's error is not known, although it was before."""
+    largest_state: float = 0.0
+    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
+    longest_update_ns: int = 0
+    """Longest time between two updates of the controller, or to the end of the run."""
+
+
+class SampleFactsReader:
+    """Reads these facts, part by part of an aligned run; the claims end at ``until_s``."""
+
+    def __init__(self, scenario: Scenario, until_s: float = math.inf) -> None:
+        self._scenario, self._until_s = scenario, until_s
+        self._found = SampleFacts()
+        self._fresh_ns: int | None = None
+        self._newest, self._last_ns = -1, 0
+
+    def take(self, joined: AlignedRun) -> None:
+        """Add the next measurements."""
+        if not len(joined.t_ns):
+            return
+        found, common, t_s = self._found, shares_update(self._scenario, joined), joined.t_ns * 1e-9
+        started = np.logical_or.accumulate(common) | found.any_in_common
+        gaps = np.flatnonzero(started & ~common)
+        gap_s = float(t_s[gaps[0]]) if found.gap_s is None and len(gaps) else found.gap_s
+        until = t_s < self._until_s
+        both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
+        largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
+        changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=self._newest))]
+        ends_ns = changes if self._fresh_ns is None else np.append(self._fresh_ns, changes)
+        longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
+        self._fresh_ns = int(ends_ns[-1]) if len(ends_ns) else None
+        self._newest, self._last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
+        self._found = SampleFacts(bool(started[-1]), gap_s, largest, longest_ns)
+
+    @property
+    def facts(self) -> SampleFacts:
+        """What is known after the last part."""
+        if self._fresh_ns is None:
+            return self._found
+        since_ns = self._last_ns - self._fresh_ns
+        longest_ns = max(self._found.longest_update_ns, since_ns)
+        return self._found._replace(longest_update_ns=longest_ns)
+
+
+def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
+    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
+    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
+    return np.asarray(finite & in_common(scenario, joined))
+
+
+@lru_cache(maxsize=1)
+@np.errstate(all="ignore")  # a run may diverge
+def signal_statistics(record: RunRecord) -> "SignalStatistics":
+    """Read the signals of a run; the summary and the claims use the same ones."""
+    return SignalStatistics(record)
 
 
 class SignalStatistics:
@@ -39,13 +112,17 @@ class SignalStatistics:
         self._errors, self._late_errors = SizeStatistics(), SizeStatistics()
         self._scale, self._read = 0.0, 0
         self._half = record.count(SENSOR_MEASUREMENT) // 2
+        facts = SampleFactsReader(record.scenario)
         residual = IdentityResidual(record.scenario)
         for part in aligned_parts(record):
             self._add(part)
+            facts.take(part.aligned)
             left = residual.take(part)
             self._residual = _larger(self._residual, left[~np.isnan(left)])
             self._estimation_error(part)
             self._read += len(part.rows)
+        self.facts = facts.facts
+        """What claims need to know before they are checked."""
 
     def _add(self, part: AlignedPart) -> None:
         aligned = part.aligned
@@ -122,11 +199,12 @@ def disturbances(record: RunRecord) -> list[DisturbancePart]:
 def watchdog_actions(record: RunRecord) -> WatchdogPart:
     """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
     timing = record.scenario.timing
-    received = np.zeros(0, record.tables[PLANT_ACTUATION])
+    names = ("now_ns", "sequence", "t_ns", "actuation")
+    received = np.zeros(0, with_columns(record.tables[PLANT_ACTUATION], names))
     trips, steps_old, first_s, was_old = 0, 0, None, False
-    for part in record.slices(PLANT_STEP, PLANT_ACTUATION):
+    for part in record.slices(PLANT_STEP, PLANT_ACTUATION, columns=names):
         steps = part[PLANT_STEP]
-        received = np.concatenate([received, part[PLANT_ACTUATION]])
+        received = joined([received, part[PLANT_ACTUATION]], received.dtype)
         found = np.searchsorted(received["sequence"], steps["actuation"])
         there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
         newest_ns = np.where(

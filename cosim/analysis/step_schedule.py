@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.continuous.plant_grid_loop import NO_ACTUATION, StepSchedule
+from cosim.simulation.continuous import network_fates
+from cosim.simulation.plant_grid_loop import NO_ACTUATION, StepSchedule
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import (

@@ -4,7 +4,7 @@ from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.scenarios import Source, load
 from cosim.output.all_certificates import Certificates, certificates_of
 from noack.config.resolution import resolve
-from noack.theory.joint_spectral_radius import ACCURACY
+from noack.theory.margins.joint_spectral_radius import ACCURACY
 
 
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:

@@ -9,7 +9,7 @@ from cosim.measurement.measurement_outputs import write_network
 from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
 from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
-from noack.traces.shipped_traces import find_trace
+from noack.traces.trace_formats import find_trace
 
 
 class Measurement(NetworkMeasurement):

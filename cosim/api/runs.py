@@ -318,9 +318,9 @@ class Run:
 
     @cached_property
     def _envelopes(self) -> list[Any]:
-        from cosim.analysis.claims.claims_by_part import RunClaims
+        from cosim.analysis.claims.claims_by_part import claims_of
 
-        return RunClaims(self._record).envelopes()
+        return claims_of(self._record).envelopes()
 
     def __repr__(self) -> str:
         from cosim.api.run_facts import run_facts

@@ -10,10 +10,10 @@ import numpy as np
 
 from cosim.shipped_files import find_shipped
 from noack.config import toml_file
+from noack.config.matrix_files import matrices_of, model_of
 from noack.config.runtime_parameters import full_key
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
-from noack.config.state_space import matrices_of, model_of
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 

@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def _fork_server(words: list[str]) -> "ForkServer | None":
-    """Start the fork server of a live run, which imports while this process does."""
+    """Fork the fork server of a live run, which imports while this process does."""
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
         return None
     import os
@@ -61,5 +61,5 @@ def _fork_server(words: list[str]) -> "ForkServer | None":
 
     os.environ.update(QUICK_IMPORTS)
     with suppress(OSError):  # the command reports it
-        return ForkServer()
+        return ForkServer(of_itself=True)
     return None

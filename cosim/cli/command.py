@@ -282,10 +282,14 @@ def _why_not_written(error: Exception) -> str | None:
 
 
 def register_commands(wanted: str = "") -> None:
-    """Import the module of a command; without such a module import all, sorted for the help."""
-    modules = [module.name for module in pkgutil.iter_modules(commands.__path__)]
-    own = f"{wanted}_command"
-    for module in [own] if own in modules else modules:
+    """Import the module that declares a command; otherwise import all, sorted for the help.
+
+    It is found by its source, since importing all of them takes 0.05 s.
+    """
+    modules = [one.name for one in pkgutil.iter_modules(commands.__path__)]
+    folder, declaration = Path(commands.__path__[0]), f"\ndef {wanted}("
+    own = [one for one in modules if declaration in (folder / f"{one}.py").read_text("utf-8")]
+    for module in own or modules:
         import_module(f"{commands.__name__}.{module}")
     app.registered_commands.sort(key=lambda one: _order[one.callback])
 

@@ -30,7 +30,7 @@ def settings(incomplete: str) -> list[str]:
     """Return matching keys for ``--set``, each with its =."""
     from noack.config.runtime_parameters import SHORT
     from noack.config.scenario import Scenario
-    from noack.config.validation_messages import keys
+    from noack.config.toml_file import keys
 
     return _matching(incomplete, [f"{key}=" for key in (*SHORT, *keys(Scenario))])
 

@@ -1,22 +1,38 @@
-"""Functions of all commands that make a run: warnings, the run itself, its verdict."""
+"""What all commands share that make runs: warnings, the run itself, its verdict; campaigns.
+
+All processes of a run wait for the slowest one: what the start does not need is imported later.
+"""
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from cosim.cli import command as cli
 from cosim.cli.command import console, print_json
+from noack.core.errors import CallerError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cosim.live.fork_server import ForkServer
     from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
+    from cosim.output.figure_format import FigureFiles
     from cosim.record.run_ending import RunEnding
+    from cosim.studies.campaign.campaign_file import Campaign
+    from cosim.studies.campaign.finished_campaign import FinishedCampaign
     from noack.config.scenario import Scenario
 
-# All processes wait for the slowest one: modules not needed at the start are imported later.
+_PER_CORE = 4
+"""Maximum worker processes per core; more gain nothing, and use memory."""
+Workers = Annotated[
+    int | None, typer.Option(help="Worker processes; one per core by default.", min=1)
+]
 
 
 @dataclass(frozen=True)
@@ -59,17 +75,20 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import joint_watcher, later_watcher, launch
+        from cosim.live.launcher import Watcher, joint_watcher, later_watcher, launch
         from cosim.live.run_log import RunLog
+        from noack.config.link_load import require_capacity
         from noack.protocol.topology import ROLES
 
         scenario, ending = load(), None
-        warn_of_violations(scenario)
+        require_capacity(scenario)
         warn_of_other_runs()
+        # Those of the theory come at the start: nothing waits for the launcher then.
+        warnings = Watcher(started=lambda run_dir: warn_of_violations(scenario))
         try:
             with ExitStack() as stack:
                 line = later_watcher(lambda: stack.enter_context(_progress(scenario, session)))
-                watchers = [line, RunLog().watcher()]
+                watchers = [warnings, line, RunLog().watcher()]
                 if metrics is not None:
                     watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
                 ending = launch(
@@ -108,15 +127,13 @@ def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
 def warn_of_violations(scenario: "Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
 
-    Loops that share a network: also what may go wrong at their bottleneck. Raise CallerError if a
-    bottleneck cannot carry the datagrams that must pass.
+    Loops that share a network: also what may go wrong at their bottleneck.
     """
-    from noack.config.link_load import link_loads, load_warnings, require_capacity
-    from noack.config.loops import loop_names, loop_scenario, loop_sections
+    from noack.config.link_load import link_loads, load_warnings
     from noack.config.resolution import resolve
-    from noack.theory.assumptions import AssumptionStatus, assumptions
+    from noack.config.scenario import loop_names, loop_scenario, loop_sections
+    from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 
-    require_capacity(scenario)
     shares = len(loop_names(scenario)) > 1
     for line in load_warnings(link_loads(scenario), scenario) if shares else ():
         print(f"noack: warning: {line}", file=sys.stderr)
@@ -168,3 +185,44 @@ def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     else:
         print_outcome(console(), outcome, verbose=output.verbose)
     return outcome.status
+
+
+def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[Any], Any]:
+    """Return a function that starts the workers; its argument is a function that prints a line."""
+    from cosim.studies.campaign.campaign_workers import cluster, local
+
+    if scheduler is not None:
+        if workers is not None:
+            raise CallerError("--workers: with --scheduler the cluster's workers are used")
+        return lambda say: cluster(scheduler, say)
+    number = workers or cli.cores()
+    if number > (most := _PER_CORE * cli.cores()):
+        raise CallerError(f"--workers {number}: on this machine at most {most}")
+    return lambda say: local(number)
+
+
+def execute_campaign(
+    console: "Console", plan: "Campaign", path: Path, start: Callable[[Any], Any], *,
+    folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
+) -> "FinishedCampaign":  # fmt: skip
+    """Run or continue a campaign; write its page.
+
+    Args:
+        console: shows the progress.
+        plan: the campaign.
+        path: its file, in whose folder its scenario may be.
+        start: starts the workers, see :func:`worker_pool`.
+        folder: of the campaign.
+        draws: number of draws; the campaign's by default.
+        figure_files: write each figure as a file, too.
+    """
+    from cosim.live.progress import runs_bar
+    from cosim.studies.campaign.finished_campaign import finish_campaign
+
+    def say(line: str) -> None:
+        console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+
+    return finish_campaign(
+        plan, path, folder, lambda: start(say), draws=draws, figure_files=figure_files,
+        show=console.status, bar=runs_bar(console),
+    )  # fmt: skip

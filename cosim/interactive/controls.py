@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosim.interactive.draft import Draft
-from noack.config.feature_kinds import POLICIES
 from noack.config.runtime_parameters import trigger_parameters
 from noack.config.scenario import Scenario
+from noack.config.sections import POLICIES
 from noack.core.clock import NS_PER_S
 
 _STEPS = 200

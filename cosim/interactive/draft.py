@@ -17,7 +17,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put, toml_text, value_of
 from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import read_regular
-from noack.settings.named_file import PLACES
+from noack.settings.user_files import PLACES
 
 _SOURCE = "scenario"
 _LINE = re.compile(rf"^{_SOURCE}: ([\w.-]+)(?:: | = )")

@@ -1,7 +1,7 @@
 """Many runs of one scenario: bands that contain most of them, over time.
 
 The events are those of exact runs. Between them the state z = (x, e_s, e_c) follows
-dz/dt = G z (:mod:`cosim.simulation.continuous.continuous_loop`), with a matrix G for each draw,
+dz/dt = G z (:mod:`cosim.simulation.continuous`), with a matrix G for each draw,
 because each draw has its own plant. All draws advance together on a grid of times.
 """
 
@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch.batch_interface import (
+from cosim.simulation.batch import (
     Events,
     Population,
     Setting,
     run_with_events,
     setting_of,
 )
-from cosim.simulation.batch.batch_status import DIVERGED, OK
+from cosim.simulation.exact_simulation import DIVERGED, OK
 from cosim.studies.campaign.random_draws import box_of
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

@@ -9,9 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.continuous.continuous_loop import LoopState
-from cosim.simulation.continuous.continuous_report import run_continuous, summary
-from cosim.simulation.continuous.continuous_run import ContinuousRun, TooManyEventsError
+from cosim.simulation.continuous import (
+    ContinuousRun,
+    LoopState,
+    TooManyEventsError,
+    run_continuous,
+    summary,
+)
 from noack.config.resolution import loop_of, policy_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

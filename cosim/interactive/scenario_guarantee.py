@@ -12,11 +12,15 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.number_format import number
-from noack.theory.assumptions import AssumptionStatus
-from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
-from noack.theory.run_conditions import nominal_conditions
-from noack.theory.scenario_certificates import own_plant
-from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
+from noack.theory.certificates.assumptions import AssumptionStatus
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import (
+    OWN_PLANT,
+    about_setpoint,
+    nominal_conditions,
+    void_at_setpoint,
+)
+from noack.theory.certificates.scenario_certificates import own_plant
 
 CERTIFIED, VOID, NOT_COVERED = "certified", "no certificate", "not covered"
 _POINTS = 121

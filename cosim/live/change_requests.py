@@ -4,7 +4,6 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
-from noack.config.loops import loop_scenario
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -12,10 +11,11 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.config.scenario import MOST_CHANGES
+from noack.config.scenario import loop_scenario
+from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.kept_loss import found_probabilities
+from noack.impairments.loss_prediction import found_probabilities
 from noack.runtime.control_messages import ChangeRequest, parse_message
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket

@@ -16,9 +16,8 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.record.divergence import GrowthMonitor
 from cosim.record.loop_rows import rows_by_loop
 from cosim.record.run_record import Rows
-from noack.config.loops import phases_ns
-from noack.config.resolution import resolved_loops
-from noack.config.scenario import Scenario
+from noack.config.resolution import resolved_loops, tables_of
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
@@ -43,7 +42,7 @@ class ClaimMonitor:
     def __init__(self, scenario: Scenario) -> None:
         loops = resolved_loops(scenario)
         self._names = [one.name for one in loops]
-        self._phases_ns = phases_ns(scenario)
+        self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._stopped: str | None = None
         self._until_s = np.inf
         checked = loops if len(loops) <= MOST_CHECKED else ()
@@ -105,7 +104,9 @@ class ClaimMonitor:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
-            for loop, rows in rows_by_loop(table, np.concatenate(batches), self._phases_ns):
+            for loop, rows in rows_by_loop(
+                table, np.concatenate(batches), self._phases_ns, self._types
+            ):
                 self._monitors[loop].take(table, rows)
         self._due = [*range(len(self._monitors))]
 

@@ -28,7 +28,7 @@ from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
 from noack.runtime.zenoh_session import header_of, next_payload
 
-_START_DELAY_NS, _LONG_START_DELAY_NS = 50_000_000, 100_000_000
+_START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The
 longer one is for processes on other hosts, and for a loaded machine."""
 _RESTART_DELAY_S = 0.3

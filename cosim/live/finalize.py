@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claims_by_part import claims_of
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
@@ -42,7 +42,6 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
-from noack.config.loops import phases_ns
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.python_process import cores
@@ -50,6 +49,7 @@ from noack.runtime.spool import SPOOL
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
+_LOOPS_AT_ONCE = 16
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
@@ -165,17 +165,22 @@ def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[Loop
         )
         return
     with processes(workers) as pool:
+        # Consecutive loops share parts of the files, and equal certificates.
+        width = min(max(loops // (4 * workers), 1), _LOOPS_AT_ONCE)
+        blocks = (range(first, min(first + width, loops)) for first in range(0, loops, width))
         with interrupts_held():
-            found = [pool.submit(_judged_stored_loop, ending, number) for number in range(loops)]
-        yield (one.result() for one in found)
+            found = [pool.submit(_judged_stored_loops, ending, block) for block in blocks]
+        yield (one for block in found for one in block.result())
 
 
 @np.errstate(all="ignore")
-def _judged_stored_loop(ending: RunEnding, number: int) -> LoopSummary:
-    run = _stored_run(ending.run_dir)
-    record = run.loops[number]
-    summary = _loop_summary(run, record, ending)
-    return _with_results(record, summary, ending.run_dir, len(run.loops))
+def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[LoopSummary]:
+    run, found = _stored_run(ending.run_dir), []
+    for number in numbers:
+        record = run.loops[number]
+        summary = _loop_summary(run, record, ending)
+        found.append(_with_results(record, summary, ending.run_dir, len(run.loops)))
+    return found
 
 
 _stored_run = cache(load_run)
@@ -183,7 +188,7 @@ _stored_run = cache(load_run)
 
 
 def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
-    phase_ns = phases_ns(run.scenario)[record.number or 0]
+    phase_ns = run.phases_ns[record.number or 0]
     return summarise(record, int(ending.status), ending.reason, phase_ns)
 
 
@@ -209,7 +214,7 @@ def _with_results(
 
 
 def _claim_results(record: RunRecord, summary: LoopSummary) -> dict[str, Any]:
-    claims = RunClaims(record)
+    claims = claims_of(record)
     longest = summary.longest_loss_burst
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))

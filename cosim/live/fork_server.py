@@ -1,8 +1,13 @@
 """The fork server: a process that imports what a run needs once, and forks the run's processes.
 
-Otherwise each process would spend half a second on the same imports, when it starts and when it is
-restarted. The server imports them while the launcher prepares the run. It has one thread, so that
-it can be forked, and ends with its launcher. Linux only.
+Otherwise each process would spend a third of a second on the same imports, when it starts and when
+it is restarted. The server has one thread, so that it can be forked, and ends with its launcher.
+Linux only.
+
+A command that begins a run imports what it has in common with the processes, and then forks the
+server of itself: these imports, most of all, are done once. The server imports the rest while the
+command reads its options. For a program that uses the library the server is a program of its own,
+because the program may have threads.
 """
 
 import ctypes
@@ -16,6 +21,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from typing import IO
 
 from noack.core.errors import MachineError
@@ -23,9 +29,14 @@ from noack.core.process_limits import require_limits
 from noack.core.python_process import python_command
 from noack.runtime.command_line import TICKET_ON_STDIN
 
+_COMMON = (
+    "noack.runtime.control_plane", "noack.runtime.invitation", "noack.config.scenario_file",
+    "noack.config.resolution", "noack.core.random_streams", "cosim.record.environment",
+)  # fmt: skip
+"""What the processes and the launcher import."""
 _IMPORTS = (
-    "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__", "netem.__main__",
-    "cosim.live.recorder", "numpy.random", "zenoh",
+    *_COMMON, "plant_server.__main__", "sensor_node.__main__", "controller_node.__main__",
+    "netem.__main__", "cosim.live.recorder", "numpy.random", "zenoh",
 )  # fmt: skip
 QUICK_IMPORTS = {
     "OPENBLAS_NUM_THREADS": "1",  # numpy starts no threads
@@ -44,15 +55,19 @@ ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": "131072",
 }
 """Environment variables of the processes of a run, beside the launcher's."""
+_MALLOPT = {-8: 2, -3: 131_072, -1: 131_072}
+"""The last three of them, as glibc's mallopt takes them: it reads the environment only once."""
+_PYTHONS_GC_THRESHOLDS = (700, 10, 10)
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MOST_BYTES = 65_536
 _START_TIMEOUT_S = 120.0
 _PR_SET_CHILD_SUBREAPER = 36
 
 
 class ForkedProcess:
-    """A process from the fork server, and a child of the launcher; see :class:`ForkServer`."""
+    """A process that was forked, and is a child of the launcher."""
 
-    def __init__(self, pid: int, stdin: IO[str]) -> None:
+    def __init__(self, pid: int, stdin: IO[str] | None = None) -> None:
         self.pid = pid
         self.stdin = stdin
         self._status: int | None = None
@@ -88,18 +103,23 @@ class ForkServer:
     The server forks twice. Linux gives a process whose parent has ended to its nearest ancestor
     that adopts orphans: while the server lives, this process does.
 
+    Args:
+        of_itself: fork the server of this process, if that is possible; of a command, before it
+            has begun its work.
+
     Raises:
         MachineError: a limit of the system is too low for a run.
         OSError: it cannot be started.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, of_itself: bool = False) -> None:
         require_limits()
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
             on_error.callback(self._socket.close)
-            self._process = subprocess.Popen(
+            self._process = self._forked(its) if of_itself else None
+            self._process = self._process or subprocess.Popen(
                 python_command("-m", "cosim.live.fork_server", its.fileno()),
                 pass_fds=[its.fileno()],
                 stdin=subprocess.DEVNULL,
@@ -108,6 +128,32 @@ class ForkServer:
             )
             on_error.pop_all()
         _adopt_orphans(True)
+
+    def _forked(self, its: socket.socket) -> ForkedProcess | None:
+        """Fork the server; None if only a program of its own would work as every process must.
+
+        That is one thread, and UTF-8 for files and streams.
+        """
+        _import(_COMMON)
+        threads = len([*Path("/proc/self/task").iterdir()])
+        if threads > 1 or sys.getfilesystemencoding() != "utf-8":
+            return None
+        if (pid := os.fork()) > 0:
+            return ForkedProcess(pid)
+        self._socket.close()
+        os.setsid()  # the launcher handles Ctrl-C
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        usual = (signal.default_int_handler, signal.SIG_DFL, signal.SIG_DFL)
+        for number, handler in zip(_ENDING, usual, strict=True):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, handler)
+        os.environ.update(ENVIRONMENT)
+        with suppress(AttributeError):  # another C library
+            for parameter, value in _MALLOPT.items():
+                ctypes.CDLL(None).mallopt(parameter, value)
+        gc.set_threshold(*_PYTHONS_GC_THRESHOLDS)
+        _run(its)
+        sys.exit()
 
     def close(self) -> None:
         """End the server; its processes go on."""
@@ -215,7 +261,7 @@ def _fork_twice() -> int:
 
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
-    from noack.config.scenario_changes import prepare_changes
+    from noack.config.scenario_checks import prepare_changes
     from noack.impairments.kinds.loss import LossOf
     from noack.impairments.link_settings import LinkSettings
     from noack.runtime.join_ticket import Ticket
@@ -227,11 +273,19 @@ def _build_validators() -> None:
 
 def main() -> None:
     """Run the server."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent's "ignore" is inherited
-    connection = socket.socket(fileno=int(sys.argv[1]))
-    gc.disable()
-    for module in _IMPORTS:
+    _run(socket.socket(fileno=int(sys.argv[1])))
+
+
+def _import(modules: Sequence[str]) -> None:
+    for module in modules:
         import_module(module)
+
+
+def _run(connection: socket.socket) -> None:
+    """Import, and fork processes; in each of them exit with the status of its ``main``."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent's "ignore" is inherited
+    gc.disable()
+    _import(_IMPORTS)
     _build_validators()
     # What was collected now would leave holes, which each process would fill on pages of its own.
     gc.freeze()

@@ -33,7 +33,7 @@ from cosim.record.run_directory import (
     write_scenario,
 )
 from cosim.record.run_ending import EndingFile, RunEnding
-from noack.config.resolution import require_equal_sizes, resolve_run, resolved_loops
+from noack.config.resolution import resolve_run, resolved_loops
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
@@ -132,7 +132,6 @@ def launch(
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)
         resolved = resolve_run(scenario)
-        require_equal_sizes(scenario)
         require_disk_space(loops, runs)
         if PLANT in spawn:
             # Compile now: the start barrier has a time limit.
@@ -166,8 +165,6 @@ def launch(
                 watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        # While the processes get ready: the versions of all packages take 0.02 s.
-        write_environment(run_dir, "live", run_name(ticket.run_id))
         run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
@@ -208,7 +205,7 @@ class _Run:
         notices: SimpleQueue[str],
     ) -> None:
         self._notices = notices
-        self._scenario = ticket.scenario
+        self._scenario, self._run_id = ticket.scenario, ticket.run_id
         self._run_dir = run_dir
         self._coordinator = coordinator
         self._children = children
@@ -243,6 +240,8 @@ class _Run:
                     self._notify_missing()
             elif not started:
                 started = True
+                # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
+                write_environment(self._run_dir, "live", run_name(self._run_id))
                 point_to_latest(self._run_dir)
                 self._notify("started", self._run_dir)
                 self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))

@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from noack.config.loops import loop_names
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.runtime.join_ticket import DEFAULT_SESSION
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from cosim.live.telemetry_recorder import Recorder
 from cosim.record.decimate import is_long
 from cosim.record.run_directory import RECORDING_FILE, active_run
+from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError
 from noack.protocol.machine_interface import RESTART, Notice
 from noack.protocol.topology import RECORDER
@@ -57,6 +58,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     if process.replaces is not None:
         recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
     process.join(None)
+    core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
     unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
     if view is not None or not (process.start.is_restart or unseen):

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 from cosim.live.coordinator import AdmissionPass, Coordinator
 from cosim.live.remote_hosts import Host, load_hosts
-from noack.config.loops import loop_names
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.invitation_proof import InvitationProof
 from noack.protocol.topology import LOOP_ROLES
@@ -93,7 +92,7 @@ def listen_address(text: str, option: str = "--listen") -> Address:
 
 def with_clocks(scenario: Scenario) -> Scenario:
     """Return a scenario whose run on several hosts records the bounds of its clocks' errors."""
-    if scenario.clocks is not None or len(loop_names(scenario)) > 1:
+    if scenario.clocks is not None:
         return scenario
     return scenario.model_copy(update={"clocks": ClocksSection()})
 

@@ -2,22 +2,21 @@
 
 import time
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.live.claim_monitor import ClaimMonitor, Finding
 from cosim.live.process_tokens import ProcessTokens
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.process_reports import report_of, write_reports
 from cosim.record.run_record import Rows
-from noack.config.loops import loop_names
 from noack.config.parameter_changes import ParameterChange, change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError, PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
@@ -29,6 +28,7 @@ from noack.runtime.telemetry import first_row
 from noack.runtime.zenoh_session import header_of
 
 if TYPE_CHECKING:
+    from cosim.live.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.network_recording import NetworkRecording
     from cosim.output.viewer.recording import RunView
     from cosim.output.viewer.run_feed import LoopFeed, NetworkFeed
@@ -60,7 +60,6 @@ class Recorder:
         self._feed: LoopFeed | NetworkFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._monitor = ClaimMonitor(scenario)
         self._blind_reported = self._monitoring_ended = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
@@ -77,6 +76,13 @@ class Recorder:
         if start.is_restart:
             self._monitor.stop("the recorder was restarted")
             self._store.load(self._progress.count)
+
+    @cached_property
+    def _monitor(self) -> "ClaimMonitor":
+        """Checks claims. It imports the theory, for which the other processes do not wait."""
+        from cosim.live.claim_monitor import ClaimMonitor
+
+        return ClaimMonitor(self._scenario)
 
     @property
     def finished(self) -> bool:
@@ -212,7 +218,7 @@ class Recorder:
         if self._feed is not None:
             self._feed.add(table, rows)
 
-    def _monitor_assumptions(self, check: Callable[[], list[Finding]]) -> None:
+    def _monitor_assumptions(self, check: "Callable[[], list[Finding]]") -> None:
         """Report violated assumptions in the log, the view and the progress report."""
         if self._monitoring_ended:
             return

@@ -2,8 +2,8 @@
 
 Each packet of the trace is taken as an update of the scenario, sent when it was sent. The
 conditions are those of the scenario's certificates
-(:func:`noack.theory.run_conditions.allowed_conditions`). Losses are counted as the claims about a
-run count them: by the rules of the guarantee, and
+(:func:`noack.theory.certificates.conditions.allowed_conditions`). Losses are counted as the claims
+about a run count them: by the rules of the guarantee, and
 :class:`cosim.analysis.claims.observed_conditions.PacketLosses`. A condition is violated
 
 * by losses: from the sending of the packet whose loss is one too many, until a later packet is
@@ -28,8 +28,8 @@ from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.measurement.loss_bursts import outcomes
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.run_conditions import allowed_conditions, network_delay_ns
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace
 
 Times = NDArray[np.int64]

@@ -19,10 +19,10 @@ from cosim.output.figure_format import FigureFiles
 from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import toml_text
-from noack.config.sections.network_section import NetworkSection
+from noack.config.sections import NetworkSection
 from noack.core.errors import CallerError, printable
 from noack.core.file_access import require_suffix, write_whole
-from noack.impairments.link_settings import read_files
+from noack.impairments.loss_prediction import read_files
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 
 Form = Literal["trace", "model"]

@@ -27,12 +27,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
-from noack.impairments.link_records import NEVER_NS
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
-from noack.traces.capture_blocks import is_capture
-from noack.traces.capture_numbers import SequenceField
-from noack.traces.capture_trace import CaptureOptions, read_captures
+from noack.traces.capture_packets import is_capture
+from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.packet_trace import (
     LOST_NS,
     MAX_PACKETS,

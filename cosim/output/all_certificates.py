@@ -12,17 +12,27 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.row_display import Rows, as_html, as_text
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.assumptions import assumptions
-from noack.theory.certified_bounds import BOX, OWN_PLANT, ScenarioCertificate
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.loss_margin import LossMargin, Stability
-from noack.theory.network_limits import NetworkLimits, network_limits
-from noack.theory.paper_bounds import Theorem2, theorem_2
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import box, own_plant
-from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
-from noack.theory.unlimited_losses import UnlimitedLosses, unlimited_losses
-from noack.theory.weight import choose_weight
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import (
+    BOX,
+    OWN_PLANT,
+    about_setpoint,
+    ideal_conditions,
+    nominal_conditions,
+    void_at_setpoint,
+)
+from noack.theory.certificates.scenario_certificates import (
+    NetworkLimits,
+    box,
+    network_limits,
+    own_plant,
+)
+from noack.theory.certificates.weight import choose_weight
+from noack.theory.margins.loss_margin import LossMargin, Stability
+from noack.theory.paper.theorems import Theorem2, theorem_2
+from noack.theory.random_losses.moments import UnlimitedLosses, unlimited_losses
 from noack.trigger.decaying import DecayingSettings
 from noack.trigger.periodic_trigger import PeriodicSettings
 

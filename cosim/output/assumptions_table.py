@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cosim.analysis.summary_model import AssumptionPart
-from noack.theory.assumptions import Assumption, AssumptionStatus
+from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 _COLOURS: dict[str, str] = {
     AssumptionStatus.HOLDS: "green",

@@ -12,11 +12,10 @@ from cosim.output.certificate_rows import constant_rows, plants_of
 from cosim.output.result_tables import ResultTable
 from cosim.output.unlimited_losses_report import print_unlimited
 from noack.core.number_format import duration
-from noack.theory.assumptions import assumptions
-from noack.theory.certified_bounds import BOX
-from noack.theory.envelope_formula import envelope_formula
-from noack.theory.network_limits import MOST_S
-from noack.theory.scenario_certificates import outside_box
+from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.certified_bounds import envelope_formula
+from noack.theory.certificates.conditions import BOX
+from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 
 
 def print_certificates(console: Console, found: Certificates) -> None:

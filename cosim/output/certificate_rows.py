@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 
 from noack.core.number_format import NONE, number
-from noack.theory.certified_bounds import BOX, ScenarioCertificate
-from noack.theory.paper_bounds import Theorem2
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import BOX
+from noack.theory.paper.theorems import Theorem2
 
 _PERSISTENT = {
     "‖e_c‖": "delta", "‖e_s‖": "overshoot", "‖u − Kx‖": "input_error", "‖x‖": "state",

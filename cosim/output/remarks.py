@@ -6,7 +6,7 @@ from typing import NamedTuple
 from cosim.analysis.claims.observed_conditions import CAUSES
 from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.output.run_tables import away, changes_in
-from noack.theory.assumptions import AssumptionStatus
+from noack.theory.certificates.assumptions import AssumptionStatus
 
 _MOST = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01

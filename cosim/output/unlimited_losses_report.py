@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from noack.core.number_format import number
-from noack.theory.unlimited_losses import UnlimitedLosses
+from noack.theory.random_losses.moments import UnlimitedLosses
 
 _RARE = 1e-4
 """Rows are shown from this probability on, up to the first one that is exceeded less often."""

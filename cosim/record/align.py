@@ -12,13 +12,13 @@ If a controller dies, there is no x_c until the restarted controller has its fir
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.estimation_error import true_states
+from cosim.record.record_source import joined
 from cosim.record.recorded_changes import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import LoopMatrices, loop_of
@@ -33,7 +33,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.identities import ModelDifference
+from noack.theory.paper.error_bounds import MissedEvents, missed_sum
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
@@ -246,11 +246,11 @@ def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
             yield part(waiting[:ready], int(track.model_ns[-1]))
             last_ns = waiting["t_ns"][ready - 1]
             keep = max(int(np.searchsorted(track.model_ns, last_ns, "right")) - 1, 0)
-            track, steps = track.since(keep), steps[steps["t_ns"] > last_ns]
-        waiting = np.concatenate([waiting[ready:], taken[SENSOR_MEASUREMENT]])
+            track, steps = track.since(keep), steps.compress(steps["t_ns"] > last_ns)
+        waiting = joined([waiting[ready:], taken[SENSOR_MEASUREMENT]], waiting.dtype)
         track = controller_track(track, taken[CONTROLLER_STEP], taken[CONTROLLER_DELIVERY])
         if reads_steps:
-            steps = np.concatenate([steps, taken[PLANT_STEP]])
+            steps = joined([steps, taken[PLANT_STEP]], steps.dtype)
     yield part(waiting, int(track.model_ns[-1]) + scenario.timing.controller_period_ns)
 
 
@@ -265,36 +265,30 @@ def align_tables(record: RunRecord) -> AlignedRun:
 class IdentityResidual:
     """Computes max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at the measurements of a run, in order.
 
-    This is the residual of (I1). It is zero up to rounding on every run, for all losses. It is NaN
-    if x_c is not recorded, and before the first delivery unless x(0) is known. In a run with
-    acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.
+    This is the residual of (I1). It is zero up to rounding on every run, for all losses.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._missed = ModelDifference(loop_of(scenario).H)
+        period_ns = scenario.timing.measurement_period_ns
+        self._missed = MissedEvents(loop_of(scenario).H, period_ns)
 
     @np.errstate(over="ignore", invalid="ignore")
     def take(self, part: AlignedPart) -> Reals:
         """Return the residuals at the next k measurements, (k,)."""
-        rows, aligned = part.rows, part.aligned
-        if self._scenario.protocol.acknowledges or not len(rows):
-            return np.full(len(rows), np.nan)
-        missed, e_s = self._missed, rows["x_s"] - rows["x"]
-        totals = np.zeros_like(e_s)
-        t_ns, events, received = (
-            column.tolist() for column in (rows["t_ns"], rows["event"], aligned.received)
-        )
-        begins = np.flatnonzero(rows["event"] != NO_SEQUENCE).tolist()
-        for begin, end in pairwise([0, *begins, len(rows)]):
-            for i in range(begin, end):
-                is_event = events[i] != NO_SEQUENCE
-                if missed.is_empty and not is_event:
-                    break  # nothing is missed until the next event
-                missed.advance_to(t_ns[i])
-                if is_event:
-                    missed.event(events[i], e_s[i])
-                missed.received(received[i])
-                totals[i] = missed.total()
-        residual = np.abs(aligned.x_c - aligned.x_s - totals).max(axis=1)
-        return np.where(in_common(self._scenario, aligned), residual, np.nan)
+        rows, e_s = part.rows, part.rows["x_s"] - part.rows["x"]
+        missed = self._missed.take(rows["t_ns"], e_s, rows["event"], part.aligned.received)
+        return identity_residual(self._scenario, part.aligned, missed_sum(missed, *e_s.shape))
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def identity_residual(scenario: Scenario, aligned: AlignedRun, missed: Reals) -> Reals:
+    """Return max |x_c − x_s − missed| at k measurements, (k,).
+
+    It is NaN if x_c is not recorded, and before the first delivery unless x(0) is known. In a run
+    with acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.
+    """
+    if scenario.protocol.acknowledges or not len(aligned.t_ns):
+        return np.full(len(aligned.t_ns), np.nan)
+    residual = np.abs(aligned.x_c - aligned.x_s - missed).max(axis=1)
+    return np.where(in_common(scenario, aligned), residual, np.nan)

@@ -95,13 +95,19 @@ class GrowthMonitor:
         self._early_ns = loops[0].timing.horizon_ns // 10
         self._scales = np.array([_scale(one) for one in loops])
         self._found = np.zeros(len(loops), np.bool_)
+        sizes = np.array([loop.model.dimensions[0] for loop in loops])
+        self._entries = np.arange(sizes.max()) < sizes[:, None]
+        """(loops, n) which entries of a vector each loop has."""
 
     @np.errstate(all="ignore")
     def take(
         self, loops: NDArray[np.integer], t_ns: NDArray[np.int64], x: Matrix
     ) -> list[tuple[int, int, str]]:
-        """Add states x, (k, n), of loops, (k,), at their times; return loop, time and text."""
-        norms = row_norms(x)
+        """Add states x, (k, n), of loops, (k,), at their times; return loop, time and text.
+
+        Of a loop with fewer states than n, the others are not used.
+        """
+        norms = row_norms(np.where(self._entries[loops], x, 0.0))
         lost, early = ~np.isfinite(norms), t_ns < self._early_ns
         np.fmax.at(self._scales, loops[early & ~lost], norms[early & ~lost])
         limits = GROWTH * self._scales[loops]

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows
+from noack.config.resolution import steady_state
 from noack.config.scenario import Scenario
-from noack.config.state_estimation import steady_state
 
 Reals = NDArray[np.float64]
 

@@ -17,11 +17,12 @@ from cosim.record.record_source import (
     RecordSource,
     Rows,
     RowsInMemory,
+    joined,
     with_columns,
 )
 from noack.config.resolution import has_loop, is_of_network, network_tables
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import LOOP, NETEM_SETTING
+from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
@@ -59,16 +60,29 @@ def without_loop(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
     return found
 
 
-def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[tuple[int, Rows]]:
+def rows_by_loop(
+    table: str,
+    rows: Rows,
+    phases_ns: Sequence[int],
+    types: Sequence[Mapping[str, np.dtype[np.void]]],
+) -> Iterator[tuple[int, Rows]]:
     """Yield the number and the rows of each loop, from a part of a table of a live run.
 
-    The inputs of the emulator keep their numbers. The table of a clock is that of loop 0.
+    The inputs of the emulator keep their numbers. The table of a process's clock is of every loop.
+
+    Args:
+        table: the table.
+        rows: its rows.
+        phases_ns: when each loop begins.
+        types: the row types of the tables of each loop.
     """
-    names = [name for name in rows.dtype.names or () if name != LOOP]
-    own = np.dtype([(name, rows.dtype[name]) for name in names])
+    if table in CLOCK_TABLES:
+        yield from enumerate(_shifted(rows, phase_ns) for phase_ns in phases_ns)
+        return
     shared, numbers = is_of_network(table), np.zeros(len(rows), np.int64)
-    if shared:
-        numbers = rows["flow"] % len(phases_ns) if "flow" in names else numbers
+    has_flow = shared and "flow" in (rows.dtype.names or ())
+    if has_flow:
+        numbers = rows["flow"] % len(phases_ns)
     elif has_loop(table):
         numbers = rows[LOOP].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
@@ -76,12 +90,12 @@ def rows_by_loop(table: str, rows: Rows, phases_ns: Sequence[int]) -> Iterator[t
     for number in np.unique(numbers).tolist():
         if number >= len(phases_ns):  # damaged
             continue
-        chosen = rows[order[ends[number - 1] if number else 0 : ends[number]]]
+        chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
         if shared:
             _shift(chosen, phases_ns[number])
-            if "flow" in names:
+            if has_flow:
                 chosen["flow"] //= len(phases_ns)
-        yield number, without_loop(chosen, own)
+        yield number, without_loop(chosen, types[number][table])
 
 
 class NetworkRows:
@@ -116,7 +130,7 @@ class NetworkRows:
             if table in self._orders:
                 first, last = self._ends[table][number : number + 2]
                 chosen = self._orders[table][first:last]
-            own[table] = found[chosen].copy()
+            own[table] = found.take(chosen) if table in self._orders else found.copy()
         _renumber(own, self._inputs)
         for table, found in own.items():
             _shift(found, self._phases_ns[number])
@@ -153,6 +167,7 @@ class LoopTables(RecordSource):
         types: the types of its rows.
         stored: the tables of the run.
         network: the loop's rows of the network.
+        phase_ns: when the loop begins.
     """
 
     def __init__(
@@ -161,9 +176,11 @@ class LoopTables(RecordSource):
         types: Mapping[str, np.dtype[np.void]],
         stored: "StoredTables",
         network: RecordSource,
+        phase_ns: int = 0,
     ) -> None:
         super().__init__(types)
         self._number, self._stored, self._network = number, stored, network
+        self._phase_ns = phase_ns
         self._whole: dict[str, Rows] = {}
         self._counts: dict[str, int] = {}
 
@@ -172,8 +189,7 @@ class LoopTables(RecordSource):
         if is_of_network(table):
             return self._network.whole(table)
         if table not in self._whole:
-            empty = np.zeros(0, self.types[table])
-            self._whole[table] = np.concatenate([empty, *self._read(table, ())])
+            self._whole[table] = joined([*self._read(table, ())], self.types[table])
         return self._whole[table]
 
     def count(self, table: str) -> int:
@@ -183,6 +199,11 @@ class LoopTables(RecordSource):
         if table not in self._counts:
             self._counts[table] = self._stored.count_of_loop(table, self._number)
         return self._counts[table]
+
+    def highest_input(self, table: str) -> int:
+        """Return the highest number of an input of any loop in a table; −1 without rows."""
+        source = self._network if is_of_network(table) else self._stored
+        return source.highest_input(table)
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order; a short one is kept."""
@@ -195,9 +216,9 @@ class LoopTables(RecordSource):
             yield from self._read(table, columns)
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        dtype = with_columns(self.types[table], columns)
-        for rows in self._stored.of_loop(table, self._number, columns):
-            yield without_loop(rows, dtype)
+        of_loop = self._stored.of_loop
+        for rows in of_loop(table, self._number, with_columns(self.types[table], columns)):
+            yield _shifted(rows, self._phase_ns) if table in CLOCK_TABLES else rows
 
 
 def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
@@ -213,6 +234,15 @@ def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
         for counted, sign in ((inputs, -1), (mine, 1)):
             before = np.searchsorted(counted, numbers) - np.searchsorted(counted, begin)
             found["input"] += sign * before
+
+
+def _shifted(rows: Rows, phase_ns: int) -> Rows:
+    """Return rows with times of a loop in place of those of the run."""
+    if not phase_ns:
+        return rows
+    rows = rows.copy()
+    _shift(rows, phase_ns)
+    return rows
 
 
 def _shift(rows: Rows, phase_ns: int) -> None:

@@ -9,11 +9,10 @@ from cosim.record.run_record import Rows, RunRecord
 from noack.protocol.record_tables import (
     NETEM_PACKET,
     NETEM_RELEASE,
-    PACKET_HEAD_BYTES,
     direction_of,
     effective,
 )
-from noack.protocol.wire_format import FLOW_OFFSET, VERSIONS, Flow, read_header
+from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
 
 
 class PacketOutcome(NamedTuple):
@@ -96,20 +95,12 @@ def updates_in(
     Returns:
         Their rows of ``netem_packet``, sequence numbers and event times.
     """
-    indices, sequences, events_ns = [], [], []
-    heads = packets["head"]
-    octets = np.ascontiguousarray(heads).view(np.uint8).reshape(len(heads), PACKET_HEAD_BYTES)
-    marks = octets[:, FLOW_OFFSET]
-    for i in np.flatnonzero(marks == flow).tolist():
-        header = read_header(heads[i].tobytes())
-        if header is None or header.version not in VERSIONS or header.flow != flow:
-            continue
-        if header.sequence < 2**63 and header.t_ns >= 0:  # others do not fit the record's columns
-            indices.append(i)
-            sequences.append(header.sequence)
-            events_ns.append(header.t_ns)
+    headers = np.ascontiguousarray(packets["head"]).view(HEADER_ROW)
+    mine = (headers["magic"] == MAGIC) & np.isin(headers["version"], VERSIONS)
+    mine &= (headers["flow"] == flow) & (headers["t_ns"] >= 0)
+    mine &= headers["sequence"] < 2**63  # others do not fit the record's columns
     return (
-        packets[indices],
-        np.array(sequences, dtype=np.int64),
-        np.array(events_ns, dtype=np.int64),
+        packets.compress(mine),
+        headers["sequence"].compress(mine).astype(np.int64),
+        headers["t_ns"].compress(mine),
     )

@@ -12,13 +12,19 @@ from noack.protocol.machine_interface import GENERATION
 _COLUMNS = ("input", "now_ns")
 
 
-class Life(NamedTuple):
-    """One generation of a process."""
+class RowCounts(NamedTuple):
+    """The recorded rows of one generation of a process."""
 
     generation: int
     rows: Mapping[str, int]
     """Number of recorded rows by table."""
     report: Mapping[str, Any] | None
+
+
+class Life(NamedTuple):
+    """One generation of a process."""
+
+    counts: RowCounts
     first_ns: int | None
     """Time of the first row; None without rows."""
     last_ns: int | None
@@ -27,6 +33,21 @@ class Life(NamedTuple):
     missing at the end of a process without a report are unknown."""
     missing_inputs: int
     """Number of inputs without a row, before the last recorded input."""
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+        return self.counts.generation
+
+    @property
+    def rows(self) -> Mapping[str, int]:
+        """Number of recorded rows by table."""
+        return self.counts.rows
+
+    @property
+    def report(self) -> Mapping[str, Any] | None:
+        """The final report; None if it wrote none."""
+        return self.counts.report
 
 
 class LifeNumbers(NamedTuple):
@@ -48,6 +69,8 @@ def generations(source: RecordSource, tables: Sequence[str]) -> list[int]:
 
     If that row is missing, the rows of a later generation prove that there were earlier ones.
     """
+    if all(source.highest_input(table) < GENERATION for table in tables):
+        return [0]
     first, of = 0, np.zeros(0, np.int64)
     for table in tables:
         for rows in source.batches(table, ("input",)):
@@ -116,10 +139,10 @@ def lives_of(
             continue
         places = {table: numbers.places(rows) for table, rows in part.items()}
         for i, count in enumerate(counts):
-            count.add({table: rows[places[table] == i] for table, rows in part.items()})
+            count.add({table: rows.compress(places[table] == i) for table, rows in part.items()})
     return [
         Life(
-            generation, one.rows, reports.get(generation),
+            RowCounts(generation, one.rows, reports.get(generation)),
             one.first_ns, one.last_ns, one.hole_ns, one.missing_inputs,
         )
         for generation, one in zip(numbers.begun, counts, strict=True)

@@ -97,9 +97,11 @@ def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
     of_loops = channel.pop("loops", [])
     rejected = Counter[str](channel.get("rejected"))
     channel |= of_loops[number] if number < len(of_loops) else {}
-    of_none = rejected - sum((Counter(one.get("rejected")) for one in of_loops), Counter[str]())
-    if number == 0 and of_loops and of_none:  # such as datagrams of others that a socket dropped
-        channel["rejected"] = channel.get("rejected", {}) | of_none
+    if number == 0 and of_loops:
+        for loop in of_loops:
+            rejected.subtract(loop.get("rejected") or {})
+        if of_none := +rejected:  # such as datagrams of others that a socket dropped
+            channel["rejected"] = channel.get("rejected", {}) | of_none
     answers = channel.get("acknowledgements")
     if answers and "loops" in answers:
         channel["acknowledgements"] = answers["loops"][number]

@@ -14,6 +14,27 @@ BATCH_ROWS = 16_384
 """Largest number of rows of a table that are read at a time."""
 
 
+def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
+    """Return rows of one type in one array, as raw bytes: numpy would join column by column."""
+    if len(parts) == 1:
+        return parts[0]
+    if any(rows.dtype != dtype for rows in parts):
+        return np.concatenate([np.zeros(0, dtype), *parts])
+    raw = np.dtype((np.void, dtype.itemsize))
+    found = np.concatenate([np.zeros(0, raw), *(rows.view(raw) for rows in parts)])
+    return found.view(dtype)
+
+
+def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
+    """Return the columns of a type, without gaps between them."""
+    if rows.dtype == dtype:
+        return rows
+    found = np.empty(len(rows), dtype)
+    for name in dtype.names or ():
+        found[name] = rows[name]
+    return found
+
+
 class RecordSource(ABC):
     """The tables of a record, with their row types."""
 
@@ -27,6 +48,11 @@ class RecordSource(ABC):
     @abstractmethod
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
+
+    def highest_input(self, table: str) -> int:
+        """Return the highest number of an input in a table, or a higher one; −1 without rows."""
+        highest = (rows["input"].max(initial=-1) for rows in self.batches(table, ("input",)))
+        return int(max(highest, default=-1))
 
     @abstractmethod
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
@@ -51,7 +77,8 @@ class RowsInMemory(RecordSource):
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order."""
         rows = self._rows[table]
-        rows = rows[[*columns]] if columns else rows
+        if columns:
+            rows = rows[[name for name in rows.dtype.names or () if name in columns]]
         for first in range(0, len(rows), BATCH_ROWS):
             yield rows[first : first + BATCH_ROWS]
 
@@ -94,6 +121,14 @@ def slices(
     before the part's end. The ends are multiples of ``width_ns``; intervals without rows are
     omitted.
     """
+    if all(source.count(table) <= BATCH_ROWS for table in tables):
+        parts = {table: [*source.batches(table, columns)] for table in tables}
+        if any(parts.values()):
+            yield {
+                table: joined(found, with_columns(source.types[table], columns))
+                for table, found in parts.items()
+            }
+        return
     readers = {table: _TableReader(source, table, columns) for table in tables}
     end_ns: int | None = None
     while True:
@@ -133,4 +168,4 @@ class _TableReader:
                 break
         if not found:
             return self._rows[:0]
-        return np.concatenate(found) if len(found) > 1 else found[0]
+        return joined(found, found[0].dtype)

@@ -16,7 +16,7 @@ from noack.core.file_access import copy_whole, locked, read_regular, write_whole
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
-    from noack.settings.named_file import FileSettings
+    from noack.settings.user_files import FileSettings
 
 DEFAULT_RUNS = Path("runs")
 """Folder for run directories, relative to the current folder."""
@@ -87,9 +87,9 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         MachineError, OSError: the directory cannot be written.
     """
     # The command line needs this module for shell completion, and not the settings.
-    from noack.config.loops import with_loop_tables
+    from noack.config.scenario import with_loop_tables
     from noack.config.scenario_file import dumps
-    from noack.settings.named_file import file_tables, unchanged, with_tables
+    from noack.settings.user_files import file_tables, unchanged, with_tables
 
     common = dict(file_tables(scenario))
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
 from cosim.record.loop_rows import LoopTables, NetworkRows, count_of, with_loop
-from cosim.record.process_lives import Life, LifeNumbers, generations, lives_of
+from cosim.record.process_lives import Life, LifeNumbers, RowCounts, generations, lives_of
 from cosim.record.process_reports import (
     entries_of_loop,
     joint_reports,
@@ -27,12 +27,13 @@ from cosim.record.record_source import (
     RecordSource,
     RowsInMemory,
     Slice,
+    joined,
+    packed,
     slices,
     with_columns,
 )
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE
-from noack.config.loops import loop_names, loop_scenario, loop_sections, loops_of, phases_ns
 from noack.config.resolution import (
     LoopMatrices,
     is_of_network,
@@ -42,7 +43,14 @@ from noack.config.resolution import (
     run_tables,
     tables_of,
 )
-from noack.config.scenario import Scenario
+from noack.config.scenario import (
+    Scenario,
+    loop_names,
+    loop_scenario,
+    loop_sections,
+    loops_of,
+    phases_ns,
+)
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
@@ -124,12 +132,15 @@ class RunRecord:
         """Return the number of rows of a table."""
         return self.source.count(table)
 
-    def slices(self, *tables: str) -> Iterator[Slice]:
+    def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
+
+        They have all columns, or only some besides ``now_ns``.
 
         A part holds at most ``BATCH_ROWS`` steps of the plant; a short run is one part.
         """
-        return slices(self.source, tables or [*self.tables], self._slice_ns)
+        columns = (*columns, "now_ns") if columns else ()
+        return slices(self.source, tables or [*self.tables], self._slice_ns, columns)
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -139,10 +150,9 @@ class RunRecord:
         For a long run, only tables of few rows and selections of few rows fit into memory.
         """
         batches = self.source.batches(table, names)
-        chosen = (rows if where is None else rows[where(rows)] for rows in batches)
-        empty = np.zeros(0, with_columns(self.tables[table], names))
-        found = [*(empty.dtype.names or ())]
-        return np.concatenate([empty, *(rows[found] for rows in chosen)])
+        chosen = (rows if where is None else rows.compress(where(rows)) for rows in batches)
+        dtype = with_columns(self.tables[table], names)
+        return joined([packed(rows, dtype) for rows in chosen], dtype)
 
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
@@ -174,14 +184,24 @@ class RunRecord:
     def lives(self, role: str) -> list[Life]:
         """The generations of a process, in order."""
         if role not in self._lives:
-            newest = self.reports.get(role)
-            reports = {} if newest is None else {newest.get("generation", 0): newest}
-            earlier = [one for one in self.earlier if one["process"] == role]
-            reports |= {one.get("generation", 0): one for one in earlier}
             self._lives[role] = lives_of(
-                self.source, self.owned_by(role), self.life_numbers(role), reports, self._slice_ns
-            )
+                self.source, self.owned_by(role), self.life_numbers(role), self._reports_of(role),
+                self._slice_ns,
+            )  # fmt: skip
         return self._lives[role]
+
+    def row_counts(self, role: str) -> list[RowCounts]:
+        """The numbers of rows of each generation of a process, in order."""
+        if role in self._lives or len(self.life_numbers(role).begun) > 1:
+            return [one.counts for one in self.lives(role)]
+        counts = {table: self.count(table) for table in self.owned_by(role)}
+        return [RowCounts(0, counts, self._reports_of(role).get(0))]
+
+    def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
+        """The final reports of a process, by generation."""
+        newest = [] if role not in self.reports else [self.reports[role]]
+        earlier = [report for report in self.earlier if report["process"] == role]
+        return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
     def life_numbers(self, role: str) -> LifeNumbers:
         """The numbers of the generations of a process."""
@@ -220,6 +240,11 @@ class RecordedRun:
     def __init__(self, network: RunRecord, loops: Sequence[RunRecord]) -> None:
         self.network, self.loops = network, loops
         self.scenario, self.kind = network.scenario, network.kind
+
+    @cached_property
+    def phases_ns(self) -> Sequence[int]:
+        """When each loop begins, in the time of the run."""
+        return phases_ns(self.scenario)
 
     @cached_property
     def names(self) -> list[str]:
@@ -261,6 +286,8 @@ class _StoredLoops(Sequence[RunRecord]):
         self._network, self._stored = network, stored
         self._loops, self._phases_ns = loops_of(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
+        self._newest: RunRecord | None = None
+        """The loop that was used last."""
 
     def __len__(self) -> int:
         return len(self._loops)
@@ -273,6 +300,11 @@ class _StoredLoops(Sequence[RunRecord]):
         if isinstance(number, slice):
             return [self[one] for one in range(len(self))[number]]
         number = range(len(self))[number]
+        if self._newest is None or (self._newest.number or 0) != number:
+            self._newest = self._record_of(number)
+        return self._newest
+
+    def _record_of(self, number: int) -> RunRecord:
         loop = resolve(self._loops[number])
         is_alone, rows = len(self) == 1, self._network.source
         entries = entries_of_loop(self._entries, number)
@@ -280,7 +312,8 @@ class _StoredLoops(Sequence[RunRecord]):
             own = self._shared.of_loop(number)
             entries = [(role, self._of_network(one, own)) for role, one in entries]
             rows = RowsInMemory(own)
-        source = LoopTables(number, tables_of(loop), self._stored, rows)
+        phase_ns = self._phases_ns[number]
+        source = LoopTables(number, tables_of(loop), self._stored, rows, phase_ns)
         reports, earlier = valid_reports(entries, source)
         notices = [
             {key: value for key, value in notice.items() if key != LOOP}
@@ -377,7 +410,9 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
         if is_of_network(table):
             yield from run.network.source.batches(table)
             return
-        for number, record in enumerate(run.loops):
+        # A process's clock is in the record of every loop; only simulated runs have several, and
+        # those compare no clocks.
+        for number, record in enumerate(run.loops[:1] if table in CLOCK_TABLES else run.loops):
             if table in record.tables:
                 for batch in record.source.batches(table):
                     yield with_loop(batch, number, types[table])

@@ -1,6 +1,5 @@
 """What is known at the newest event of a run, followed measurement by measurement."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -42,31 +41,16 @@ class EventFollower:
     @np.errstate(all="ignore")  # a run may diverge
     def take(self, rows: Rows, aligned: AlignedRun) -> SinceEvent:
         """Return what follows from the newest event, at the next measurements."""
-        t_ns, predicted = rows["t_ns"], np.empty_like(rows["x"])
-        newest, begun_ns = np.empty_like(rows["event"]), np.empty_like(t_ns)
-        events = np.flatnonzero(rows["event"] != NO_SEQUENCE).tolist()
-        for begin, end in pairwise([0, *events, len(rows)]):
-            following = begin
-            if begin < end and rows["event"][begin] != NO_SEQUENCE:
-                self._x, self._event_ns = rows["x"][begin], int(t_ns[begin])
-                self._event = int(rows["event"][begin])
-                predicted[begin], following = self._x, begin + 1
-            predicted[following:end] = self._followed(t_ns[following:end])
-            newest[begin:end], begun_ns[begin:end] = self._event, self._event_ns
-        age_s = np.where(newest == NO_SEQUENCE, np.nan, (t_ns - begun_ns) * 1e-9)
-        shared = in_common(self._scenario, aligned)
-        return SinceEvent(age_s, predicted, np.where(shared, newest - aligned.received, UNKNOWN))
-
-    def _followed(self, t_ns: NDArray[np.int64]) -> Reals:
-        """Return the prediction at times of the measurements' grid, (k, n).
-
-        A step count is followed bit by bit, so that a value does not depend on the other times.
-        """
-        found = np.tile(self._x, (len(t_ns), 1))
+        new = np.flatnonzero(rows["event"] != NO_SEQUENCE)
+        events = np.append(self._event, rows["event"][new])
+        event_ns = np.append(self._event_ns, rows["t_ns"][new])
+        x = np.concatenate([self._x[None], rows["x"][new]])
+        newest = np.searchsorted(new, np.arange(len(rows)), "right")
         period_ns = self._scenario.timing.measurement_period_ns
-        counts = (t_ns - self._event_ns) // period_ns
-        for bit in range(int(counts.max(initial=0)).bit_length()):
-            rows = np.flatnonzero(counts >> bit & 1)
-            leap, before = self._propagate.transition(period_ns << bit), found[rows]
-            found[rows] = sum(leap[:, i] * before[:, i, None] for i in range(len(self._x)))
-        return found
+        age_ns = rows["t_ns"] - event_ns[newest]
+        predicted = self._propagate.leaps(x[newest], age_ns // period_ns, period_ns)
+        age_s = np.where(events[newest] == NO_SEQUENCE, np.nan, age_ns * 1e-9)
+        shared = in_common(self._scenario, aligned)
+        missing = np.where(shared, events[newest] - aligned.received, UNKNOWN)
+        self._event, self._event_ns, self._x = int(events[-1]), int(event_ns[-1]), x[-1]
+        return SinceEvent(age_s, predicted, missing)

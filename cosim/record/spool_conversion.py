@@ -17,9 +17,9 @@ from cosim.record.run_record import (
     vector_names,
     write_tables,
 )
-from cosim.record.spool_merge import merged, spool_segments
-from noack.config.loops import loop_names
+from cosim.record.spool_merge import by_loop, merged, spool_segments
 from noack.config.resolution import has_loop, run_tables
+from noack.config.scenario import loop_names
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
@@ -29,7 +29,7 @@ from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.log_lines import stored_lines
 from noack.runtime.spool import SPOOL, spool_files
 
-_BLOCK_BYTES = 128 * 1024 * 1024
+_BLOCK_BYTES = 64 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
 
 
@@ -70,22 +70,19 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     Of many loops, as many are sorted at once as fit into memory; one loop is never in memory as a
     whole.
     """
-    if not has_loop(table):
-        yield from _recorded(run_dir, table, dtype, None)
-        return
+    from cosim.record.table_files import group_segments  # imports pyarrow
+
     path = run_dir / RECORD / f"{table}.parquet"
+    segments = [*group_segments(path, dtype)] if path.is_file() else []
+    segments += spool_segments(run_dir / SPOOL, table, dtype)
+    if loops == 1 or not has_loop(table):
+        yield from merged(segments, dtype)
+        return
     paths = [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
     all_bytes = sum(one.stat().st_size for one in paths)
     at_once = max(loops * _BLOCK_BYTES // max(all_bytes, _BLOCK_BYTES), 1)
     for first in range(0, loops, at_once):
-        block = range(first, min(first + at_once, loops))
-        rows = _recorded(run_dir, table, dtype, block)
-        if len(block) == 1:
-            yield from rows
-            continue
-        whole = np.concatenate([np.zeros(0, dtype), *rows])
-        whole = whole[np.argsort(whole[LOOP], kind="stable")]
-        yield from np.split(whole, np.flatnonzero(np.diff(whole[LOOP])) + 1)
+        yield from by_loop(segments, dtype, range(first, min(first + at_once, loops)))
 
 
 def remove_spool(run_dir: Path) -> None:
@@ -109,18 +106,6 @@ def _kept(run_dir: Path, error: OSError) -> MachineError:
         f"{run_dir / RECORD}: the record cannot be written: {why(error)}; what was recorded is "
         f"kept in {run_dir / SPOOL}, and `noack summary {run_dir}` finishes it"
     )
-
-
-def _recorded(
-    run_dir: Path, table: str, dtype: np.dtype[np.void], loops: range | None
-) -> Iterator[Rows]:
-    """Yield the rows of a table, of some loops, in the order of their inputs."""
-    from cosim.record.table_files import group_segments
-
-    path = run_dir / RECORD / f"{table}.parquet"
-    recorded = group_segments(path, dtype) if path.is_file() else ()
-    segments = [*recorded, *spool_segments(run_dir / SPOOL, table, dtype)]
-    yield from merged(segments, dtype, loops)
 
 
 def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:

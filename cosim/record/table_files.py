@@ -16,11 +16,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.record.loop_rows import without_loop
 from cosim.record.record_source import (
     BATCH_ROWS,
     RecordSource,
     Rows,
     RowsInMemory,
+    joined,
     with_columns,
 )
 from cosim.record.spool_merge import Segment
@@ -59,16 +61,15 @@ class StoredTables(RecordSource):
         self._folder, self._most_rows = folder, most_rows
         self._whole: dict[str, Rows] = {}
         self._groups: dict[str, list[_Group]] = {}
-        self._newest: tuple[tuple[str, int], Rows] | None = None
-        """The group of several loops that was read last."""
+        self._newest: dict[str, tuple[int, Rows]] = {}
+        """The group of several loops that was read last, by table."""
         self._counts = {table: self._check(table) for table in types}
 
     def whole(self, table: str) -> Rows:
         """Read all rows of a table."""
         if table not in self._whole:
             dtype = self.types[table]
-            batches = [np.zeros(0, dtype), *read_batches(self.path(table), dtype)]
-            self._whole[table] = np.concatenate(batches)
+            self._whole[table] = joined([*read_batches(self.path(table), dtype)], dtype)
         return self._whole[table]
 
     def count(self, table: str) -> int:
@@ -83,19 +84,17 @@ class StoredTables(RecordSource):
         else:
             yield from read_batches(self.path(table), with_columns(self.types[table], columns))
 
-    def of_loop(self, table: str, number: int, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Read the rows of a loop in order; of a table without loops, all rows."""
-        path, dtype = self.path(table), self.types[table]
-        if LOOP not in (dtype.names or ()):
-            yield from self.batches(table, columns)
+    def of_loop(self, table: str, number: int, dtype: RowType) -> Iterator[Rows]:
+        """Read the rows of a loop in order, as rows of a type; of a table without loops, all."""
+        if LOOP not in (self.types[table].names or ()):
+            yield from self.batches(table, dtype.names or ())
             return
         for place, group in enumerate(self._groups[table]):
             if group.first == number == group.last:
-                yield from _read_batches(path, [place], with_columns(dtype, columns))
+                yield from _read_batches(self.path(table), [place], dtype)
             elif group.first <= number <= group.last:
                 rows = self._mixed(table, place)
-                chosen = rows[rows[LOOP] == number]
-                yield chosen[[*columns]] if columns else chosen
+                yield without_loop(rows.compress(rows[LOOP] == number), dtype)
 
     def count_of_loop(self, table: str, number: int) -> int:
         """Return the number of rows of a loop; of a table without loops, of all rows."""
@@ -111,10 +110,18 @@ class StoredTables(RecordSource):
 
     def _mixed(self, table: str, place: int) -> Rows:
         """Read a group with rows of several loops; the loops are usually read in turn."""
-        key = table, place
-        if self._newest is None or self._newest[0] != key:
-            self._newest = key, _read_group(self.path(table), place, self.types[table])
-        return self._newest[1]
+        newest, rows = self._newest.get(table, (-1, None))
+        if newest != place or rows is None:
+            rows = _read_group(self.path(table), place, self.types[table])
+            self._newest[table] = place, rows
+        return rows
+
+    def highest_input(self, table: str) -> int:
+        """Return the highest number of an input in a table; −1 without rows."""
+        groups = self._groups[table]
+        if any(group.highest_input is None for group in groups):
+            return super().highest_input(table)
+        return max((group.highest_input or 0 for group in groups), default=-1)
 
     def path(self, table: str) -> Path:
         """Return the file of a table."""
@@ -150,14 +157,20 @@ class _Group(NamedTuple):
     """Lowest number of a loop."""
     last: int
     """Highest number of a loop."""
+    highest_input: int | None
+    """Highest number of an input; None if unknown."""
 
 
 def _group(group: Any, metadata: pq.FileMetaData) -> _Group:
     names = metadata.schema.names
-    found = group.column(names.index(LOOP)).statistics if LOOP in names else None
-    if found is None or not found.has_min_max:
-        return _Group(group.num_rows, 0, MAX_LOOPS)
-    return _Group(group.num_rows, int(found.min), int(found.max))
+    loops, inputs = (
+        group.column(names.index(name)).statistics if name in names else None
+        for name in (LOOP, "input")
+    )
+    highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
+    if loops is None or not loops.has_min_max:
+        return _Group(group.num_rows, 0, MAX_LOOPS, highest)
+    return _Group(group.num_rows, int(loops.min), int(loops.max), highest)
 
 
 def read_table(path: Path, dtype: RowType) -> pa.Table:
@@ -191,7 +204,9 @@ def _read_batches(path: Path, groups: Sequence[int] | None, dtype: RowType) -> I
         _require_columns(path, file.schema_arrow, dtype)
         for group in range(file.num_row_groups) if groups is None else groups:
             # A reader of several groups would keep the memory of all of them to the end.
-            for batch in file.iter_batches(BATCH_ROWS, row_groups=[group], columns=names):
+            for batch in file.iter_batches(
+                BATCH_ROWS, row_groups=[group], columns=names, use_threads=False
+            ):
                 batch.validate(full=True)
                 yield _rows(path, batch, dtype)
 
@@ -226,7 +241,7 @@ def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
         table = file.read_row_group(group, columns=names).combine_chunks()
         table.validate(full=True)
         batches = table.to_batches()
-        return np.concatenate([np.zeros(0, dtype), *(_rows(path, one, dtype) for one in batches)])
+        return joined([_rows(path, one, dtype) for one in batches], dtype)
 
 
 def write_table(
@@ -268,18 +283,18 @@ def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
     for batch in batches:
         begins = count and LOOP in (dtype.names or ()) and waiting[-1][LOOP][-1:] != batch[LOOP][:1]
         if count >= _LEAST_GROUP_ROWS and begins:
-            yield np.concatenate(waiting)
+            yield joined(waiting, dtype)
             waiting, count = [], 0
         waiting.append(batch)
         count += len(batch)
         if count >= _GROUP_ROWS:
-            rows = np.concatenate(waiting)
+            rows = joined(waiting, dtype)
             whole = count - count % _GROUP_ROWS
             for first in range(0, whole, _GROUP_ROWS):
                 yield rows[first : first + _GROUP_ROWS]
             waiting, count = [rows[whole:].copy()], count - whole
     if count:
-        yield np.concatenate([np.zeros(0, dtype), *waiting])
+        yield joined(waiting, dtype)
 
 
 def _arrays(rows: Rows) -> dict[str, Any]:
@@ -288,14 +303,18 @@ def _arrays(rows: Rows) -> dict[str, Any]:
         column = rows[name]
         if column.ndim == 2:
             for entry, values in zip(entry_names(name, column.shape[1]), column.T, strict=True):
-                columns[entry] = pa.array(np.ascontiguousarray(values))
-        elif column.dtype.kind == "V":
-            width = column.dtype.itemsize
-            raw = pa.py_buffer(np.ascontiguousarray(column).tobytes())
-            columns[name] = pa.Array.from_buffers(pa.binary(width), len(rows), [None, raw])
+                columns[entry] = _array(values)
         else:
-            columns[name] = pa.array(np.ascontiguousarray(column))
+            columns[name] = _array(column)
     return columns
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """Return numbers or bytes as an Arrow array; ``pa.array`` would import pandas."""
+    kind, width = values.dtype, values.dtype.itemsize
+    type_ = pa.binary(width) if kind.kind == "V" else pa.from_numpy_dtype(kind)
+    data = pa.py_buffer(np.ascontiguousarray(values).view(np.uint8))
+    return pa.Array.from_buffers(type_, len(values), [None, data])
 
 
 def _rows(path: Path, batch: pa.RecordBatch, dtype: RowType) -> Rows:
@@ -307,13 +326,14 @@ def _rows(path: Path, batch: pa.RecordBatch, dtype: RowType) -> Rows:
             column = batch.column(entry)
             _require_whole(path, entry, column)
             if field.shape:
-                rows[name][:, i] = column.to_numpy()
+                rows[name][:, i] = _values(column, field.base)
             else:
-                rows[name] = _bytes(column, field) if field.kind == "V" else column.to_numpy()
+                rows[name] = _values(column, field)
     return rows
 
 
-def _bytes(column: Any, field: np.dtype[Any]) -> NDArray[Any]:
+def _values(column: Any, field: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values of an Arrow array; its ``to_numpy`` would import pandas."""
     if not len(column):
         return np.zeros(0, field)
     data: memoryview = memoryview(column.buffers()[1])

@@ -14,8 +14,7 @@ from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.trigger.core_rule import fill_rule
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy, fill_rule
 
 ROW = dtype_of("noack_exact_row")
 """The row of a run: ``noack_exact_row`` of native/noack.h."""

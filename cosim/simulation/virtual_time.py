@@ -8,24 +8,28 @@ of the network couple the loops.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.loop_rows import NetworkRows
+from cosim.record.loop_rows import NetworkRows, without_loop
 from cosim.record.record_source import RecordSource, RowsInMemory
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
-from noack.config.loops import phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
-from noack.config.resolution import is_of_network, network_tables, resolved_loops, tables_of
-from noack.config.scenario import Scenario
+from noack.config.resolution import (
+    has_loop,
+    is_of_network,
+    network_tables,
+    resolved_loops,
+    shape_of,
+    tables_of,
+)
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.core_library import core, ffi
-from noack.machines.loop_machines import LoopMachines
-from noack.machines.machine_parts import NEVER_NS
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
@@ -69,7 +73,7 @@ class RecordCollector:
         self._batches.setdefault(table, []).append(rows)
 
     def rows(self, table: str, dtype: np.dtype[np.void]) -> Rows:
-        """Return all rows of a table whose rows have this type."""
+        """Return all rows of a table of this type."""
         return _joined(
             [np.array(self._settings.get(table, []), dtype), *self._batches.get(table, [])]
         )
@@ -80,18 +84,12 @@ class RecordCollector:
         numbers.append(np.array([row[0] for row in self._settings.get(table, [])], np.uint16))
         return np.bincount(np.concatenate(numbers), minlength=loops)
 
-    def take_by_loop(self, table: str, dtype: np.dtype[np.void]) -> dict[int, Rows]:
-        """Return the rows of each loop in a table of the machines, and keep them no longer.
-
-        The loops' rows may have different types; rows of settings have ``dtype``.
-        """
+    def take_by_loop(self, table: str, dtype: np.dtype[np.void], loops: int) -> list[Rows]:
+        """Return the rows of each loop in a table of the machines, and keep them no longer."""
         batches = self._batches.pop(table, [])
         if settings := self._settings.pop(table, []):
-            batches = [np.array(settings, np.dtype([(LOOP, "<u2"), *dtype.descr])), *batches]
-        by_type: dict[np.dtype[np.void], list[Rows]] = {}
-        for rows in batches:
-            by_type.setdefault(rows.dtype, []).append(rows)
-        return dict(own for same in by_type.values() for own in _split(_joined(same)))
+            batches = [np.array(settings, dtype), *batches]
+        return _split(_joined(batches or [np.zeros(0, dtype)]), loops)
 
     def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
@@ -120,20 +118,10 @@ class VirtualRun:
         network: Network | None = None,
     ) -> None:
         self._scenario = scenario
-        self.types = [tables_of(loop) for loop in loops]
-        """The types of each loop's rows, by table."""
-        self.groups: Sequence[Sequence[int]] = [*_groups(self.types)]
-        """The numbers of the loops whose rows have the same columns."""
-        self.phases_ns = phases = phases_ns(scenario)
+        self.phases_ns = phases_ns(scenario)
         """When each loop begins."""
-        self.machines = [
-            {
-                role: make([loops[k] for k in numbers], [phases[k] for k in numbers], numbered=True)
-                for role, make in _ROLES.items()
-            }
-            for numbers in self.groups
-        ]
-        """The machines of each group of loops whose rows have the same columns, by role."""
+        self.machines = {role: make(loops, self.phases_ns) for role, make in _ROLES.items()}
+        """The machines of all loops, by role."""
         self.channel = channel_of(scenario, loops=len(loops), network=network)
         self.record = RecordCollector()
         self.core: Any = self._new_core(len(loops))
@@ -157,11 +145,9 @@ class VirtualRun:
             elif simulation.asking == core.NOACK_NETWORK:
                 self.channel.answer(reason)
             elif reason == core.NOACK_ROWS_FULL:
-                role = [*_ROLES][simulation.asking]
-                self._take(simulation.asking_group, role)
+                self._take([*_ROLES][simulation.asking])
             else:
-                role = [*_ROLES][simulation.asking]
-                self.machines[simulation.asking_group][role].answer(reason)
+                self.machines[[*_ROLES][simulation.asking]].answer(reason)
         self._take_all()
 
     def announce(self) -> None:
@@ -172,21 +158,16 @@ class VirtualRun:
         """
         changes = scheduled(self._scenario)
         for role in CHANGEABLE:
+            announcing = self.channel if role == "netem" else self.machines[role]
             for change in changes:
-                if role == "netem":
-                    for output in self.channel.announce(change, 0):
-                        self.record.take(role, output)
-                    continue
-                for group, machines in enumerate(self.machines):
-                    for output in machines[role].announce(change, 0):
-                        self.record.take(role, self._of_run(group, output))
+                for output in announcing.announce(change, 0):
+                    self.record.take(role, output)
         for change in changes:
             self.record.take(RECORDER, change_notice(change))
 
     def reception(self, role: str, loop: int, *, acknowledges: bool = False) -> dict[str, Any]:
         """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
-        place = self.core.of_loop[loop]
-        machine = self.machines[place.group][role].machines[place.place].machine
+        machine = self.machines[role].machines[loop].machine
         counts = machine.acknowledgements if acknowledges else machine.received
         rejected = zip(_REASONS, counts.rejected, strict=True)
         return {
@@ -197,22 +178,13 @@ class VirtualRun:
     def _new_core(self, loops: int) -> Any:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
-        numbers = [ffi.new("int64_t[]", one) for one in self.groups]
-        groups = ffi.new("noack_loop_group[]", len(self.groups))
-        of_loop = ffi.new("noack_loop_place[]", loops)
-        for number, (group, machines) in enumerate(zip(groups, self.machines, strict=True)):
-            group.processes = [one.core for one in machines.values()]
-            group.numbers = numbers[number]
-            for place, loop in enumerate(self.groups[number]):
-                of_loop[loop] = (number, place)
         simulation = ffi.new("noack_simulation *", {
-            "groups": len(groups), "loops": loops, "of_group": groups, "of_loop": of_loop,
+            "loops": loops, "processes": [machines.core for machines in self.machines.values()],
             "channel": self.channel.core, "wire": {"run_id": RUN_ID},
             "directions": [flows.index(flow) if flow in flows else -1 for flow in (0, *Flow)],
             "steps_left": _INPUTS_PER_PROGRESS,
         })  # fmt: skip
         core.noack_wire_key(ffi.addressof(simulation, "wire"), key)
-        self._kept = numbers, groups, of_loop
         self._sent = ffi.new("noack_sent_datagram[]", _SENT_PLACES)
         simulation.sent, simulation.sent_places = self._sent, _SENT_PLACES
         return simulation
@@ -227,32 +199,18 @@ class VirtualRun:
         self._sent = simulation.sent = larger
         simulation.sent_places, simulation.sent_first = 2 * places, 0
 
-    def _take(self, group: int, role: str, *, last: bool = False) -> None:
-        """Take the rows and notices of machines."""
-        machines, numbers = self.machines[group][role], np.array(self.groups[group])
-        for table, rows in machines.take_rows(last=last):
-            if len(self.groups) > 1:
-                rows[LOOP] = numbers[rows[LOOP]]
+    def _take(self, role: str, *, last: bool = False) -> None:
+        """Take the rows and notices of the machines of a role."""
+        for table, rows in self.machines[role].take_rows(last=last):
             self.record.extend(table, rows)
-        for notice in machines.take_notices():
-            self.record.take(role, self._of_run(group, notice))
+        for notice in self.machines[role].take_notices():
+            self.record.take(role, notice)
 
     def _take_all(self) -> None:
-        for group, machines in enumerate(self.machines):
-            for role in machines:
-                self._take(group, role, last=True)
+        for role in self.machines:
+            self._take(role, last=True)
         for table, rows in self.channel.take_rows():
             self.record.extend(table, rows)
-
-    def _of_run(self, group: int, output: Record | Notice) -> Record | Notice:
-        """Return an output of a group with the number that its loop has in the run."""
-        numbers = self.groups[group]
-        if isinstance(output, Notice):
-            return output if output.loop is None else output._replace(loop=numbers[output.loop])
-        if len(self.groups) == 1:
-            return output
-        place, *row = output.row
-        return Record(output.table, (numbers[place], *row))
 
 
 def simulate(
@@ -296,16 +254,16 @@ def _simulated(
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
     packets = NetworkRows(of_network, run.phases_ns)
-    by_table: dict[str, dict[int, Rows]] = {}
+    types = row_types(map(shape_of, loops))
     counts = packets.counts() | {
-        table: run.record.counts(table, len(loops))
-        for table in {table for types in run.types for table in types}
-        if not is_of_network(table)
+        table: run.record.counts(table, len(loops)) for table in types if not is_of_network(table)
     }
+    by_table: dict[str, list[Rows]] = {}
     records = []
     for number, loop in enumerate(loops):
-        rows = _LoopRows(run.record, by_table, packets, number, run.types[number])
-        own_counts = {table: int(counts[table][number]) for table in run.types[number]}
+        own_types = tables_of(loop)
+        rows = _LoopRows(run.record, by_table, types, packets, number, len(loops), own_types)
+        own_counts = {table: int(counts[table][number]) for table in own_types}
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         shared = number if len(loops) > 1 else None
@@ -324,26 +282,26 @@ class _LoopRows(RecordSource):
     Args:
         record: the rows of the run's machines.
         by_table: the tables that have been split, of all loops.
+        run_types: the types of the run's rows.
         packets: the rows of the network.
         number: the number of the loop.
-        types: the types of its rows.
+        loops: the number of loops.
+        types: the types of the loop's rows.
     """
 
     def __init__(
         self,
         record: RecordCollector,
-        by_table: dict[str, dict[int, Rows]],
+        by_table: dict[str, list[Rows]],
+        run_types: Mapping[str, np.dtype[np.void]],
         packets: NetworkRows,
         number: int,
+        loops: int,
         types: Mapping[str, np.dtype[np.void]],
     ) -> None:
         super().__init__(types)
-        self._record, self._by_table, self._packets, self._number = (
-            record,
-            by_table,
-            packets,
-            number,
-        )
+        self._record, self._by_table, self._run_types = record, by_table, run_types
+        self._packets, self._number, self._loops = packets, number, loops
 
     @cached_property
     def _of_network(self) -> Mapping[str, Rows]:
@@ -353,10 +311,12 @@ class _LoopRows(RecordSource):
         """Return all rows of a table."""
         if is_of_network(table):
             return self._of_network[table]
+        if not has_loop(table):  # nothing in virtual time compares clocks
+            return np.zeros(0, self.types[table])
         if table not in self._by_table:
-            self._by_table[table] = self._record.take_by_loop(table, self.types[table])
-        # Nothing in virtual time compares clocks: these tables are empty.
-        return self._by_table[table].get(self._number, np.zeros(0, self.types[table]))
+            whole = self._run_types[table]
+            self._by_table[table] = self._record.take_by_loop(table, whole, self._loops)
+        return without_loop(self._by_table[table][self._number], self.types[table])
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
@@ -367,18 +327,6 @@ class _LoopRows(RecordSource):
         yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
 
 
-def _groups(types: Sequence[Mapping[str, np.dtype[np.void]]]) -> Iterator[list[int]]:
-    """Yield the numbers of the loops whose rows have the same columns."""
-    groups: list[tuple[Mapping[str, np.dtype[np.void]], list[int]]] = []
-    for number, own in enumerate(types):
-        same = next((numbers for known, numbers in groups if known == own), None)
-        if same is None:
-            groups.append((own, [number]))
-        else:
-            same.append(number)
-    yield from (numbers for _, numbers in groups)
-
-
 def _joined(batches: Sequence[Rows]) -> Rows:
     """Return rows of one type in one array; numpy's own function takes as long for each column."""
     if len(batches) == 1:
@@ -386,17 +334,14 @@ def _joined(batches: Sequence[Rows]) -> Rows:
     return np.concatenate([rows.view(np.uint8) for rows in batches]).view(batches[0].dtype)
 
 
-def _split(rows: Rows) -> Iterator[tuple[int, Rows]]:
-    """Yield the number and the rows of each loop that has some, without the loop's number."""
-    (_, *names), loops = rows.dtype.names or (), rows[LOOP]
-    own = np.dtype([(name, rows.dtype[name]) for name in names])
-    ends = np.cumsum(np.bincount(loops)).tolist()
-    order = np.argsort(loops, kind="stable") if len(ends) > 1 else slice(None)
+def _split(rows: Rows, loops: int) -> list[Rows]:
+    """Return the rows of each loop, without the column of its number."""
+    numbers = rows[LOOP]
+    is_sorted = bool((numbers[1:] >= numbers[:-1]).all())
+    order = slice(None) if is_sorted else np.argsort(numbers, kind="stable")
     data = rows.view(np.uint8).reshape(len(rows), rows.dtype.itemsize)[order, 2:]
-    ordered = np.ascontiguousarray(data).view(own).reshape(-1)
-    for number, (first, last) in enumerate(pairwise([0, *ends])):
-        if last > first:
-            yield number, ordered[first:last]
+    own = np.ascontiguousarray(data).view(np.dtype(rows.dtype.descr[1:])).reshape(-1)
+    return np.split(own, np.cumsum(np.bincount(numbers, minlength=loops))[:-1])
 
 
 def _reports(

@@ -25,12 +25,11 @@ from cosim.record.run_directory import (
     SCENARIO_FILE,
     SUMMARY_FILE,
 )
-from noack.config.loops import loops_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
 from noack.core.file_access import new_file, open_regular
-from noack.settings.named_file import PLACES, Sha256, file_tables
+from noack.settings.user_files import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"
 SUFFIX = ".noack.zip"

@@ -24,11 +24,10 @@ from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
 from cosim.studies.run_archive import MANIFEST, outside_files, unpack
 from cosim.studies.run_comparison import compare_runs
-from noack.config.loops import loops_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, printable, why
-from noack.settings.named_file import file_tables
+from noack.settings.user_files import file_tables
 
 _MOST_STEPS = 1_000_000
 _US_PER_STEP = 100.0

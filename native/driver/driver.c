@@ -4,38 +4,69 @@
 
 #include <errno.h>
 #include <netinet/in.h>
+#include <netinet/udp.h>
 #include <poll.h>
+#include <sched.h>
 #include <stddef.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/timerfd.h>
 #include <time.h>
+#include <unistd.h>
 
 enum {
-    BUFFERS = 64,       /* datagrams that are received or sent at once */
-    MOST_RECEIVED = 63, /* the last buffer is for a datagram that Python adds */
-    TICKS = 32,         /* that are done before it receives again */
+    BUFFERS = 64, /* datagrams that are handled or sent at once; the kernel segments as many */
+    TICKS = 64,   /* that are done before it receives again */
     BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
-    QUIET_NS = 500000,  /* housekeeping in Python nearly always takes less time */
-    MOST_PUT_OFF_NS = 50000000
+    MESSAGES = 16,      /* received at once; the last place is for a datagram that Python adds */
+    MESSAGE_BYTES = BUFFERS * BUFFER_BYTES, /* a message of the kernel has several datagrams */
+    QUIET_NS = 500000, /* housekeeping in Python nearly always takes less time */
+    /* Housekeeping waits for a step, and for so long after it: the receivers of its messages come
+       first, and the next step is usually a period away. But it does not wait longer than: */
+    SETTLE_NS = 200000,
+    MOST_SETTLE_NS = 10000000,
+    MOST_PUT_OFF_NS = 50000000, /* if a tick is always near */
+    EARLY_NS = 1000             /* a timer may expire so much before its time */
 };
 
+typedef union { /* room for the size of the datagrams in a message */
+    struct cmsghdr head;
+    uint8_t bytes[CMSG_SPACE(sizeof(int))];
+} control;
+
+typedef struct { /* a datagram that was received */
+    uint8_t *data;
+    int64_t size_bytes;
+    const uint8_t *name;
+} arrival;
+
 typedef struct {
-    struct mmsghdr in_headers[BUFFERS], out_headers[BUFFERS];
-    struct iovec in_vectors[BUFFERS], out_vectors[BUFFERS];
-    uint8_t in_names[BUFFERS][NOACK_NAME_BYTES];
-    int64_t in_next, in_end; /* the current datagram, and the end of those received */
+    struct mmsghdr in_headers[MESSAGES], out_headers[BUFFERS];
+    struct iovec in_vectors[MESSAGES], out_vectors[BUFFERS];
+    control in_controls[MESSAGES], out_control;
+    uint8_t in_names[MESSAGES][NOACK_NAME_BYTES];
+    int64_t message_next, message_end; /* the messages of which datagrams are still to be taken */
+    int64_t taken_bytes;               /* of the next one */
+    arrival arrivals[BUFFERS];
+    int64_t in_next, in_end; /* the current datagram, and the end of those taken */
+    int64_t is_unsegmented;  /* 1: the kernel does not segment what this process sends */
     int64_t out_count, sealed_count;
-    int64_t is_sealing;  /* 1: Python encrypts what waits to be sent */
-    int64_t reason;      /* why the driver returns then */
-    int64_t is_accepted; /* 1: the current datagram has become the message */
-    int64_t is_ticking;  /* 1: a tick waits for an answer */
-    int64_t now_ns;      /* time of the message or tick */
-    int64_t batch;       /* datagrams that one call receives */
-    int64_t worked;      /* 1: something was done since it last slept */
-    int64_t has_more;    /* 1: a socket may have more datagrams than were received */
-    int64_t has_asked;   /* 1: the present step has asked Python */
+    int64_t is_sealing;        /* 1: Python encrypts what waits to be sent */
+    int64_t reason;            /* why the driver returns then */
+    int64_t is_accepted;       /* 1: the current datagram has become the message */
+    int64_t is_ticking;        /* 1: a tick waits for an answer */
+    int64_t now_ns;            /* time of the message or tick */
+    int64_t batch;             /* datagrams that one call receives */
+    int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
+    int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
+    int64_t worked;            /* 1: something was done since it last slept */
+    int64_t has_followed;      /* 1: something was done since housekeeping has been due */
+    int64_t has_more;          /* 1: a socket may have more datagrams than were received */
+    int64_t has_asked;         /* 1: the present step has asked Python */
     noack_message message;
-    uint8_t in_data[BUFFERS][BUFFER_BYTES], out_data[BUFFERS][BUFFER_BYTES];
+    uint8_t out_data[BUFFERS][BUFFER_BYTES];
+    uint8_t in_data[MESSAGES][MESSAGE_BYTES];
 } driver_scratch;
 
 static driver_scratch *scratch_of(const noack_driver *driver) { return driver->scratch; }
@@ -56,28 +87,41 @@ const char *noack_driver_check(const noack_driver *driver) {
     if (driver->receiver_count < 0 || driver->receiver_count > 2)
         return "receiver_count: not from 0 to 2";
     for (int k = 0; k < 2; k++)
-        if (!is_name(&driver->sources[k]) || !is_name(&driver->destinations[k]))
+        if (!is_name(&driver->sources[k]))
             return "name_bytes: not from 0 to 32";
     return NULL;
 }
 
 static void renew_header(driver_scratch *own, int64_t k) {
     own->in_headers[k].msg_hdr.msg_namelen = NOACK_NAME_BYTES;
+    own->in_headers[k].msg_hdr.msg_control = &own->in_controls[k];
+    own->in_headers[k].msg_hdr.msg_controllen = sizeof own->in_controls[k];
 }
 
-void noack_driver_open(noack_driver *driver) {
+int64_t noack_driver_open(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
     for (int k = 0; k < BUFFERS; k++) {
-        own->in_vectors[k] = (struct iovec){own->in_data[k], BUFFER_BYTES};
         own->out_vectors[k] = (struct iovec){own->out_data[k], 0};
-        own->in_headers[k].msg_hdr = (struct msghdr){
-            .msg_name = own->in_names[k], .msg_iov = &own->in_vectors[k], .msg_iovlen = 1};
         own->out_headers[k].msg_hdr =
             (struct msghdr){.msg_iov = &own->out_vectors[k], .msg_iovlen = 1};
+    }
+    for (int k = 0; k < MESSAGES; k++) {
+        own->in_vectors[k] = (struct iovec){own->in_data[k], MESSAGE_BYTES};
+        own->in_headers[k].msg_hdr = (struct msghdr){
+            .msg_name = own->in_names[k], .msg_iov = &own->in_vectors[k], .msg_iovlen = 1};
         renew_header(own, k);
     }
     /* A call that has received as many as it may does not look for another one. */
-    own->batch = min_of(driver->process->loops, MOST_RECEIVED);
+    own->batch = min_of(driver->process->loops, MESSAGES - 1);
+    driver->senders[0] = driver->senders[1] = -1;
+    driver->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC);
+    return driver->timer < 0 ? errno : 0;
+}
+
+void noack_driver_close(noack_driver *driver) {
+    if (driver->timer >= 0)
+        close((int)driver->timer);
+    driver->timer = -1;
 }
 
 /* Whether a name is that of a peer: the same family, port and host. */
@@ -95,36 +139,65 @@ void noack_driver_add_datagram(
     noack_driver *driver, const uint8_t name[NOACK_NAME_BYTES], const uint8_t *data,
     int64_t size_bytes) {
     driver_scratch *own = scratch_of(driver);
+    uint8_t *place = own->in_data[MESSAGES - 1];
+    size_bytes = min_of(size_bytes, BUFFER_BYTES);
+    memcpy(place, data, (size_t)size_bytes);
+    memcpy(own->in_names[MESSAGES - 1], name, NOACK_NAME_BYTES);
     if (own->in_next == own->in_end)
         own->in_next = own->in_end = 0;
-    int64_t place = own->in_end;
-    size_bytes = min_of(size_bytes, BUFFER_BYTES);
-    memcpy(own->in_data[place], data, (size_t)size_bytes);
-    memcpy(own->in_names[place], name, NOACK_NAME_BYTES);
-    own->in_headers[place].msg_len = (unsigned)size_bytes;
-    own->in_end++;
+    own->arrivals[own->in_end++] = (arrival){place, size_bytes, own->in_names[MESSAGES - 1]};
 }
 
-/* Send the datagrams that wait; a failure is counted. */
+/* Send datagrams of one size as one message, which goes through the kernel once. Return their
+   number, or -1 if that fails: the network's interface may refuse such messages. */
+static int send_segmented(driver_scratch *own, int fd, int64_t place, int64_t count) {
+    uint16_t size = (uint16_t)own->out_vectors[place].iov_len;
+    struct msghdr message = {
+        .msg_iov = &own->out_vectors[place],
+        .msg_iovlen = (size_t)count,
+        .msg_control = &own->out_control,
+        .msg_controllen = CMSG_SPACE(sizeof size)};
+    own->out_control.head = (struct cmsghdr){
+        .cmsg_level = IPPROTO_UDP, .cmsg_type = UDP_SEGMENT, .cmsg_len = CMSG_LEN(sizeof size)};
+    memcpy(CMSG_DATA(&own->out_control.head), &size, sizeof size);
+    if (sendmsg(fd, &message, MSG_DONTWAIT) >= 0)
+        return (int)count;
+    own->is_unsegmented = errno == EINVAL || errno == EIO || errno == EMSGSIZE;
+    return -1;
+}
+
+/* Send datagrams of one socket, from a place on; return the number of those that were sent, or -1.
+ */
+static int call_send(driver_scratch *own, int fd, int64_t place, int64_t count) {
+    const struct iovec *vectors = &own->out_vectors[place];
+    int64_t equal = 1;
+    while (equal < count && vectors[equal].iov_len == vectors[0].iov_len)
+        equal++;
+    if (equal > 1 && !own->is_unsegmented) {
+        int sent = send_segmented(own, fd, place, equal);
+        if (sent > 0 || !own->is_unsegmented)
+            return sent;
+    }
+    if (count > 1)
+        return sendmmsg(fd, &own->out_headers[place], (unsigned)count, MSG_DONTWAIT);
+    const struct iovec *vector = &own->out_vectors[place];
+    return send(fd, vector->iov_base, vector->iov_len, MSG_DONTWAIT) < 0 ? -1 : 1;
+}
+
+/* Send the datagrams that wait; a failure is counted. An ICMP error of an earlier datagram makes
+   one call fail, too, so each is tried twice. */
 static void send_all(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
-    int fd = (int)driver->sender;
-    for (int64_t k = 0; k < own->out_count;) {
-        const struct msghdr *first = &own->out_headers[k].msg_hdr;
-        int64_t left = own->out_count - k, sent;
-        if (left == 1)
-            sent = sendto(
-                       fd, first->msg_iov->iov_base, first->msg_iov->iov_len, MSG_DONTWAIT,
-                       first->msg_name, first->msg_namelen)
-                           < 0
-                       ? -1
-                       : 1;
-        else
-            sent = sendmmsg(fd, &own->out_headers[k], (unsigned)left, MSG_DONTWAIT);
+    int has_failed = 0;
+    for (int64_t k = 0, end; k < own->out_count;) {
+        for (end = k + 1; end < own->out_count && own->out_flows[end] == own->out_flows[k];)
+            end++;
+        int sent = call_send(own, (int)driver->senders[own->out_flows[k]], k, end - k);
         if (sent > 0) {
             driver->sent += sent;
             k += sent;
-        } else if (errno != EINTR) {
+            has_failed = 0;
+        } else if (errno != EINTR && !(has_failed ^= 1)) {
             driver->errors[errno & (NOACK_ERRNOS - 1)]++;
             k++;
         }
@@ -140,10 +213,7 @@ static void put_output(noack_driver *driver) {
     if (!output->sends)
         return;
     int64_t place = own->out_count++;
-    noack_peer *destination = &driver->destinations[output->message.flow == NOACK_ACKNOWLEDGEMENT];
-    struct msghdr *header = &own->out_headers[place].msg_hdr;
-    header->msg_name = destination->name;
-    header->msg_namelen = (socklen_t)destination->name_bytes;
+    own->out_flows[place] = output->message.flow == NOACK_ACKNOWLEDGEMENT;
     own->out_vectors[place].iov_len =
         (size_t)noack_wire_encode(&driver->wire, &output->message, own->out_data[place]);
 }
@@ -175,8 +245,9 @@ static int64_t ask(noack_driver *driver, int64_t question) {
 /* Examine the current datagram; return NOACK_DRIVER_OPEN if it must be opened. */
 static int64_t examine(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
-    uint8_t *datagram = own->in_data[own->in_next];
-    int64_t size_bytes = own->in_headers[own->in_next].msg_len;
+    const arrival *current = &own->arrivals[own->in_next];
+    uint8_t *datagram = current->data;
+    int64_t size_bytes = current->size_bytes;
     int64_t loop = noack_wire_loop(datagram, size_bytes);
     int is_answer = driver->sources[1].name_bytes > 0
                     && noack_wire_flow(datagram, size_bytes) == NOACK_ACKNOWLEDGEMENT;
@@ -189,8 +260,7 @@ static int64_t examine(noack_driver *driver) {
     if (driver->opened != NOACK_NOT_AUTHENTIC)
         found = noack_wire_examine(
             &driver->wire, reception, max_of(loop, 0), datagram, size_bytes,
-            is_peer(own->in_names[own->in_next], &driver->sources[is_answer]), driver->opened,
-            &own->message);
+            is_peer(current->name, &driver->sources[is_answer]), driver->opened, &own->message);
     if (found == NOACK_ENCRYPTED)
         return NOACK_DRIVER_OPEN;
     driver->opened = NOACK_NOT_OPENED;
@@ -264,57 +334,135 @@ static int64_t next_tick_ns(const noack_driver *driver, int64_t now_ns) {
     return due_ns == INT64_MAX ? INT64_MAX : noack_clock_wait_ns(&driver->clock, due_ns - now_ns);
 }
 
-/* Sleep until a socket has datagrams, a tick is near, or for wait_ns. Return the sockets to read as
-   bits, or -1 if a signal interrupted it. */
-static int64_t sleep_until_needed(noack_driver *driver, int64_t tick_ns, int64_t wait_ns) {
+/* Let the timer expire at a time of the monotonic clock, or a little before.
+
+   It is not cancelled if a datagram comes first, as the timeout of ppoll would be: cancelling the
+   next timer of a core takes microseconds in a virtual machine. */
+static void set_timer(noack_driver *driver, int64_t wall_ns, int64_t at_ns) {
     driver_scratch *own = scratch_of(driver);
-    nfds_t count = (nfds_t)driver->receiver_count;
+    if (wall_ns < own->timer_ns && own->timer_ns <= at_ns && at_ns - own->timer_ns < EARLY_NS)
+        return;
+    struct itimerspec at = {.it_value = {at_ns / NS_PER_S, at_ns % NS_PER_S}};
+    timerfd_settime((int)driver->timer, TFD_TIMER_ABSTIME, &at, NULL);
+    own->timer_ns = at_ns;
+}
+
+/* Sleep until a socket has datagrams, a tick is near, or for wait_ns from wall_ns on. Return the
+   sockets to read as bits, or -1 if a signal interrupted it. */
+static int64_t sleep_until_needed(
+    noack_driver *driver, int64_t wall_ns, int64_t tick_ns, int64_t wait_ns) {
+    driver_scratch *own = scratch_of(driver);
     int rests = own->worked && !own->has_more && 0 < tick_ns && tick_ns < driver->rest_ns;
-    if (rests)
-        wait_ns = driver->rest_ns;
-    else if (tick_ns != INT64_MAX)
-        wait_ns = max_of(min_of(wait_ns, tick_ns - driver->spin_ns), 0);
     own->worked = 0;
-    struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
-    struct pollfd readable[2];
-    for (nfds_t k = 0; k < count; k++)
-        readable[k] = (struct pollfd){.fd = (int)driver->receivers[k], .events = POLLIN};
-    if (ppoll(readable, rests ? 0 : count, &limit, NULL) < 0)
+    if (rests) {
+        struct timespec rest = {0, driver->rest_ns};
+        return clock_nanosleep(CLOCK_MONOTONIC, 0, &rest, NULL) == EINTR
+                   ? -1
+                   : (INT64_C(1) << driver->receiver_count) - 1;
+    }
+    if (tick_ns != INT64_MAX)
+        wait_ns = min_of(wait_ns, tick_ns - driver->spin_ns);
+    struct pollfd readable[3];
+    nfds_t count = 0;
+    for (; count < (nfds_t)driver->receiver_count; count++)
+        readable[count] = (struct pollfd){(int)driver->receivers[count], POLLIN, 0};
+    if (wait_ns > 0) {
+        set_timer(driver, wall_ns, wall_ns + wait_ns);
+        readable[count++] = (struct pollfd){(int)driver->timer, POLLIN, 0};
+    }
+    if (poll(readable, count, wait_ns > 0 ? -1 : 0) < 0)
         return errno == EINTR ? -1 : 0;
     int64_t ready = 0;
-    for (nfds_t k = 0; k < count; k++)
-        ready |= (int64_t)(rests || readable[k].revents != 0) << k;
+    for (int64_t k = 0; k < driver->receiver_count; k++)
+        ready |= (int64_t)(readable[k].revents != 0) << k;
     return ready;
 }
 
-/* Receive datagrams from the sockets that have some, and count their sources. */
-static void receive(noack_driver *driver, int64_t ready) {
+/* Receive at most a number of messages from a place on; return their number. After an ICMP error of
+   a datagram, it fails once. */
+static int64_t call_receive(driver_scratch *own, int fd, int64_t place, int64_t most) {
+    if (most > 1)
+        return recvmmsg(fd, &own->in_headers[place], (unsigned)most, MSG_DONTWAIT, NULL);
+    socklen_t name_bytes = NOACK_NAME_BYTES;
+    ssize_t size_bytes = recvfrom(
+        fd, own->in_data[place], BUFFER_BYTES, MSG_DONTWAIT,
+        (struct sockaddr *)own->in_names[place], &name_bytes);
+    own->in_headers[place].msg_len = (unsigned)max_of(size_bytes, 0);
+    own->in_headers[place].msg_hdr.msg_controllen = 0;
+    return size_bytes < 0 ? -1 : 1;
+}
+
+/* The size of the datagrams in a message; only the last one may be smaller. */
+static int64_t segment_bytes(const struct mmsghdr *message) {
+    struct msghdr head = message->msg_hdr;
+    for (struct cmsghdr *one = CMSG_FIRSTHDR(&head); one; one = CMSG_NXTHDR(&head, one))
+        if (one->cmsg_level == IPPROTO_UDP && one->cmsg_type == UDP_GRO) {
+            int size_bytes;
+            memcpy(&size_bytes, CMSG_DATA(one), sizeof size_bytes);
+            return max_of(size_bytes, 1);
+        }
+    return message->msg_len;
+}
+
+/* Take datagrams out of the messages that were received, and count their sources. */
+static void take_arrivals(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
-    own->in_next = own->in_end = own->has_more = 0;
-    for (int64_t k = 0; k < driver->receiver_count; k++) {
-        unsigned most = (unsigned)min_of(own->batch, MOST_RECEIVED - own->in_end);
-        if (!(ready >> k & 1) || most == 0)
-            continue;
-        int taken = recvmmsg(
-            (int)driver->receivers[k], &own->in_headers[own->in_end], most, MSG_DONTWAIT, NULL);
-        own->in_end += max_of(taken, 0); /* after an ICMP error of a datagram, it fails once */
-        own->has_more |= taken == (int)most;
-    }
-    for (int64_t k = 0; k < own->in_end; k++) {
+    own->in_next = own->in_end = 0;
+    /* One place is left for a datagram that Python adds. */
+    while (own->message_next < own->message_end && own->in_end < BUFFERS - 1) {
+        int64_t number = own->message_next, all_bytes = own->in_headers[number].msg_len;
+        int64_t size_bytes =
+            min_of(segment_bytes(&own->in_headers[number]), all_bytes - own->taken_bytes);
+        const uint8_t *name = own->in_names[number];
+        own->arrivals[own->in_end++] =
+            (arrival){own->in_data[number] + own->taken_bytes, size_bytes, name};
+        own->taken_bytes += size_bytes;
         int64_t source = 0;
-        while (source < 2 && !is_peer(own->in_names[k], &driver->sources[source]))
+        while (source < 2 && !is_peer(name, &driver->sources[source]))
             source++;
         if (source < 2)
             driver->sources[source].received++;
         else
             driver->foreign++;
-        renew_header(own, k);
+        if (own->taken_bytes == all_bytes) {
+            renew_header(own, number);
+            own->taken_bytes = 0;
+            own->message_next++;
+        }
     }
 }
 
-/* Whether housekeeping, which is overdue, makes no tick late, or has been put off long enough. */
-static int is_housekeeping_time(const noack_driver *driver, int64_t overdue_ns, int64_t tick_ns) {
-    return tick_ns > QUIET_NS || noack_clock_wait_ns(&driver->clock, overdue_ns) >= MOST_PUT_OFF_NS;
+/* Receive messages from the sockets that have some. */
+static void receive(noack_driver *driver, int64_t ready) {
+    driver_scratch *own = scratch_of(driver);
+    own->message_next = own->message_end = own->taken_bytes = own->has_more = 0;
+    for (int64_t k = 0; k < driver->receiver_count; k++) {
+        int64_t most = min_of(own->batch, MESSAGES - 1 - own->message_end);
+        if (!(ready >> k & 1) || most == 0)
+            continue;
+        int64_t taken = call_receive(own, (int)driver->receivers[k], own->message_end, most);
+        own->message_end += max_of(taken, 0);
+        own->has_more |= taken == most;
+    }
+    take_arrivals(driver);
+}
+
+/* How long to wait for, at most, or 0 if the time for housekeeping has come. */
+static int64_t wait_for_ns(
+    noack_driver *driver, int64_t until_ns, int64_t now_ns, int64_t tick_ns) {
+    driver_scratch *own = scratch_of(driver);
+    if (now_ns < until_ns) {
+        own->has_followed = 0;
+        return max_of(noack_clock_wait_ns(&driver->clock, until_ns - now_ns), 1);
+    }
+    if (until_ns == INT64_MIN) /* what has been received is still to be handled */
+        return SETTLE_NS;
+    int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
+    own->has_followed |= own->worked;
+    int settled = overdue_ns >= MOST_SETTLE_NS || (own->has_followed && !own->worked);
+    if ((settled && tick_ns > QUIET_NS) || overdue_ns >= MOST_PUT_OFF_NS)
+        return 0;
+    return own->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
 }
 
 int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
@@ -327,23 +475,37 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
         if (own->out_count > 0)
             send_all(driver);
         if (own->reason == NOACK_DRIVER_OPEN)
-            point_to(driver, own->in_data[own->in_next], own->in_headers[own->in_next].msg_len);
+            point_to(
+                driver, own->arrivals[own->in_next].data, own->arrivals[own->in_next].size_bytes);
         if (own->reason != NOACK_DRIVER_NOTHING)
             return own->reason;
+        if (own->in_next == own->in_end && own->message_next < own->message_end)
+            take_arrivals(driver);
         if (until_ns == INT64_MIN && own->in_next == own->in_end)
             return NOACK_DRIVEN;
-        int64_t now_ns = run_time_ns(&driver->clock), tick_ns = next_tick_ns(driver, now_ns);
-        int64_t wait_ns = QUIET_NS;
-        if (now_ns < until_ns)
-            wait_ns = noack_clock_wait_ns(&driver->clock, until_ns - now_ns);
-        else if (until_ns != INT64_MIN && is_housekeeping_time(driver, now_ns - until_ns, tick_ns))
+        int64_t wall_ns = clock_ns(CLOCK_MONOTONIC);
+        int64_t now_ns = noack_clock_at_ns(&driver->clock, wall_ns);
+        int64_t tick_ns = next_tick_ns(driver, now_ns);
+        int64_t wait_ns = wait_for_ns(driver, until_ns, now_ns, tick_ns);
+        if (wait_ns == 0)
             return NOACK_DRIVEN;
         if (own->in_next < own->in_end)
             continue;
-        int64_t ready = sleep_until_needed(driver, tick_ns, wait_ns);
+        int64_t ready = sleep_until_needed(driver, wall_ns, tick_ns, wait_ns);
         if (ready < 0)
             return NOACK_DRIVEN;
         if (ready > 0)
             receive(driver, ready);
     }
+}
+
+void noack_prefer_others(void) {
+    struct { /* sched_attr of Linux */
+        uint32_t size, policy;
+        uint64_t flags;
+        int32_t nice;
+        uint32_t priority;
+        uint64_t runtime_ns, deadline_ns, period_ns;
+    } attributes = {.size = 48, .policy = SCHED_OTHER, .runtime_ns = 100000000};
+    syscall(SYS_sched_setattr, 0, &attributes, 0);
 }

@@ -20,6 +20,15 @@ static inline double bracketed(
     return 0.5 * (low_s + high_s);
 }
 
+/* The positive root of value + slope q + most q^2/2, given value <= 0, or span if that is smaller.
+ */
+static inline double safe_step(double value, double slope, double most, double span) {
+    if (value + span * (slope + 0.5 * most * span) <= 0.0)
+        return span;
+    double root = sqrt(slope * slope - 2.0 * most * value);
+    return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / most, span);
+}
+
 /* The root of an increasing h in (start.s, ahead_s), or NONE. look gives h and its derivative. */
 static inline __attribute__((always_inline)) double ascend(
     look_function *look, const void *curve, const level_search *search, search_point at,

@@ -123,7 +123,7 @@ static inline double least(double a, double b) { return b < a ? b : a; }
 static inline double largest_of(double a, double b) { return b > a ? b : a; }
 
 static inline double level_at(const level_search *search, double s) {
-    return search->rate > 0.0 ? search->level * exp(-search->rate * s) : search->level;
+    return search->rate > 0.0 ? search->level * fixed_exp(-search->rate * s) : search->level;
 }
 
 #endif

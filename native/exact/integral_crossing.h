@@ -42,13 +42,13 @@ static double first_excess(
         double error = fabs(gained - quadrature(curve, p, s, next_s));
         if (error > tolerance * (*integral + gained) && step > shortest * end_s) {
             step = 0.5 * (next_s - s);
-        } else if (*integral + gained > search->level * exp(-search->rate * next_s)) {
+        } else if (*integral + gained > search->level * fixed_exp(-search->rate * next_s)) {
             for (int turn = (low_s = s, high_s = next_s, 0); turn < bisections; turn++) {
                 middle = 0.5 * (low_s + high_s);
                 if (!(low_s < middle && middle < high_s))
                     break;
                 if (*integral + quadrature(curve, p, s, middle)
-                    > search->level * exp(-search->rate * middle))
+                    > search->level * fixed_exp(-search->rate * middle))
                     high_s = middle;
                 else
                     low_s = middle;

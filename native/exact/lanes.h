@@ -42,11 +42,15 @@ static inline part spread(double number) { return number - (part){0.0}; }
 
 static inline lanes load(const double *numbers) {
     lanes v;
-    memcpy(&v, numbers, sizeof v);
+    for (int i = 0; i < PARTS; i++)
+        memcpy(&v.part[i], numbers + i * WIDTH, sizeof v.part[i]);
     return v;
 }
 
-static inline void store(double *numbers, lanes v) { memcpy(numbers, &v, sizeof v); }
+static inline void store(double *numbers, lanes v) {
+    for (int i = 0; i < PARTS; i++)
+        memcpy(numbers + i * WIDTH, &v.part[i], sizeof v.part[i]);
+}
 
 static inline lanes filled(double number) {
     lanes v;
@@ -117,6 +121,11 @@ static inline __attribute__((always_inline)) lanes times(const double *matrix, l
     for (int j = 1; j < N; j++)
         total = fma_scaled(load(matrix + j * STRIDE), entry(v, j), total);
     return total;
+}
+
+/* W v; without W, v. */
+static inline lanes weigh(const double *weight, lanes v) {
+    return weight == NULL ? v : times(weight, v);
 }
 
 /* The first entry of times(). */

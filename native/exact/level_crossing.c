@@ -48,14 +48,6 @@ static double bend_of(const double *g, int degree, double s) {
     return total * (1.0 + 1e-9);
 }
 
-/* phi's positive root, given phi(0) <= 0, or span if that is smaller. */
-static double safe_step(double value, double slope, double most, double span) {
-    if (value + span * (slope + 0.5 * most * span) <= 0.0)
-        return span;
-    double root = sqrt(slope * slope - 2.0 * most * value);
-    return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / most, span);
-}
-
 /* The first s in [0, end_s] from which g(s) >= c e^(-rs), NONE or UNRESOLVED. If h starts above 0,
    or at 0 and increases, that is 0; grain is the rounding error of h(0). */
 double first_root(const double *g, int degree, const level_search *search, double grain) {

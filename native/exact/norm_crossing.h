@@ -6,9 +6,10 @@
 
    phi is convex. If phi(0) < 0 and phi(q) <= 0, then phi and h are negative in between, so a step
    of length q skips no crossing, however short. Newton's method from the right stays right of phi's
-   root. The chord from its last point to (0, phi(0)) is zero at a point left of the root: this
-   point is the step. A chord of phi lies above phi, so Newton's method may stop at any iteration:
-   the step is then shorter and equally safe.
+   root. It begins at the root that |y(s)| + (y.y'/|y|) q in place of |y(s) + y'(s) q| gives. The
+   chord from its last point to (0, phi(0)) is zero at a point left of the root: this point is the
+   step. A chord of phi lies above phi, so Newton's method may stop at any iteration: the step is
+   then shorter and equally safe.
 
    If y is not 0, h'' = (|y'|^2 - (y.y'/|y|)^2 + y.y'')/|y| - r^2 c_s >= -(b + r^2 c_s) =: -L. If
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
@@ -48,12 +49,12 @@ static inline search_point look_at_norm(const void *curve, const level_search *s
     return (search_point){s, size - level, slope};
 }
 
-/* The length of a step that skips no crossing; span if there is none within it. square, mixed and
-   speed are |y|^2, y.y' and |y'|^2; most is b. */
+/* The length of a step that skips no crossing, at most length; length if there is none within it.
+   square, mixed and speed are |y|^2, y.y' and |y'|^2; most is b. */
 static double safe_length(
     double square, double mixed, double speed, double level, double rate, double most,
-    double span) {
-    double length = span, below = level - sqrt(square), above = 0.0;
+    double length) {
+    double below = level - sqrt(square), above = 0.0;
     for (int step = 0; step < NEWTON_STEPS; step++) {
         double straight = sqrt(largest_of(square + length * (2.0 * mixed + length * speed), 0.0));
         above = straight + level * (rate * length - 1.0) + 0.5 * most * length * length;
@@ -102,7 +103,8 @@ static double first_exit(
                 return s;
             s = ahead_s;
         } else {
-            double step = safe_length(square, mixed, speed, level, rate, most, ahead_s - s);
+            double most_s = safe_step(size - level, slope, most, ahead_s - s);
+            double step = safe_length(square, mixed, speed, level, rate, most, most_s);
             if (s + step >= end_s)
                 return NONE;
             if (!(s + step > s))

@@ -27,7 +27,8 @@ rule_span span_after(const exact_memory *memory, double t_s, double left, double
     if (span.level > rule->floor) {
         span.floor_from_s = INFINITY;
         if (rule->floor > 0.0 && rule->rate_per_s > 0.0)
-            span.floor_from_s = span.since_s + log(span.level / rule->floor) / rule->rate_per_s;
+            span.floor_from_s =
+                span.since_s + noack_log(span.level / rule->floor) / rule->rate_per_s;
     }
     span.due_s = (t_s * PER_S + due_ns) * NS;
     span.begin_s = least((t_s * PER_S + idle_ns) * NS, span.due_s);
@@ -47,7 +48,7 @@ rule_phase phase_at(const exact_memory *memory, const rule_span *span, double t_
     if (rule->up_rows == 0)
         return (rule_phase){span->due_s, 0, 0.0, 0.0};
     if (t_s < span->floor_from_s) {
-        double threshold = span->level * exp(-rule->rate_per_s * (t_s - span->since_s));
+        double threshold = span->level * fixed_exp(-rule->rate_per_s * (t_s - span->since_s));
         double until_s = least(span->due_s, span->floor_from_s);
         return (rule_phase){until_s, 1, threshold, rule->rate_per_s};
     }
@@ -56,7 +57,7 @@ rule_phase phase_at(const exact_memory *memory, const rule_span *span, double t_
 
 /* The threshold s seconds after the start of a phase. */
 double threshold_after(const rule_phase *phase, double s) {
-    return phase->rate_per_s > 0.0 ? phase->threshold * exp(-phase->rate_per_s * s)
+    return phase->rate_per_s > 0.0 ? phase->threshold * fixed_exp(-phase->rate_per_s * s)
                                    : phase->threshold;
 }
 

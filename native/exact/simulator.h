@@ -22,10 +22,6 @@ typedef struct { /* the comparison from the start of a piece on */
 
 static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
 
-static inline lanes weigh(const double *weight, lanes v) {
-    return weight == NULL ? v : times(weight, v);
-}
-
 /* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
    three arguments are constants, each combination of which has code. */
 static inline __attribute__((always_inline)) void expand_with(
@@ -164,9 +160,9 @@ static int measure_supremum(
     const double *curve = of_state ? memory->x : memory->weighted;
     lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
     double rate = t_s < exact->fading_until_s ? exact->fading_per_s : 0.0;
-    double growth = exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
+    double growth = fixed_exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
     double before = run->row->sup_e_c_scaled, at_s = length_s;
-    double best = largest_of(before, size_of(last) * growth * exp(rate * length_s));
+    double best = largest_of(before, size_of(last) * growth * fixed_exp(rate * length_s));
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
         best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
     if (best == UNRESOLVED)
@@ -333,9 +329,9 @@ static void follow(exact_memory *memory, exact_run *run) {
         double ceiling = INFINITY; /* while both models agree, e_c = e_s */
         if (agree && !memory->quadratic && phase.compares && !memory->integrates
             && exact->measure != NOACK_EXACT_STATE)
-            ceiling =
-                phase.threshold
-                * exp(exact->fading_per_s * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
+            ceiling = phase.threshold
+                      * fixed_exp(
+                          exact->fading_per_s * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
         double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
         if (within_s == UNRESOLVED)
             break;

@@ -99,7 +99,7 @@ static void find_reaches(exact_memory *memory) {
         memory->reach_s[i] = memory->measured_s[i] = left_out == 0.0 ? INFINITY : 0.0;
         if (left_out != 0.0 && left_out < INFINITY) {
             double most_s = z > 0.0 ? (p + 2) / (2.0 * z) : INFINITY;
-            double carried_s = exp(log(NEGLIGIBLE / left_out) / (p + 1));
+            double carried_s = fixed_exp(noack_log(NEGLIGIBLE / left_out) / (p + 1));
             memory->reach_s[i] = least(carried_s, most_s);
             memory->measured_s[i] = least(carried_s * LESS_STRICT[i], most_s);
         }
@@ -114,12 +114,15 @@ static inline int degree_for(const double *reach_s, double window_s) {
     return degree_of(i);
 }
 
-/* The sum over k <= p of c_k s^k. */
+/* The sum over k <= p of c_k s^k; p is even. Even and odd powers are two sums, half as long. */
 static inline lanes value(const double *curve, int p, double s) {
-    lanes total = load(curve + p * STRIDE);
-    for (int k = p - 1; k >= 0; k--)
-        total = fma_scaled(total, s, load(curve + k * STRIDE));
-    return total;
+    lanes even = load(curve + p * STRIDE), odd = filled(0.0);
+    double square = s * s;
+    for (int k = p - 2; k >= 0; k -= 2) {
+        even = fma_scaled(even, square, load(curve + k * STRIDE));
+        odd = fma_scaled(odd, square, load(curve + (k + 1) * STRIDE));
+    }
+    return fma_scaled(odd, s, even);
 }
 
 /* The state at a time on a piece. */
@@ -135,16 +138,19 @@ static inline models state_at(const exact_memory *memory, int p, double s) {
     return state;
 }
 
-/* The polynomial and its derivative. */
+/* The polynomial and its derivative: y = E(s^2) + s O(s^2), y' = O + 2 s (E' + s O'). */
 static inline void value_and_slope(
     const double *curve, int p, double s, lanes *value, lanes *slope) {
-    lanes total = load(curve + p * STRIDE), rise = filled(0.0);
-    for (int k = p - 1; k >= 0; k--) {
-        rise = fma_scaled(rise, s, total);
-        total = fma_scaled(total, s, load(curve + k * STRIDE));
+    lanes even = load(curve + p * STRIDE), odd = filled(0.0), even_rise = odd, odd_rise = odd;
+    double square = s * s;
+    for (int k = p - 2; k >= 0; k -= 2) {
+        even_rise = fma_scaled(even_rise, square, even);
+        odd_rise = fma_scaled(odd_rise, square, odd);
+        even = fma_scaled(even, square, load(curve + k * STRIDE));
+        odd = fma_scaled(odd, square, load(curve + (k + 1) * STRIDE));
     }
-    *value = total;
-    *slope = rise;
+    *value = fma_scaled(odd, s, even);
+    *slope = fma_scaled(fma_scaled(odd_rise, s, even_rise), 2.0 * s, odd);
 }
 
 /* Bounds on |y''| and on |y|^2 in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its

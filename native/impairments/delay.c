@@ -17,7 +17,7 @@ static const double LONGEST_NS = 1e15;
 
 /* Quantile of the Pareto distribution with shape 3, mean 0 and standard deviation 1. */
 static double pareto(double u) {
-    return (pow(1.0 - u, -1.0 / 3.0) - PARETO_MEAN) / PARETO_DEVIATION;
+    return (1.0 / noack_cube_root(1.0 - u) - PARETO_MEAN) / PARETO_DEVIATION;
 }
 
 /* Quantile of the random part; u in [0, 1). */

@@ -96,8 +96,8 @@ void noack_exponential(int64_t n, const double *matrix, double *result, double *
     multiply(n, powers[0], powers[0], powers[1]);
     multiply(n, powers[1], powers[0], powers[2]);
     multiply(n, powers[1], powers[1], powers[3]);
-    double cube = pow(largest_column(n, powers[2]), 1.0 / 3.0);
-    double fourth = pow(largest_column(n, powers[3]), 1.0 / 4.0);
+    double cube = noack_cube_root(largest_column(n, powers[2]));
+    double fourth = sqrt(sqrt(largest_column(n, powers[3])));
     double alpha = fourth > cube ? fourth : cube;
     int more = halvings(ldexp(alpha, halved), LARGEST) - halved;
     for (int k = 0; k < 4; k++)

@@ -203,14 +203,27 @@ static int64_t row_words(const noack_process *process, int64_t loop, int64_t tab
            + plant->at_state.width;
 }
 
+/* Whether the rows of a table have a place for each of their words. */
+static int has_layout(const noack_table *table, int64_t loop, int64_t words) {
+    int64_t bytes = table->row_bytes - NOACK_LOOP_BYTES;
+    const int64_t *layout = table->layouts == NULL ? NULL : table->layouts[loop];
+    if (layout == NULL)
+        return bytes == 8 * words;
+    if (bytes % 8 != 0 || !is_between(words, bytes / 8, NOACK_MAX_ROW_WORDS))
+        return 0;
+    for (int64_t k = 0; k < bytes / 8; k++)
+        if (!is_between(NOACK_MISSING_ZERO, layout[k], words - 1))
+            return 0;
+    return 1;
+}
+
 static const char *check_tables(const noack_process *process, int64_t loop) {
     for (int64_t k = 0; k < NOACK_TABLES; k++) {
         const noack_table *table = &process->tables[k];
         int64_t words = row_words(process, loop, k);
         if (words == 0)
             continue;
-        if ((table->prefix_bytes != 0 && table->prefix_bytes != 2)
-            || table->row_bytes != 8 * words + table->prefix_bytes || words > NOACK_MAX_ROW_WORDS)
+        if (words > NOACK_MAX_ROW_WORDS || !has_layout(table, loop, words))
             return "the rows of a table have another size than the machines write";
         if (table->rows == NULL || !is_between(1, table->places, MOST_LENGTH)
             || !is_between(0, table->count, table->places))

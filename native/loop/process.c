@@ -4,6 +4,8 @@
    begins at its phase, a time of the run; its messages, rows and notes have the loop's own time. */
 #include "loop.h"
 
+#include <math.h>
+
 noack_machine *noack_process_machine(const noack_process *process, int64_t loop) {
     if (process->role == NOACK_PLANT)
         return &process->plants[loop].machine;
@@ -65,16 +67,31 @@ static int is_full(const noack_process *process, int64_t table) {
            || process->note_count == process->note_places;
 }
 
+/* Write a loop's own row where the columns of a table with longer vectors have it. */
+static void spread(const int64_t *layout, int64_t words, const int64_t *own, uint8_t *row) {
+    static const double missing = NAN;
+    for (int64_t k = 0; k < words; k++, row += sizeof *own) {
+        if (layout[k] >= 0)
+            memcpy(row, &own[layout[k]], sizeof *own);
+        else if (layout[k] == NOACK_MISSING_NAN)
+            memcpy(row, &missing, sizeof missing);
+        else
+            memset(row, 0, sizeof *own);
+    }
+}
+
 /* Append the row of the output to its table, behind the number of the loop. */
 static void append_row(noack_process *process, int64_t loop) {
     noack_table *table = &process->tables[process->output.table];
     uint8_t *row = table->rows + table->count++ * table->row_bytes;
+    int64_t bytes = table->row_bytes - NOACK_LOOP_BYTES;
+    const int64_t *layout = table->layouts == NULL ? NULL : table->layouts[loop];
     uint16_t number = (uint16_t)loop;
-    if (table->prefix_bytes > 0)
-        memcpy(row, &number, sizeof number);
-    memcpy(
-        row + table->prefix_bytes, process->output.row,
-        (size_t)(table->row_bytes - table->prefix_bytes));
+    memcpy(row, &number, NOACK_LOOP_BYTES);
+    if (layout == NULL)
+        memcpy(row + NOACK_LOOP_BYTES, process->output.row, (size_t)bytes);
+    else
+        spread(layout, bytes / 8, process->output.row, row + NOACK_LOOP_BYTES);
 }
 
 /* Keep the outputs of a step that is done. */

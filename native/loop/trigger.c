@@ -25,8 +25,8 @@ static int is_reached(const noack_trigger_rule *rule, double size, double t_s, d
     /* The first two terms of the series where the third is below rounding. */
     double grown = tau_s * (1 + exponent / 2);
     if (exponent > 1e-8)
-        grown = expm1(exponent) / rule->growth_per_s;
-    double faded = rule->beta * exp(-rule->alpha_per_s * (t_s + tau_s));
+        grown = noack_expm1(exponent) / rule->growth_per_s;
+    double faded = rule->beta * fixed_exp(-rule->alpha_per_s * (t_s + tau_s));
     return speed * grown >= (rule->forecast_floor > faded ? rule->forecast_floor : faded);
 }
 
@@ -85,8 +85,8 @@ static double auxiliary_after(
     if (rule->integrates)
         return value + dt_s * (first + last) / 2;
     double decay = rule->decay_per_s;
-    double gained_s = decay > 0.0 ? -expm1(-decay * dt_s) / decay : dt_s;
-    return value * exp(-decay * dt_s) + gained_s * first;
+    double gained_s = decay > 0.0 ? -noack_expm1(-decay * dt_s) / decay : dt_s;
+    return value * fixed_exp(-decay * dt_s) + gained_s * first;
 }
 
 void noack_trigger_restart(
@@ -113,7 +113,7 @@ static void compare(
     const double *z, double sides[2], double *image) {
     double right = state->level, auxiliary = state->auxiliary;
     if (rule->rate_per_s != 0.0)
-        right *= exp(-rule->rate_per_s * (double)(t_ns - state->since_ns) * 1e-9);
+        right *= fixed_exp(-rule->rate_per_s * (double)(t_ns - state->since_ns) * 1e-9);
     if (rule->floor > right)
         right = rule->floor;
     sides[0] = auxiliary;

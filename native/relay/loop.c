@@ -10,7 +10,9 @@
 
 enum {
     FEW_BUFFERS = 16,
+    BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
     HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
+    SETTLE_NS = 200000,       /* between sending and housekeeping */
     MOST_PUT_OFF_NS = 10000000,
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
     LOOP_HEADER_BYTES = 32,
@@ -41,7 +43,6 @@ void noack_relay_open(noack_relay *relay) {
         own->hints[k] = -1;
         renew_header(relay, k);
     }
-    own->most_segments = MOST_SEGMENTS;
     struct timespec at_once = {0, 0};
     own->sleeps =
         syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;
@@ -171,7 +172,7 @@ static int64_t client_of(noack_relay *relay, int64_t number, int64_t size_bytes)
             return REFUSED;
         }
     }
-    return relay->by_loop ? row_of_loop(relay, data, size_bytes) : row;
+    return relay->loops > 0 ? row_of_loop(relay, data, size_bytes) : row;
 }
 
 /* Read the arrival time of the current datagram.
@@ -297,12 +298,22 @@ static int64_t decide_batch(noack_relay *relay) {
     return NOACK_CARRY_ON;
 }
 
-/* Whether to postpone housekeeping because it would make the next delayed datagram late. */
-static int is_soon_due(const noack_relay *relay, int64_t until_ns) {
-    return relay->heap_length > 0
-           && (double)(relay->heap[0].release_ns - relay->read_ns)
-                  < (double)HOUSEKEEPING_NS * relay->clock.speed
-           && (double)(relay->read_ns - until_ns) < (double)MOST_PUT_OFF_NS * relay->clock.speed;
+/* How long to postpone housekeeping, which is due; 0: not at all. It must not make the next delayed
+   datagram late. It waits for a datagram, and for a moment after it: its receiver comes first, and
+   the next one is usually a period away. */
+static int64_t postponed_ns(noack_relay *relay, int64_t until_ns) {
+    relay_scratch *own = scratch_of(relay);
+    double speed = relay->clock.speed;
+    double left_ns = (double)MOST_PUT_OFF_NS * speed - (double)(relay->read_ns - until_ns);
+    own->has_followed |= own->worked;
+    if (left_ns <= 0)
+        return 0;
+    if (relay->heap_length > 0
+        && (double)(relay->heap[0].release_ns - relay->read_ns) < (double)HOUSEKEEPING_NS * speed)
+        return (int64_t)((double)HOUSEKEEPING_NS * speed);
+    if (own->is_busy || (own->has_followed && !own->worked))
+        return 0;
+    return (int64_t)(own->has_followed ? (double)SETTLE_NS * speed : left_ns) + 1;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
@@ -315,14 +326,20 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
         wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
     }
     struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
+    int fd = (int)relay->epoll;
+    if (relay->only_socket >= 0)
+        fd = relay->sockets[relay->only_socket].fd;
+    struct pollfd readable = {.fd = fd, .events = POLLIN};
     long found;
-    if (!own->sleeps) {
-        found = syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &limit, NULL, 0);
-    } else {
-        struct pollfd readable = {.fd = (int)relay->epoll, .events = POLLIN};
+    if (relay->only_socket < 0 && !own->sleeps)
+        found = syscall(EPOLL_PWAIT2, fd, own->ready, READY, &limit, NULL, 0);
+    else
         found = ppoll(&readable, 1, &limit, NULL);
-        if (found > 0)
-            found = epoll_wait((int)relay->epoll, own->ready, READY, 0);
+    if (found > 0 && relay->only_socket >= 0) {
+        own->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
+        own->ready[0].data.u64 = (uint64_t)relay->only_socket;
+    } else if (found > 0 && own->sleeps) {
+        found = epoll_wait(fd, own->ready, READY, 0);
     }
     own->ready_count = max_of(found, 0);
     own->ready_next = 0;
@@ -332,17 +349,25 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
 }
 
 /* Receive datagrams from a socket, as far as there are buffers; return 0, or errno if there are
-   none. */
+   none.
+
+   If the last datagrams came one at a time, it receives one: looking for another takes time. */
 static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *own = scratch_of(relay);
-    int64_t begin = own->batch_end;
-    int taken = recvmmsg(
-        relay->sockets[socket].fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags,
-        NULL);
+    int64_t begin = own->batch_end, before_ns = relay->read_ns;
+    int fd = relay->sockets[socket].fd, taken;
+    if (own->is_busy) {
+        taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags, NULL);
+    } else {
+        ssize_t size_bytes = recvmsg(fd, &own->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
+        own->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
+        taken = size_bytes < 0 ? -1 : 1;
+    }
     int error = taken > 0 ? 0 : errno;
     relay->read_ns = run_time_ns(&relay->clock);
     if (own->stamps)
         own->real_ns = clock_ns(CLOCK_REALTIME);
+    own->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
     if (taken > 0) {
         own->batch_socket = socket;
         own->batch_next = begin;
@@ -389,6 +414,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
             if (own->leaving_count > 0)
                 sent_ns = send_all(relay);
+            own->worked |= sent_ns >= 0;
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
@@ -399,13 +425,14 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = until_ns;
             if (relay->read_ns >= until_ns) {
-                if (!is_soon_due(relay, until_ns)) {
-                    own->ready_count = own->ready_next = 0;
+                int64_t more_ns = postponed_ns(relay, until_ns);
+                if (more_ns == 0) {
+                    own->ready_count = own->ready_next = own->has_followed = 0;
                     return NOACK_HOUSEKEEPING;
                 }
-                wait_until_ns =
-                    relay->read_ns + (int64_t)((double)HOUSEKEEPING_NS * relay->clock.speed);
+                wait_until_ns = relay->read_ns + more_ns;
             }
+            own->worked = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_HOUSEKEEPING;

@@ -13,8 +13,6 @@ enum {
     READY = 64,
     LEAVING = 256,
     ERRORS = 16,
-    MOST_SEGMENTS = 128, /* in one message; of kernels before 6.8: */
-    FEW_SEGMENTS = 64,
     VECTORS = 1024,                   /* maximum number of vectors in one call */
     MOST_BYTES = 65536,               /* no received datagram is longer */
     BUFFER_STRIDE = MOST_BYTES + 256, /* the buffers' first bytes are in different cache sets */
@@ -62,7 +60,9 @@ typedef struct {
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
     int64_t sleeps;        /* 1: there is no epoll_pwait2, so by ppoll and epoll_wait */
-    int64_t most_segments; /* that the kernel accepts in one message */
+    int64_t worked;        /* 1: it has sent datagrams since it last waited */
+    int64_t has_followed;  /* 1: it has sent datagrams since housekeeping has been due */
+    int64_t is_busy;       /* 1: the next datagrams may come together */
     uint64_t loaded;       /* a sum of what was loaded into the caches, so that it is loaded */
     uint8_t buffers[BUFFERS][BUFFER_STRIDE];
 } relay_scratch;

@@ -13,9 +13,8 @@
 
 enum {
     CALLS_PER_READING = 8, /* of the clock */
+    MOST_SEGMENTS = 64,    /* that every kernel with UDP_SEGMENT accepts in one message */
     MOST_SEGMENTED_BYTES = 65507,
-    /* With more than FEW_SEGMENTS. A queue on the way may refuse larger messages, or lose them. */
-    MANY_SEGMENTS_BYTES = 32768,
     TRIES = 3,
     /* Maximum number of tries. An ICMP error of an earlier datagram makes one send fail. A send
        that fails without an ICMP error in the error queue, or this often, is expected to fail
@@ -100,12 +99,11 @@ static int64_t add_vectors(const noack_relay *relay, int64_t count, const depart
 
 /* Whether a datagram may follow others of size_bytes in one message that the kernel segments. */
 static int may_join(
-    const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes,
-    int64_t segments) {
-    int64_t most_bytes = segments < FEW_SEGMENTS ? MOST_SEGMENTED_BYTES : MANY_SEGMENTS_BYTES;
+    const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes) {
     int to_client = relay->directions[first->direction].sends == NOACK_CLIENT_NAME;
     return 0 < other->size_bytes && other->size_bytes <= first->size_bytes
-           && all_bytes + other->size_bytes <= most_bytes && other->direction == first->direction
+           && all_bytes + other->size_bytes <= MOST_SEGMENTED_BYTES
+           && other->direction == first->direction
            && (other->client == first->client || !to_client);
 }
 
@@ -148,10 +146,9 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
         vectors = add_vectors(relay, vectors, first);
         number = first->next;
         if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
-            while (number >= 0 && segments < own->most_segments
-                   && last_bytes == first->size_bytes) {
+            while (number >= 0 && segments < MOST_SEGMENTS && last_bytes == first->size_bytes) {
                 const departure *other = &own->leaving[number];
-                if (!may_join(relay, first, other, all_bytes, segments)
+                if (!may_join(relay, first, other, all_bytes)
                     || vectors + vectors_of(other) > VECTORS)
                     break;
                 last_bytes = other->size_bytes;
@@ -197,13 +194,6 @@ static void mark_failed(relay_scratch *own, int64_t number, int64_t end, int err
         own->leaving[number].error = error;
 }
 
-static int64_t segments_of(const relay_scratch *own, int64_t number, int64_t end) {
-    int64_t segments = 0;
-    for (; number != end; number = own->leaving[number].next)
-        segments++;
-    return segments;
-}
-
 /* Send a number of messages; return the number of messages that were sent or failed.
 
    If it is smaller than headers, the kernel does not segment the next message: the headers of the
@@ -234,13 +224,8 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
                 continue;
             const struct msghdr *message = &own->out_headers[done].msg_hdr;
             if (message->msg_controllen > 0) {
-                if (segments_of(
-                        own, number, done < headers - 1 ? own->out_first[done + 1] : following)
-                    > FEW_SEGMENTS)
-                    own->most_segments = FEW_SEGMENTS;
-                else
-                    relay->segment_below =
-                        min_of(relay->segment_below, own->leaving[number].size_bytes);
+                relay->segment_below =
+                    min_of(relay->segment_below, own->leaving[number].size_bytes);
                 return done;
             }
         }

@@ -10,8 +10,9 @@ from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
 from netem.words.words_to_settings import GRAMMAR, KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings, read_files
-from noack.impairments.quantities import OWN_TIME_S
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
+from noack.impairments.words import OWN_TIME_S
 from noack.runtime.address import parse_address, parse_destination
 from noack.runtime.command_line import Parser
 from noack.runtime.process_entry import add_options

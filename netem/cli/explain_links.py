@@ -15,8 +15,8 @@ from netem.engine.relay_interface import LinkSpec
 from netem.words.tc_command import TcCommand, tc_command
 from netem.words.words_to_settings import text_of
 from noack.core.errors import shortened
-from noack.impairments.kept_loss import expected_loss, with_kept_loss
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import expected_loss, with_kept_loss
 from noack.runtime.address import text_of as address_text
 
 _MAX_TOML = 4000

@@ -17,9 +17,8 @@ from netem.engine.relay import Relay
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport
 from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError
-from noack.impairments.kept_loss import expected_loss
-from noack.impairments.link_records import Counters
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
+from noack.impairments.loss_prediction import expected_loss
 
 T = TypeVar("T")
 

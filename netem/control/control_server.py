@@ -23,10 +23,10 @@ from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.words_to_settings import settings_of, text_of
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import CallerError, MachineError, NoackError
-from noack.impairments.kept_loss import with_kept_loss
 from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.runtime.zenoh_session import cause_of, open_session
 
 _PUBLISH_S = 1.0

@@ -18,7 +18,8 @@ from netem.control.statistics_view import History, render
 from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.signals import Signals
 

@@ -19,7 +19,7 @@ from netem.engine.relay_interface import (
     LinkReport,
 )
 from noack.core.clock import NS_PER_S
-from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import Counters
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import text_of
 
@@ -76,7 +76,7 @@ class FlowStatistics(TypedDict):
 class DirectionStatistics(TypedDict):
     """One direction of a link; see :class:`netem.engine.relay_interface.DirectionReport`.
 
-    The counts are those of :class:`noack.impairments.link_records.Counters`.
+    The counts are those of :class:`noack.impairments.link_settings.Counters`.
     """
 
     words: str

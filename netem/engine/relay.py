@@ -242,7 +242,10 @@ class Relay:
     def _listen(self, number: int) -> None:
         link = self._open_links[number]
         forward, reverse = self._directions[2 * number : 2 * number + 2]
-        self._memory.watch(link.endpoint.fileno(), number)
+        if len(self.specs) == 1 and not link.spec.return_path:
+            self._memory.wait_for_only(link.endpoint.fileno(), number, let_wait(link.endpoint))
+        else:
+            self._memory.watch(link.endpoint.fileno(), number)
         sends = core.NOACK_OWN_SOCKET
         if link.path is not None:
             self._memory.sockets["fd"][len(self.specs) + number] = link.path.fileno()
@@ -254,8 +257,6 @@ class Relay:
         forward.set_server(link.server, sends)
         reverse.set_server(link.server, core.NOACK_CLIENT_NAME)
         forward.row.listen, _ = packed_name(link.name)
-        if len(self.specs) == 1 and not link.spec.return_path:
-            self._memory.wait_for_only(number, let_wait(link.endpoint))
 
     def _stamp_arrivals(self, direction: int) -> None:
         """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""

@@ -12,8 +12,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.impairments.link_records import Counters, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings, RecordedDecision
 
 Address = tuple[str, int]
 """Numeric host (IPv4 or IPv6) and port."""

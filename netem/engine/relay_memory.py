@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from netem.link_state import Integers, LinkState
 from netem.relay_events import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 Array = NDArray[Any]
@@ -87,13 +86,15 @@ class RelayMemory:
         if error := core.noack_relay_watch(self.core, fd, number):
             raise OSError(error, "epoll_ctl")
 
-    def wait_for_only(self, number: int, wait_ns: int) -> None:
-        """Let the core wait in the receiving call of a socket: it is the only one that is watched.
+    def wait_for_only(self, fd: int, number: int, wait_ns: int) -> None:
+        """Wait for the datagrams of no socket but this one, by receiving from it.
 
         Args:
+            fd: its descriptor.
             number: its place among the sockets.
             wait_ns: how long receiving from it waits.
         """
+        self.sockets["fd"][number] = fd
         self.core.only_socket, self.core.receive_wait_ns = number, wait_ns
 
     def add_room(self) -> None:

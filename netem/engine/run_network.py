@@ -41,7 +41,7 @@ class RunNetwork:
     Args:
         resolved: the resolved scenario.
         start: where in the run it begins.
-        loops: number of the run's loops; of one, every datagram is its.
+        loops: number of the run's loops; each datagram has the number of its loop.
     """
 
     def __init__(self, resolved: Scenario, start: Start, loops: int = 1) -> None:
@@ -51,7 +51,7 @@ class RunNetwork:
             self._memory.add_clients()
         self._relay, clients = self._memory.core, self._memory.clients
         self._relay.inputs = self._relay.first_number = start.first_number
-        self._relay.loops, self._relay.by_loop = self._loops, self._loops > 1
+        self._relay.loops = self._loops
         flows = np.arange(self._loops)
         clients["number"][flows] = clients["place"][flows] = flows
         network = resolved.network
@@ -83,7 +83,7 @@ class RunNetwork:
 
         Args:
             clock: the run's clock.
-            sender: an unconnected socket, which sends the updates.
+            sender: connected to the first destination.
             receivers: a socket connected to the source of each direction, the sensor first.
             destinations: where each direction ends.
             spin_ns: busy-wait for this time before a departure.
@@ -94,16 +94,18 @@ class RunNetwork:
         self._memory.sockets["fd"][1] = sender.fileno()
         for place, endpoint in zip((0, self._memory.first_path), receivers.values(), strict=False):
             stamp_arrivals(endpoint)
-            self._memory.watch(endpoint.fileno(), place)
             if len(receivers) == 1:
-                self._memory.wait_for_only(place, let_wait(endpoint))
+                self._memory.wait_for_only(endpoint.fileno(), place, let_wait(endpoint))
+            else:
+                self._memory.watch(endpoint.fileno(), place)
         core.noack_relay_read_stamps(relay)
         self._sensor, name_bytes = packed_name(next(iter(receivers)))
         clients["name_bytes"][: self._loops] = name_bytes
         clients["name"][: self._loops] = name_array(self._sensor)
         core.noack_client_insert(relay, 0)
-        for direction, destination in zip(self._directions, destinations, strict=False):
-            direction.set_server(destination, core.NOACK_DESTINATION_NAME)
+        sends = (core.NOACK_LINK_SOCKET, core.NOACK_DESTINATION_NAME)
+        for direction, destination, by in zip(self._directions, destinations, sends, strict=False):
+            direction.set_server(destination, by)
         self._directions[0].row.full = 1  # refuse other sources
 
     def set_clock(self, clock: RunClock) -> None:

@@ -15,8 +15,7 @@ from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.fates.fate_trace import FORMAT, METADATA, SCHEMA
 from noack.core.errors import CallerError, one_line
 from noack.impairments.constraints import require_consistent
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import Constraints, Mansd
+from noack.impairments.link_settings import Constraints, Mansd, RecordedDecision
 from noack.impairments.loss_guarantee import LossHistory
 from noack.protocol.record_tables import Fate
 

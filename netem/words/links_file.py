@@ -17,7 +17,8 @@ from netem.engine.relay_interface import LinkSpec
 from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
 from noack.runtime.address import parse_address, parse_destination
 from noack.settings.section import ScenarioSection, Seed
 

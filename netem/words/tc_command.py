@@ -5,7 +5,7 @@ from typing import NamedTuple
 from noack.core.errors import shortened
 from noack.impairments.feature import Impairment
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.quantities import percent_text
+from noack.impairments.words import percent_text
 
 _FIXED_ORDER = ("duplicate", "loss", "corrupt", "delay", "reorder", "rate")
 """tc applies its impairments in this order, whatever the order of the words."""

@@ -18,8 +18,7 @@ from noack.impairments.feature import Constraint, Feature, Impairment, Table
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
 from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.quantities import COUNT
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, WordReader
 from noack.settings.section import Seed
 
 _REFUSED = {

@@ -26,21 +26,20 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from noack.config.loops import loop_scenario
 from noack.config.resolution import policy_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_changes import with_settings
-from noack.config.sections.network_section import DirectionSection
+from noack.config.scenario import Scenario, loop_scenario
+from noack.config.scenario_checks import with_settings
+from noack.config.sections import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.impairments.constraints import guarantee_of
+from noack.impairments.constraints import join_guarantee
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.trigger.periodic_trigger import PeriodicSettings
-from noack.trigger.trigger_policy import CodedPolicy
+from noack.trigger.trigger_rule import CodedPolicy
 
 
 class Demand(NamedTuple):
@@ -174,7 +173,7 @@ def _link_loads(stages: Sequence[_Stage], flow: Flow, path: str) -> list[LinkLoa
 
 def _window(direction: DirectionSection) -> LossWindow:
     link = direction.link
-    windows = guarantee_of(link.mansd, link.constraints).windows
+    windows = join_guarantee(link.mansd, link.constraints).windows
     return min(windows, key=lambda one: one.losses / one.packets, default=LossWindow(1, 1))
 
 

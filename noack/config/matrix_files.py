@@ -1,23 +1,30 @@
-"""Matrices from files: NumPy's ``.npz``, and ``.mat`` up to MATLAB's v7.
+"""Matrices from files (``.npz``, and ``.mat`` up to MATLAB's v7), and from state-space objects.
 
-A file has a system ẋ = A x + B u and, optionally, the gain K of u = K x. If a file has a complete
-state-space model, C must be the identity, D zero and the time continuous, because the loop measures
-x.
+A file has a system ẋ = A x + B u and, optionally, the gain K of u = K x. An object is a
+``control.StateSpace``, a ``scipy.signal.StateSpace``, or a tuple (A, B, C, D) or (A, B). In a
+complete state-space model C must be the identity, D zero and the time continuous, because the loop
+measures x. The loop's input is u = K x, but ``control.lqr`` and ``scipy.signal.place_poles`` return
+the gain of u = -K x.
 """
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from noack.config.mat_file import matrices_as_npz
+from noack.config.sections import ModelSection, instability
+from noack.config.toml_file import brief
+from noack.core.errors import CallerError
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.named_file import NamedFile
+from noack.settings.section import require_shape, rows_of
+from noack.settings.user_files import NamedFile
 
 NPZ, MAT = ".npz", ".mat"
 GAIN = "gain"
@@ -198,3 +205,97 @@ def _missing(name: str, arrays: Mapping[str, Any]) -> str:
     listed = ", ".join(list(arrays)[:10]) or "none"
     most = f"{MAX_DIMENSION} x {MAX_DIMENSION}"
     return f"has no matrix {name} of numbers, at most {most}; it has {listed}"
+
+
+def model_of(
+    system: Any,
+    gain: Any,
+    *,
+    state_names: Sequence[str] | None = None,
+    input_names: Sequence[str] | None = None,
+) -> ModelSection:
+    """Return the model section of a scenario for a system and the gain K of u = K x, (m, n).
+
+    The names are for plots; by default they are those in a python-control object, if it has any.
+
+    Raises:
+        CallerError: the object is not such a system; the shapes do not fit; or u = K x does not
+            stabilise it.
+    """
+    states = state_names or _labels(system, "state_labels")
+    inputs = input_names or _labels(system, "input_labels")
+    matrices = matrices_of(system, gain)
+    try:
+        return ModelSection(
+            A=rows_of(matrices["A"]),
+            B=rows_of(matrices["B"]),
+            gain=rows_of(matrices[GAIN]),
+            state_names=None if states is None else tuple(states),
+            input_names=None if inputs is None else tuple(inputs),
+        )
+    except ValidationError as error:
+        raise CallerError(f"the system: {brief(error)}") from None
+
+
+def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
+    """Write an ``.npz`` or ``.mat`` file for ``model.file`` or ``plant.file`` of a scenario.
+
+    Without the gain K of u = K x, (m, n), the scenario must give it. Raise CallerError as
+    :func:`model_of` does, and if the file cannot be written.
+    """
+    try:
+        write_matrices(Path(path), matrices_of(system, gain))
+    except (OSError, ValueError) as error:
+        raise CallerError(f"{path}: cannot be written: {error}") from None
+
+
+def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
+    """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
+
+    Arguments and errors are those of :func:`model_of`.
+    """
+    if isinstance(system, tuple):
+        if len(system) not in (2, 4):
+            raise CallerError(f"the system: a tuple of {len(system)}; give (A, B) or (A, B, C, D)")
+        A, B, C, D = (*system, None, None)[:4]
+        dt = None
+    else:
+        missing = [key for key in ("A", "B", "C", "D") if not hasattr(system, key)]
+        if missing:
+            raise CallerError(
+                f"the system: an object of type {type(system).__name__} has no {missing[0]}; "
+                "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
+            )
+        A, B, C, D, dt = system.A, system.B, system.C, system.D, getattr(system, "dt", None)
+    found = {"A": _numbers_of("A", A), "B": _numbers_of("B", B)}
+    n, m = found["B"].shape
+    try:
+        require_shape(rows_of(found["A"]), "A", (n, n), "B has a row for each state")
+        if gain is not None:
+            found[GAIN] = _numbers_of(GAIN, gain)
+            require_shape(rows_of(found[GAIN]), GAIN, (m, n), "a row per input, a column per state")
+    except ValueError as error:
+        raise CallerError(f"the system: {error}") from None
+    if (why := unfit(C, D, dt, n)) is not None:
+        raise CallerError(f"the system: {why}")
+    if gain is not None and (why := instability(found["A"], found["B"], found[GAIN])) is not None:
+        raise CallerError(f"gain: {why}")
+    return found
+
+
+def _numbers_of(name: str, value: Any) -> Matrix:
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CallerError(f"{name}: is not a matrix of real numbers") from None
+    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+        raise CallerError(
+            f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]"
+        )
+    return found
+
+
+def _labels(system: Any, key: str) -> Sequence[str] | None:
+    """Return the names that the user chose; None for the default names of python-control."""
+    labels = getattr(system, key, None)
+    return None if not labels or any("[" in label for label in labels) else labels

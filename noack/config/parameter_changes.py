@@ -24,8 +24,8 @@ from noack.config.runtime_parameters import (
     trigger_parameters,
 )
 from noack.config.scenario import Scenario
-from noack.config.scenario_changes import content_with_settings, with_settings
-from noack.config.sections.plant_section import PlantSection
+from noack.config.scenario_checks import content_with_settings, with_settings
+from noack.config.sections import PlantSection
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -190,6 +190,16 @@ class ChangeSchedule:
         nothing, if the scenario would be invalid.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
+        self._all = self._with(change, since_ns)
+        self._update_next()
+        return announcement_outputs(table, change, number, now_ns, since_ns)
+
+    def check(self, change: ParameterChange, reached_ns: int) -> None:
+        """Raise CallerError if the scenario would be invalid after a change; announce nothing."""
+        self._with(change, max(change.t_ns, reached_ns + 1))
+
+    def _with(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters]:
+        """Return the scenarios with a change that is in force from a time on."""
         entry = AppliedParameters(
             since_ns, change.number, change.settings, self._all[0].scenario, None
         )
@@ -203,9 +213,7 @@ class ChangeSchedule:
                 self._results[numbers] = scenario, self._prepare(scenario)
             scenario, prepared = self._results[numbers]
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
-        self._all = every
-        self._update_next()
-        return announcement_outputs(table, change, number, now_ns, since_ns)
+        return every
 
     def take(self, t_ns: int) -> AppliedParameters | None:
         """Return the next scenario that is due at a time and not yet applied, or None."""

@@ -1,24 +1,30 @@
 """From a scenario to a run: named models become matrices, random draws become numbers.
 
 The result is again a scenario: the resolved scenario. Running it repeats the run's draws exactly.
+What follows from it is here, too: matrices, the trigger's policy, the tables of its record, and the
+noise of its plant and of its observer's model.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from noack.config.feature_kinds import AnyObserver
-from noack.config.loops import loop_scenario, loop_sections, loops_by_entry, loops_of
 from noack.config.named_models import NAMED_MODELS
-from noack.config.scenario import Scenario
-from noack.config.sections.model_section import ModelSection
-from noack.config.setpoint import input_at
+from noack.config.scenario import (
+    Scenario,
+    loop_scenario,
+    loop_sections,
+    loops_by_entry,
+    loops_of,
+)
+from noack.config.scenario_checks import input_at
+from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
-from noack.observers.observability import unobservable_mode
+from noack.observers.observer_settings import EstimationModel, unobservable_mode
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
     LOOP,
@@ -28,9 +34,9 @@ from noack.protocol.record_tables import (
     largest,
     tables,
 )
-from noack.settings.matrices import rows_of
+from noack.settings.section import rows_of
 from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 _SURELY_FINITE = 600.0
 """‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is finite; above this limit, the exponential itself is
@@ -84,6 +90,40 @@ def resolve(scenario: Scenario) -> Scenario:
     return _resolved(loops)[0]
 
 
+def resolve_run(scenario: Scenario) -> Scenario:
+    """Return the scenario of a run as its directory has it; running it repeats the run's draws.
+
+    A scenario without [[loops]] is resolved. In an entry of [[loops]], the model and the observer
+    become numbers; the draws of its loops follow from the seeds.
+
+    Raises:
+        CallerError: as :func:`resolve`.
+    """
+    resolved = resolved_loops(scenario)
+    if not scenario.loops:
+        return resolved[0]
+    sections, first = [], 0
+    for section in scenario.loops:
+        loop, first = resolved[first], first + section.count
+        tables = {"model": loop.model, "observer": loop.observer}
+        update = {
+            part: table.model_dump(mode="json", exclude_none=True)
+            for part, table in tables.items()
+            if table is not None
+        }
+        sections.append(section.model_copy(update=update))
+    return scenario.model_copy(update={"loops": tuple(sections)})
+
+
+def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
+    """Return the resolved scenario of each loop of a run.
+
+    Raises:
+        CallerError: as :func:`resolve`.
+    """
+    return tuple(loop for loops in loops_by_entry(scenario) for loop in _resolved(loops))
+
+
 def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     """Return the resolved scenarios of loops that differ in their names and seeds only."""
     scenario = loops[0]
@@ -123,38 +163,79 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     return [loop.model_copy(update={"observer": observer}) for loop in found]
 
 
-def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the resolved scenario of each loop of a run.
-
-    Raises:
-        CallerError: as :func:`resolve`.
-    """
-    return tuple(loop for loops in loops_by_entry(scenario) for loop in _resolved(loops))
-
-
-def resolve_run(scenario: Scenario) -> Scenario:
-    """Return the scenario of a run as its directory has it; running it repeats the run's draws.
-
-    A scenario without [[loops]] is resolved. In an entry of [[loops]], the model and the observer
-    become numbers; the draws of its loops follow from the seeds.
-
-    Raises:
-        CallerError: as :func:`resolve`.
-    """
-    resolved = resolved_loops(scenario)
-    if not scenario.loops:
-        return resolved[0]
-    sections, first = [], 0
-    for section in scenario.loops:
-        loop, first = resolved[first], first + section.count
-        tables = {"model": loop.model, "observer": loop.observer}
-        update = {
-            part: table.model_dump(mode="json", exclude_none=True)
-            for part, table in tables.items()
-            if table is not None
+def _explicit_model(model: ModelSection) -> ModelSection:
+    if model.name is not None:
+        named = NAMED_MODELS[model.name](model.parameters)
+        return ModelSection(
+            A=rows_of(named.A),
+            B=rows_of(named.B),
+            gain=model.gain or rows_of(named.K),
+            state_names=model.state_names or named.state_names,
+            input_names=model.input_names or named.input_names,
+            allow_unstable=model.allow_unstable,
+        )
+    n, m = np.array(model.B).shape
+    return model.model_copy(
+        update={
+            "state_names": model.state_names or entry_names("x", n),
+            "input_names": model.input_names or entry_names("u", m),
         }
-        sections.append(section.model_copy(update=update))
-    return scenario.model_copy(update={"loops": tuple(sections)})
+    )
+
+
+def _perturbation(
+    rng: "np.random.Generator",
+    draw: Literal["uniform", "vertex"],
+    halfwidth: tuple[tuple[float, ...], ...] | None,
+    shape: tuple[int, int],
+) -> Matrix:
+    # One draw per entry of the matrix: a change of one entry's interval leaves the other draws
+    # unchanged.
+    unit = rng.uniform(-1.0, 1.0, shape)
+    if draw == "vertex":
+        unit = np.where(unit < 0, -1.0, 1.0)
+    return np.zeros(shape) if halfwidth is None else np.array(halfwidth) * unit
+
+
+def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
+    """Return the observer with its gain; refuse it if an unstable mode is unobservable."""
+    observer = scenario.observer
+    if observer is None:
+        return None
+    A, n = np.array(model.A), len(model.A or ())
+    given = scenario.plant.measurement.C
+    C = np.eye(n) if given is None else np.array(given)
+    period_ns = scenario.timing.measurement_period_ns
+    with np.errstate(all="ignore"):
+        step = transition(A, period_ns)
+    if not np.isfinite(step).all():
+        raise CallerError(
+            "model.A: e^(AT) is not finite, T being the time between measurements; check its size"
+        )
+    if (mode := unobservable_mode(step, C)) is not None:
+        rate_per_s = np.log(mode) / (period_ns * 1e-9)
+        rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
+        raise CallerError(
+            f"plant.measurement.C: the model's mode e^({rate} t) does not decay and does not "
+            "appear in what is measured; no observer can estimate it"
+        )
+    return observer.resolved(step, C, period_ns)
+
+
+def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
+    with np.errstate(all="ignore"):
+        if np.linalg.norm(A, 1) * step_ns * 1e-9 < _SURELY_FINITE and np.isfinite(B).all():
+            return
+        try:
+            finite = all(np.isfinite(block).all() for block in discretise(A, B, step_ns))
+        except ValueError:  # scipy raises it for infinite entries
+            finite = False
+    if not finite:
+        sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
+        raise CallerError(
+            f"{key}: these matrices take one step to infinity, with entries of {sizes}; "
+            "check their units"
+        )
 
 
 def loop_of(resolved: Scenario) -> LoopMatrices:
@@ -235,18 +316,6 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     }
 
 
-def require_equal_sizes(scenario: Scenario) -> None:
-    """Raise CallerError if the vectors of a live run's loops have different sizes."""
-    first, *others = (shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario))
-    for place, one in enumerate(others, 1):
-        if one != first:
-            raise CallerError(
-                f"loops.{place}: its vectors have other sizes than those of loops.0; the loops of "
-                "a live run have the same numbers of states, inputs and outputs (`noack simulate` "
-                "allows different ones)"
-            )
-
-
 def has_loop(table: str) -> bool:
     """Whether each row of a table in the record of a run has the number of its loop."""
     return OWNER[table] != "netem" and table not in CLOCK_TABLES
@@ -257,76 +326,60 @@ def is_of_network(table: str) -> bool:
     return OWNER[table] == "netem" and table not in CLOCK_TABLES
 
 
-def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
-    """Return the observer with its gain; refuse it if an unstable mode is unobservable."""
-    observer = scenario.observer
-    if observer is None:
-        return None
-    A, n = np.array(model.A), len(model.A or ())
-    given = scenario.plant.measurement.C
-    C = np.eye(n) if given is None else np.array(given)
-    period_ns = scenario.timing.measurement_period_ns
-    with np.errstate(all="ignore"):
-        step = transition(A, period_ns)
-    if not np.isfinite(step).all():
-        raise CallerError(
-            "model.A: e^(AT) is not finite, T being the time between measurements; check its size"
-        )
-    if (mode := unobservable_mode(step, C)) is not None:
-        rate_per_s = np.log(mode) / (period_ns * 1e-9)
-        rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
-        raise CallerError(
-            f"plant.measurement.C: the model's mode e^({rate} t) does not decay and does not "
-            "appear in what is measured; no observer can estimate it"
-        )
-    return observer.resolved(step, C, period_ns)
+class SteadyState(NamedTuple):
+    """The estimation error in the steady state, if the plant equals the model."""
+
+    gain: Matrix  # the observer's gain, (n, p)
+    radius: float
+    """Spectral radius of (I − L C)Â^(T), the factor by which the error shrinks per measurement;
+    infinite if no steady state is found."""
+    covariance: Matrix
+    """Covariance of x̂ − x right after a measurement, (n, n), caused by random disturbances and
+    noise only; infinite if the error does not decay."""
 
 
-def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
-    with np.errstate(all="ignore"):
-        if np.linalg.norm(A, 1) * step_ns * 1e-9 < _SURELY_FINITE and np.isfinite(B).all():
-            return
-        try:
-            finite = all(np.isfinite(block).all() for block in discretise(A, B, step_ns))
-        except ValueError:  # scipy raises it for infinite entries
-            finite = False
-    if not finite:
-        sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
-        raise CallerError(
-            f"{key}: these matrices take one step to infinity, with entries of {sizes}; "
-            "check their units"
-        )
-
-
-def _explicit_model(model: ModelSection) -> ModelSection:
-    if model.name is not None:
-        named = NAMED_MODELS[model.name](model.parameters)
-        return ModelSection(
-            A=rows_of(named.A),
-            B=rows_of(named.B),
-            gain=model.gain or rows_of(named.K),
-            state_names=model.state_names or named.state_names,
-            input_names=model.input_names or named.input_names,
-            allow_unstable=model.allow_unstable,
-        )
-    n, m = np.array(model.B).shape
-    return model.model_copy(
-        update={
-            "state_names": model.state_names or entry_names("x", n),
-            "input_names": model.input_names or entry_names("u", m),
-        }
+def true_model(resolved: Scenario) -> EstimationModel:
+    """The model with the covariances of the scenario's disturbances and noise."""
+    loop, plant = loop_of(resolved), resolved.plant
+    noise = plant.noise_variances(loop.n, loop.m)
+    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
+    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
+    C = np.eye(loop.n) if plant.measurement.C is None else np.array(plant.measurement.C)
+    model = EstimationModel(
+        Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every
     )
+    return model._replace(Q=model.process_covariance(noise.at_state, noise.at_input))
 
 
-def _perturbation(
-    rng: "np.random.Generator",
-    draw: Literal["uniform", "vertex"],
-    halfwidth: tuple[tuple[float, ...], ...] | None,
-    shape: tuple[int, int],
-) -> Matrix:
-    # One draw per entry of the matrix: a change of one entry's interval leaves the other draws
-    # unchanged.
-    unit = rng.uniform(-1.0, 1.0, shape)
-    if draw == "vertex":
-        unit = np.where(unit < 0, -1.0, 1.0)
-    return np.zeros(shape) if halfwidth is None else np.array(halfwidth) * unit
+def assumed_model(resolved: Scenario) -> EstimationModel:
+    """The model with the covariances that the observer assumes."""
+    model, observer = true_model(resolved), resolved.observer
+    if observer is None:
+        return model
+    noise = resolved.plant.noise_variances(*resolved.model.dimensions)
+    return observer.assumed_model(model, noise)
+
+
+def steady_state(resolved: Scenario) -> SteadyState:
+    """Return the steady state of the estimation error of a resolved scenario.
+
+    The covariance P solves P = F P Fᵀ + (I − LC) Q (I − LC)ᵀ + L R Lᵀ with F = (I − LC)Â^(T). Q and
+    R are the scenario's own, even if the observer assumes others. Without an observer x̂ = y, L =
+    I.
+    """
+    # Imported here: a sensor without an observer does not need this large module.
+    from scipy.linalg import solve_discrete_lyapunov
+
+    true, observer = true_model(resolved), resolved.observer
+    A, Q = true.between_measurements()
+    n, C = len(A), true.C
+    L = np.eye(n) if observer is None else observer.steady_gain(assumed_model(resolved))
+    if L is None:
+        return SteadyState(np.full((n, len(C)), np.nan), np.inf, np.full((n, n), np.inf))
+    rest = np.eye(n) - L @ C
+    radius = float(np.abs(np.linalg.eigvals(rest @ A)).max())
+    if radius >= 1:
+        return SteadyState(L, radius, np.full((n, n), np.inf))
+    added = rest @ Q @ rest.T + L @ true.R @ L.T
+    covariance = np.asarray(solve_discrete_lyapunov(rest @ A, added), dtype=np.float64)
+    return SteadyState(L, radius, covariance)

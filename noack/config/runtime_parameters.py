@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import NoneType
 from typing import Any, get_args
 
-from noack.config.validation_messages import nearest_key
+from noack.config.toml_file import nearest_key
 from noack.trigger.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"

@@ -1,138 +1,32 @@
-"""The scenario: everything that defines a run, validated into frozen objects.
+"""The scenario: everything that defines a run, validated into frozen objects; and its loops.
 
-A scenario file is TOML; every key is documented here and in the exported JSON Schema. Unknown keys
-are errors. :mod:`noack.config.resolution` replaces names and random draws by numbers.
+A scenario file is TOML; every key is documented in its table, and in the exported JSON Schema.
+Unknown keys are errors. :mod:`noack.config.resolution` replaces names and random draws by numbers.
+
+A run has one or more loops on one network, each an ordinary scenario. The number of a loop is its
+place in :func:`loops_of`. A loop begins at its phase: its time 0 is that time of the run.
 """
 
-from typing import Annotated, Any, Literal, Self
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any, Self
 
-from pydantic import Field, FiniteFloat, model_validator
+import numpy as np
+from pydantic import BaseModel, ValidationError, create_model, model_validator
 
-from noack.config.feature_kinds import AnyController, AnyObserver, AnyTrigger
-from noack.config.loops import check_loops
-from noack.config.message_sizes import MessageSizes
-from noack.config.scenario_changes import check_changes
-from noack.config.scenario_checks import check_sections
-from noack.config.sections.loop_section import NAME_PATTERN, LoopSection
-from noack.config.sections.model_section import ModelSection
-from noack.config.sections.network_section import NetworkSection
-from noack.config.sections.plant_section import PlantSection
-from noack.config.sections.run_sections import (
-    CertificateSection,
-    ClocksSection,
-    PortsSection,
-    RealtimeSection,
-    RecoverySection,
-    ScheduledChange,
-    SeedsSection,
-)
-from noack.config.theory_coverage import TheoryCoverage
-from noack.config.timing import Timing
-from noack.controllers.linear_feedback import LinearFeedbackSettings
-from noack.core.errors import CallerError
-from noack.core.row_display import as_html, as_text
-from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
+from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
+from noack.config.scenario_checks import check_changes, check_sections
+from noack.config.scenario_tables import ScenarioTables
+from noack.config.toml_file import explain
+from noack.core.clock import NS_PER_S
+from noack.core.random_streams import named_stream_keys, stream
 from noack.settings.section import ScenarioSection
-from noack.trigger.decaying import DecayingSettings
-
-MOST_CHANGES = 256  # largest number of scheduled changes in a run
+from noack.trigger.periodic_trigger import PeriodicSettings
 
 
-class Scenario(ScenarioSection):
+class Scenario(ScenarioTables):
     """A run of the loop, completely described."""
-
-    name: Annotated[str, Field(pattern=NAME_PATTERN)]
-    """Names the run's directory: letters, digits, _ and -."""
-    description: str = ""
-    """What the scenario shows."""
-    mode: Literal["model", "zoh"] = "model"
-    """model: x_s and x_c follow Â + B̂K between updates; zoh: they hold the last update."""
-    horizon_s: Annotated[FiniteFloat, Field(gt=0, le=1e7)]
-    """Simulated length of the run."""
-    speed: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 1.0
-    """Simulated time per wall time."""
-    start_within_s: Annotated[FiniteFloat, Field(gt=0, le=86_400)] | None = None
-    """The run ends if its processes are not ready within this wall time, which grows with the
-    system's load, up to 20 times. By default 30, and unlimited if people start processes."""
-    model: ModelSection
-    plant: PlantSection
-    trigger: AnyTrigger
-    """When the sensor transmits."""
-    observer: AnyObserver | None = None
-    """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
-    the measurement must be the state."""
-    network: NetworkSection
-    controller: AnyController = LinearFeedbackSettings()
-    certificate: CertificateSection = CertificateSection()
-    clocks: ClocksSection | None = None
-    """The clocks of a run on several hosts. Without it, claims assume one clock."""
-    recovery: RecoverySection = RecoverySection()
-    changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
-    """Changes of settings during the run, in the order of time."""
-    loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None
-    """The loops on the network, if there are several."""
-    seeds: SeedsSection = SeedsSection()
-    ports: PortsSection = PortsSection()
-    realtime: RealtimeSection = RealtimeSection()
-
-    def _rows(self) -> list[tuple[str, str]]:
-        n, m = self.model.dimensions
-        rows = [
-            ("scenario", self.name + (f": {self.description}" if self.description else "")),
-            ("mode", "model-based" if self.mode == "model" else "zero-order hold"),
-            ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
-            ("trigger", _said(self.trigger, "policy")),
-            ("network", f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
-            ("horizon", f"{self.horizon_s:g} s"),
-        ]
-        if self.loops:
-            loops = (
-                one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
-            )
-            rows.append(("loops", ", ".join(loops)))
-        return rows
-
-    def __str__(self) -> str:
-        """The most important settings, in a few lines."""
-        return as_text(self._rows())
-
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """Show the same text in IPython."""
-        printer.text(str(self))
-
-    def _repr_html_(self) -> str:
-        """Show the same as a table in notebooks."""
-        return as_html(self._rows())
-
-    @property
-    def timing(self) -> Timing:
-        """Periods, phases and timeouts."""
-        return Timing(self)
-
-    @property
-    def message_sizes(self) -> MessageSizes:
-        """The number of vector entries in its messages."""
-        return MessageSizes(self)
-
-    @property
-    def coverage(self) -> TheoryCoverage:
-        """The parts of the theory that apply to it."""
-        return TheoryCoverage(self)
-
-    @property
-    def decaying(self) -> DecayingSettings:
-        """Return the trigger, if it is the paper's; raise CallerError for another policy."""
-        if not isinstance(self.trigger, DecayingSettings):
-            raise CallerError(
-                f'trigger.policy: needs the paper\'s trigger, "decaying"; '
-                f'this scenario has "{self.trigger.policy}"'
-            )
-        return self.trigger
-
-    @property
-    def protocol(self) -> LoopProtocol:
-        """The settings that depend on whether updates are acknowledged."""
-        return PROTOCOLS[self.network.protocol]
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -142,11 +36,182 @@ class Scenario(ScenarioSection):
         return self
 
 
-def _said(section: ScenarioSection, kind: str) -> str:
-    """Describe a section by its kind, and its values that differ from the defaults."""
-    given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
-    values = (
-        f"{key} = {'…' if isinstance(value, dict | list) else value}"
-        for key, value in given.items()
-    )
-    return ", ".join((getattr(section, kind), *values))
+PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
+"""Keys of a scenario that each loop has for itself."""
+_KINDS: Mapping[str, tuple[str, ...]] = {
+    "model": ("name", "A", "file"),
+    "plant": (),
+    "trigger": ("policy",),
+    "observer": ("kind",),
+    "controller": ("kind",),
+}
+"""The tables of a loop, each with the keys that make it replace the table of the top level."""
+_DRAWN = ("plant", "initial_state", "disturbance", "noise")
+"""The seeds that each loop has of its own."""
+
+
+def loop_sections(scenario: Scenario) -> tuple[LoopSection, ...]:
+    """Return the entries of [[loops]]; a scenario without has one, which changes nothing."""
+    return scenario.loops or (LoopSection(name=scenario.name),)
+
+
+def loop_names(scenario: Scenario) -> list[str]:
+    """Return the names of the loops, in the order of their numbers."""
+    return [name for section in loop_sections(scenario) for name in section.names]
+
+
+def loops_of(scenario: Scenario) -> tuple[Scenario, ...]:
+    """Return one scenario per loop, not yet resolved.
+
+    The first loop has the seeds of the run; those of the others are drawn from these and the loop's
+    number. So a run with one entry of [[loops]] computes what the run without it does.
+    """
+    return tuple(loop for loops in loops_by_entry(scenario) for loop in loops)
+
+
+def loops_by_entry(scenario: Scenario) -> list[list[Scenario]]:
+    """Return the loops of each entry of [[loops]]; they differ in their names and seeds only."""
+    sections = loop_sections(scenario)
+    seeds = iter(_seeds(scenario, sections))
+    return [
+        [entry.model_copy(update={"name": name, "seeds": next(seeds)}) for name in section.names]
+        for section in sections
+        for entry in [loop_scenario(scenario, section)]
+    ]
+
+
+def phases_ns(scenario: Scenario) -> tuple[int, ...]:
+    """Return when each loop begins: the time of the run at which the time of the loop is 0."""
+    sections, phases = loop_sections(scenario), list[int]()
+    is_drawn = any(section.phase is None for section in sections)
+    seeds = _seeds(scenario, sections, ("initial_state",)) if is_drawn else []
+    for section in sections:
+        period_ns = _period_ns(loop_scenario(scenario, section))
+        for number in range(len(phases), len(phases) + section.count):
+            phase = section.phase
+            if phase is None:
+                seed = seeds[number].initial_state
+                phase = float(stream(seed, "phase", str(number)).uniform()) if number else 0.0
+            phases.append(int(phase * period_ns))
+    return tuple(phases)
+
+
+def with_loop_tables(
+    scenario: Scenario, change: Callable[[str, Scenario], Mapping[str, BaseModel]]
+) -> Scenario:
+    """Return a scenario with other tables in the entries of [[loops]].
+
+    ``change`` gets the place of an entry, e.g. ``loops.0``, and the scenario of its loops. It
+    returns the new tables by their places, e.g. ``plant.system``; only those of tables that the
+    entry sets itself, or that its scenario file has, are used.
+    """
+    sections = []
+    for place, section in enumerate(scenario.loops or ()):
+        update: dict[str, Any] = {}
+        changed = change(f"loops.{place}", loop_scenario(scenario, section))
+        for path, table in changed.items():
+            part, _, inner = path.partition(".")
+            content = table.model_dump(mode="json", exclude_none=True)
+            if (own := getattr(section, part)) is not None and (not inner or inner in own):
+                update[part] = own | {inner: content} if inner else content
+            elif part in (file := update.get("scenario", section.scenario) or {}):
+                own = file[part] | {inner: content} if inner else content
+                update["scenario"] = file | {part: own}
+        sections.append(section.model_copy(update=update))
+    return scenario.model_copy(update={"loops": tuple(sections) or None})
+
+
+def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
+    """Return the scenario of an entry of [[loops]], with the seeds of the run.
+
+    Raises:
+        ValueError: it is not valid; the message begins with the key within the entry.
+    """
+    loop = scenario.model_copy(update={"loops": None})
+    if isinstance(section.scenario, str):
+        raise ValueError("scenario: it is read where a scenario file is loaded; give tables here")
+    if section.scenario is not None:
+        loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
+    content: dict[str, Any] = {} if section.mode is None else {"mode": section.mode}
+    for part, kinds in _KINDS.items():
+        if (given := getattr(section, part)) is None:
+            continue
+        own = getattr(loop, part)
+        template = {} if own is None else own.model_dump(mode="json", exclude_none=True)
+        content[part] = given if any(kind in given for kind in kinds) else template | given
+    if content:
+        loop = _with_parts(loop, content, content)
+    if content or section.scenario is not None:
+        check_sections(loop)
+        check_changes(loop)
+    return loop
+
+
+def _with_parts(
+    scenario: Scenario, content: Mapping[str, Any], parts: Iterable[str], place: str = ""
+) -> Scenario:
+    """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
+    model = _parts_model(frozenset(parts))
+    try:
+        found = model.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise ValueError(place + explain(error, "", model)[0].removeprefix(": ")) from None
+    return scenario.model_copy(update={part: getattr(found, part) for part in parts})
+
+
+def check_loops(scenario: Scenario) -> None:
+    """Raise ValueError unless the loops can run together; the message begins with the key."""
+    names: dict[str, int] = {}
+    for place, section in enumerate(scenario.loops or ()):
+        try:
+            loop_scenario(scenario, section)
+        except ValueError as error:
+            raise ValueError(f"loops.{place}.{error}") from None
+        for name in section.names:
+            if name in names:
+                raise ValueError(
+                    f"loops.{place}.name: the name {name} is already given by loops.{names[name]}"
+                )
+            names[name] = place
+        if len(names) > MOST_LOOPS:
+            raise ValueError(f"loops.{place}.count: a run has at most {MOST_LOOPS} loops")
+
+
+def _period_ns(loop: Scenario) -> int:
+    """Return the time between two transmissions of a periodic trigger, else two measurements."""
+    if isinstance(loop.trigger, PeriodicSettings):
+        return round(loop.trigger.period_s * NS_PER_S)
+    return loop.timing.measurement_period_ns
+
+
+def _seeds(
+    scenario: Scenario, sections: Sequence[LoopSection], drawn_names: Sequence[str] = _DRAWN
+) -> list[SeedsSection]:
+    """Return the seeds of each loop; those of the given names are the loop's own."""
+    seeds, count = scenario.seeds, sum(section.count for section in sections)
+    drawn: list[dict[str, int]] = [{}]
+    if count > 1:
+        names = [("loop", str(number), name) for number in range(1, count) for name in drawn_names]
+        keys = named_stream_keys([getattr(seeds, name) for *_, name in names], names)
+        low, high = keys.astype(np.uint64).T
+        bits = (low | high << np.uint64(32)) >> np.uint64(1)  # 63, the range of a TOML integer
+        by_loop = bits.reshape(-1, len(drawn_names)).tolist()
+        drawn += [dict(zip(drawn_names, values, strict=True)) for values in by_loop]
+    all_seeds: list[SeedsSection] = []
+    for section in sections:
+        given = section.seeds.model_dump(exclude_none=True)
+        own = drawn[len(all_seeds) : len(all_seeds) + section.count]
+        all_seeds += [seeds.model_copy(update=values | given) for values in own]
+    return all_seeds
+
+
+@cache
+def _parts_model(parts: frozenset[str]) -> type[ScenarioSection]:
+    """Return a model of some of a scenario's parts."""
+    fields: dict[str, Any] = {
+        name: (field.annotation, field)
+        for name, field in Scenario.model_fields.items()
+        if name in parts
+    }
+    model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioSection, **fields)
+    return model

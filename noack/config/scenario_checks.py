@@ -1,29 +1,61 @@
-"""Checks of a scenario that concern several of its sections."""
+"""Checks of a scenario that concern several of its tables, and changes of its runtime parameters.
 
-from typing import TYPE_CHECKING
+A change of settings during a run gives another scenario, to which the same checks apply.
+
+A set point is an equilibrium of the model, Âx_r + B̂u_r = 0. With u = K(x_c − x_r) + u_r both models
+follow dx/dt = H(x − x_r). All statements about x, x_s and x_c then hold for x − x_r, x_s − x_r and
+x_c − x_r, with a constant disturbance if the plant does not rest at x_r
+(:mod:`noack.theory.certificates.conditions`).
+"""
+
+import json
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from noack.config.setpoint import input_at
+from noack.config.runtime_parameters import (
+    CONSTRAINTS,
+    LOSS,
+    MANSD,
+    put_settings,
+    require_runtime_parameters,
+)
+from noack.config.scenario_tables import ScenarioTables
+from noack.config.sections import AnyController, AnyTrigger, NetworkSection
+from noack.config.toml_file import brief
 from noack.core.clock import NS_PER_S
-from noack.impairments.kept_loss import with_kept_loss
+from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.constraints import require_consistent
+from noack.impairments.link_settings import Constraints, Mansd, require_scores
+from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.matrices import require_length, require_shape
+from noack.settings.section import require_length, require_shape
 
-if TYPE_CHECKING:
-    from noack.config.scenario import Scenario
+S = TypeVar("S", bound=ScenarioTables)
+_AT_FIRST_USE = ConfigDict(defer_build=True)
+_CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
+    LOSS: TypeAdapter(Loss, config=_AT_FIRST_USE),
+    MANSD: TypeAdapter(Mansd, config=_AT_FIRST_USE),
+    CONSTRAINTS: TypeAdapter(Constraints, config=_AT_FIRST_USE),
+    "trigger": TypeAdapter(AnyTrigger, config=_AT_FIRST_USE),
+    "controller": TypeAdapter(AnyController, config=_AT_FIRST_USE),
+}
+"""The parts of a scenario that may change during a run."""
+_ROUNDING = 1e-9  # largest Âx_r + B̂u_r that is taken as 0, relative to the larger term
 
 
-def check_sections(scenario: "Scenario") -> None:
+def check_sections(scenario: ScenarioTables) -> None:
     """Raise ValueError if two sections do not fit together; the message begins with the key."""
     timing = scenario.timing
     if timing.horizon_ns < timing.plant_period_ns:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
         )
-    if scenario.clocks is not None and scenario.loops:
-        raise ValueError("clocks: not in a run of several loops")
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
@@ -34,7 +66,7 @@ def check_sections(scenario: "Scenario") -> None:
     check_kept_loss(scenario)
 
 
-def check_kept_loss(scenario: "Scenario") -> None:
+def check_kept_loss(scenario: ScenarioTables) -> None:
     """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
     network = scenario.network
     for key, section in network.directions.items():
@@ -48,13 +80,13 @@ def check_kept_loss(scenario: "Scenario") -> None:
             raise ValueError(f"{key}.loss: {error}") from None
 
 
-def check_trigger(scenario: "Scenario") -> None:
+def check_trigger(scenario: ScenarioTables) -> None:
     """Raise ValueError unless the trigger fits the model's dimensions and measurement period."""
     scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
     scenario.trigger.check_period(scenario.timing.measurement_period_ns)
 
 
-def check_setpoint(scenario: "Scenario") -> None:
+def check_setpoint(scenario: ScenarioTables) -> None:
     """Raise ValueError unless the model can rest at the set point and other settings allow one."""
     key, setpoint = "controller.setpoint", scenario.controller.setpoint
     require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
@@ -75,7 +107,37 @@ def check_setpoint(scenario: "Scenario") -> None:
         raise ValueError(f"{key}: {error}") from None
 
 
-def _check_plant(scenario: "Scenario") -> None:
+def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
+    """Return u_r, (m,), with which a model rests at x_r, (n,): the solution of smallest norm.
+
+    Raise ValueError, which names the nearest equilibrium, if it cannot rest there.
+    """
+    drift = A @ x_r
+    u_r = np.asarray(np.linalg.lstsq(B, -drift, rcond=None)[0], dtype=np.float64)
+    left = np.abs(drift + B @ u_r)
+    largest = max(float(np.abs(drift).max()), float(np.abs(A).max() * np.abs(x_r).max()))
+    if not x_r.any() or (np.isfinite(left).all() and left.max() <= _ROUNDING * largest):
+        return u_r
+    states = _equilibria(A, B)
+    if not states.shape[1]:
+        raise ValueError("no equilibrium of the model, which has none but 0: Âx + B̂u = 0")
+    nearest = states @ (states.T @ x_r)
+    shown = ", ".join(f"{value:.12g}" for value in np.where(np.abs(nearest) < 1e-12, 0.0, nearest))
+    raise ValueError(
+        f"no equilibrium of the model (Âx + B̂u = 0); those are a space of dimension "
+        f"{states.shape[1]}, and the nearest one is [{shown}]"
+    )
+
+
+def _equilibria(A: Matrix, B: Matrix) -> Matrix:
+    """Return an orthonormal basis of all x with Âx in the range of B̂, (n, k)."""
+    blocked = A - B @ (np.linalg.pinv(B) @ A)
+    _, sizes, directions = np.linalg.svd(blocked)
+    scale = max(float(np.abs(A).max()), np.finfo(float).tiny)
+    return np.ascontiguousarray(directions[(sizes > _ROUNDING * scale).sum() :].T)
+
+
+def _check_plant(scenario: ScenarioTables) -> None:
     (n, m), plant, why = scenario.model.dimensions, scenario.plant, _dimensions(scenario)
     require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), why)
     require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), why)
@@ -88,7 +150,7 @@ def _check_plant(scenario: "Scenario") -> None:
     plant.measurement.check(n, why)
 
 
-def _check_disturbances(scenario: "Scenario") -> None:
+def _check_disturbances(scenario: ScenarioTables) -> None:
     n, m = scenario.model.dimensions
     for number, one in enumerate(scenario.plant.disturbances):
         place = f"plant.disturbances.{number}"
@@ -100,7 +162,7 @@ def _check_disturbances(scenario: "Scenario") -> None:
         require_length(one.entries, f"{place}.{one.entries_key}", size, f'at = "{one.at}": {why}')
 
 
-def _check_observer(scenario: "Scenario") -> None:
+def _check_observer(scenario: ScenarioTables) -> None:
     (n, m), plant, observer = scenario.model.dimensions, scenario.plant, scenario.observer
     sizes = scenario.message_sizes
     if observer is None:
@@ -119,7 +181,7 @@ def _check_observer(scenario: "Scenario") -> None:
         )
 
 
-def _check_watchdog(scenario: "Scenario") -> None:
+def _check_watchdog(scenario: ScenarioTables) -> None:
     timing, (n, m) = scenario.timing, scenario.model.dimensions
     if timing.actuation_timeout_ns < timing.predicted_ns:
         several = "" if scenario.controller.predictions == 1 else " times controller.predictions"
@@ -152,6 +214,98 @@ def _check_watchdog(scenario: "Scenario") -> None:
     )
 
 
-def _dimensions(scenario: "Scenario") -> str:
+def _dimensions(scenario: ScenarioTables) -> str:
     n, m = scenario.model.dimensions
     return f"the model has {n} states and {m} inputs"
+
+
+def check_changes(scenario: ScenarioTables) -> None:
+    """Raise ValueError if a scheduled change is not possible, or the changes are not in order."""
+    for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
+        if other.at_s < one.at_s:
+            raise ValueError(f"changes.{place + 1}.at_s: earlier than the change before it")
+    changed = scenario
+    for place, change in enumerate(scenario.changes):
+        if change.at_ns >= scenario.timing.horizon_ns:
+            raise ValueError(f"changes.{place}.at_s: the run ends at {scenario.horizon_s:g} s")
+        try:
+            changed = with_settings(changed, change.set)
+        except ValidationError as error:
+            raise ValueError(f"changes.{place}.set: {brief(error)}") from None
+        except ValueError as error:
+            raise ValueError(f"changes.{place}.set: {error}") from None
+
+
+def prepare_changes() -> None:
+    """Build the validators of changes, which takes 20 ms, before a loop needs them."""
+    for part in _CHANGEABLE.values():
+        part.rebuild()
+
+
+def with_settings(scenario: S, settings: Mapping[str, Any]) -> S:
+    """Return a scenario with other values of its runtime parameters.
+
+    Only the parts that change are validated: the processes of a run do this in their loop. Raise
+    ValueError if a key is not a runtime parameter, or the scenario would be invalid.
+    """
+    if scenario.protocol.acknowledges:
+        raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
+    require_runtime_parameters(settings, scenario.trigger)
+    sections = {key.split(".")[0] for key in settings} - {"network"}
+    changes_loss = any(key.startswith(LOSS) for key in settings)
+    loss = scenario.network.loss
+    content: dict[str, Any] = {
+        name: getattr(scenario, name).model_dump(mode="json", exclude_none=True)
+        for name in sections
+    }
+    content["network"] = {
+        "loss": loss.model_dump(mode="json", exclude_none=True) if changes_loss else {}
+    }
+    put_settings(content, settings)
+    update: dict[str, Any] = {name: _validated(name, content[name]) for name in sections}
+    update["changes"] = ()
+    update["network"] = _changed_network(scenario, content["network"], changes_loss)
+    changed = scenario.model_copy(update=update)
+    if "trigger" in sections:
+        check_trigger(changed)
+    if "controller" in sections:
+        check_setpoint(changed)
+    if "network" in sections or any(key.startswith("network.") for key in settings):
+        check_kept_loss(changed)
+    return changed
+
+
+def content_with_settings(scenario: ScenarioTables, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a scenario's content with other values of its runtime parameters, unchecked.
+
+    Raise ValueError if a key is not a runtime parameter.
+    """
+    require_runtime_parameters(settings, scenario.trigger)
+    content = scenario.model_dump(mode="json", exclude_none=True, exclude={"changes"})
+    put_settings(content, settings)
+    return content
+
+
+def _changed_network(
+    scenario: ScenarioTables, content: Mapping[str, Any], changes_loss: bool
+) -> NetworkSection:
+    """Return the network with another cap or loss model; its other settings cannot change."""
+    update: dict[str, Any] = {}
+    if "mansd" in content:
+        update["mansd"] = _validated(MANSD, content["mansd"])
+    if "constraints" in content:
+        update["constraints"] = _validated(CONSTRAINTS, content["constraints"])
+        require_consistent(scenario.network.mansd, update["constraints"])
+    if changes_loss:
+        update["loss"] = _validated(LOSS, content["loss"])
+        if isinstance(update["loss"], TraceLoss):
+            raise ValueError(
+                "network.loss.model: a trace is read before a run begins; give its losses as "
+                '{ model = "scripted", lost = [...] }'
+            )
+        require_scores(scenario.network.impairments, update["loss"])
+    return scenario.network.model_copy(update=update)
+
+
+def _validated(part: str, content: Any) -> Any:
+    return _CHANGEABLE[part].validate_json(json.dumps(content))

@@ -1,17 +1,23 @@
-"""Settings files: a TOML file is read into a frozen model, with one line per mistake."""
+"""Settings files: a TOML file is read into a frozen model, with one line per mistake.
 
+A line is ``file: key = value: what is wrong; what is right``. The first half of this file reads and
+validates; the second half turns pydantic's errors into such lines, from :func:`explain` on.
+"""
+
+import difflib
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import date, time
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
-from noack.config.validation_messages import explain
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import read_regular
 from noack.settings.section import ScenarioSection
@@ -131,7 +137,7 @@ def _defined_twice(text: str, error: str) -> str | None:
     found = _TWICE.match(error)
     if found is None:
         return None
-    keys = _keys(text, int(found["line"] or text.count("\n") + 1))
+    keys = _keys_of_lines(text, int(found["line"] or text.count("\n") + 1))
     line, key = keys.pop()
     if (inner := found["inner"]) is not None:
         return f"line {line}: {shortened(f'{key}.{inner}')} is defined twice"
@@ -142,7 +148,7 @@ def _defined_twice(text: str, error: str) -> str | None:
     return f"line {line}: {shortened(key)} is {where}"
 
 
-def _keys(text: str, last: int) -> list[tuple[int, str]]:
+def _keys_of_lines(text: str, last: int) -> list[tuple[int, str]]:
     """Return line and full key of each key and table that begins in the lines up to the last."""
 
     def hidden(found: re.Match[str]) -> str:
@@ -174,3 +180,277 @@ def _unfit(value: object) -> None:
     if isinstance(value, date | time):
         raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
     raise TypeError(f"a value of type {type(value).__name__} is no value of a setting")
+
+
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
+    "or digit, at most 64",
+    r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, "
+    "at most 32",
+    r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
+    "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
+}
+_MOST_LINES = 50
+_SIMILAR = 0.8
+"""Least similarity of a suggested key, or of its last part, as difflib measures it."""
+_MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
+_LISTS = {
+    float: "should be a list of numbers, e.g. [1.0, 0.0]",
+    int: "should be a list of numbers, e.g. [1, 2]",
+    str: 'should be a list of names, e.g. ["a", "b"]',
+    tuple: _MATRIX,
+}
+"""By the type of the list's entries."""
+_PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
+
+
+def explain(error: ValidationError, source: str, root: type[ScenarioSection]) -> list[str]:
+    """Return one line per mistake, and one line for all mistakes beyond the first fifty.
+
+    ``source`` names the file; ``root`` is the model of the whole file.
+    """
+    mistakes = error.errors(include_url=False)
+    places = [mistake["loc"] for mistake in mistakes]
+    shown = [
+        printable(f"{source}: {_explain(mistake, root)}")
+        for mistake in mistakes[:_MOST_LINES]
+        if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
+    ]
+    more = len(mistakes) - _MOST_LINES
+    return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
+
+
+def nearest_key(key: str, known: Iterable[str]) -> str | None:
+    """Return the known key most similar to a key, as a whole or in its last part, if one is."""
+
+    def similarity(one: str) -> tuple[float, float]:
+        pairs = (key, one), (key.rpartition(".")[2], one.rpartition(".")[2])
+        whole, last = (difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+        return max(whole, last), whole
+
+    best = max(known, key=similarity, default="")
+    return best if similarity(best)[0] >= _SIMILAR else None
+
+
+def keys(section: type[BaseModel], prefix: str = "") -> list[str]:
+    """Return the keys of a settings file, each once; of a union of tables, the keys of all."""
+    return list(dict.fromkeys(_keys(section, prefix, ())))
+
+
+def _keys(
+    section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]
+) -> Iterator[str]:
+    for name, field in section.model_fields.items():
+        inner = [one for one in sections_of(field.annotation) if one not in within]
+        for one in inner:  # a trigger may contain another
+            yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
+        if not inner:
+            yield f"{prefix}{name}"
+
+
+def brief(error: ValidationError) -> str:
+    """Return the first mistake, ``key: what is wrong``, without the value, which may be secret."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return printable(f"{place}: {message}" if place else message)
+
+
+def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
+    """Whether an entry of this list is itself wrong, so that the list seems too short."""
+    return any(len(other) > len(place) and other[: len(place)] == place for other in places)
+
+
+def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
+    at = _locate(mistake["loc"], root)
+    key = shortened(".".join(map(str, at.path)))
+    value, kind = mistake["input"], mistake["type"]
+    shown = f"{key} = {show_value(value)}"
+    if kind == "missing":
+        return f"{key}: missing{_purpose(at.section, str(at.path[-1]))}"
+    if kind == "extra_forbidden":
+        return f"{shown}: unknown key; {_nearest(str(at.path[-1]), at.section)}"
+    if kind == "value_error":
+        return _own_check(key, value, str(mistake["ctx"]["error"]))
+    chosen = kind in ("union_tag_invalid", "union_tag_not_found")
+    if chosen and isinstance(value, Mapping):
+        return _choice(key, value, at)
+    if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{shown}: should be a table{_table_example(value, at)}"
+    if kind == "too_short":
+        least = mistake["ctx"]["min_length"]
+        return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
+    if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
+        return f"{shown}: {_PATTERNS[mistake['ctx']['pattern']]}"
+    if kind == "tuple_type":
+        return f"{shown}: {_LISTS.get(_entry_of(at), 'should be a list of tables')}"
+    message = mistake["msg"].replace("Input should", "should")
+    return f"{shown}: {message[0].lower() + message[1:]}{_share(value, at)}"
+
+
+class _Place(NamedTuple):
+    """The place of a mistake in a file."""
+
+    path: Sequence[Any]  # of the key
+    section: type[ScenarioSection] | None  # which contains the key
+    choices: Mapping[str, type[ScenarioSection]]  # possible tables, by the discriminator's value
+    discriminator: str  # the key that selects the table
+    kind: Any  # the annotation of the value
+
+
+def _locate(place: Sequence[Any], root: type[ScenarioSection]) -> _Place:
+    """Find a place; pydantic's path also has the names of selected tables, which are not keys."""
+    kind: Any = root
+    path: list[Any] = []
+    section: type[ScenarioSection] | None = None
+    alternatives = _choices(kind)
+    for part in place:
+        choices, _ = _choices(kind)
+        if part in choices:
+            kind = choices[part]
+            continue
+        path.append(part)
+        kind, section = _within(kind, part)
+        alternatives = _choices(kind)
+    return _Place(path, section, *alternatives, kind)
+
+
+def _within(kind: Any, part: Any) -> tuple[Any, type[ScenarioSection] | None]:
+    """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
+    section = _section_of(kind)
+    if section is not None:
+        field = section.model_fields.get(str(part))
+        return (None if field is None else field.annotation), section
+    entries = [entry for inner in _alternatives(kind) for entry in get_args(inner)]
+    return (entries[0] if isinstance(part, int) and entries else None), None
+
+
+def _entry_of(at: _Place) -> Any:
+    """Return the entry type of the expected list; for an entry of a row, ``tuple``."""
+    lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
+    if isinstance(at.path[-1], int) or not lists:
+        return tuple
+    entry = _alternatives(get_args(lists[0])[0])[0]
+    return get_origin(entry) or entry
+
+
+def _share(value: Any, at: _Place) -> str:
+    """Suggest a share if a percentage was given for a number that is at most 1."""
+    field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
+    limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
+    if not any(1 in (getattr(one, "le", None), getattr(one, "lt", None)) for one in limits):
+        return ""
+    percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
+    if percent is not None:
+        value = float(percent[1])
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return f"; {value:g} % is {value / 100:g}" if is_number and 1 < value <= 100 else ""
+
+
+def _metadata(kind: Any) -> list[Any]:
+    """Return the metadata of an annotation's alternatives, e.g. that they are at most 1."""
+    found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
+    return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """Return a value's possible types, without metadata: A and B for ``Annotated[A | B, ...]``."""
+    if get_origin(kind) is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return [inner for one in get_args(kind) for inner in _alternatives(one)]
+    return [kind]
+
+
+def sections_of(kind: Any) -> list[type[ScenarioSection]]:
+    """Return the tables that a value of an annotation may be."""
+    types = [one for one in _alternatives(kind) if isinstance(one, type)]
+    return [one for one in types if issubclass(one, ScenarioSection)]
+
+
+def _section_of(kind: Any) -> type[ScenarioSection] | None:
+    sections = sections_of(kind)
+    return sections[0] if len(sections) == 1 else None
+
+
+def _choices(kind: Any) -> tuple[Mapping[str, type[ScenarioSection]], str]:
+    """Return the possible tables of a value by their discriminator, and the discriminator."""
+    sections = sections_of(kind)
+    if len(sections) < 2:
+        return {}, ""
+    key = next(
+        name for name, field in sections[0].model_fields.items()
+        if get_origin(field.annotation) is Literal
+    )  # fmt: skip
+    return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
+
+
+def _own_check(key: str, value: Any, message: str) -> str:
+    """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
+    inner, colon, rest = message.partition(": ")
+    if not colon or not isinstance(value, Mapping):
+        shown = f" = {show_value(value)}" if isinstance(value, str) else ""
+        return f"{key}{shown}: {message}"
+    path = f"{key}.{inner}" if key else inner
+    for part in inner.split("."):
+        try:
+            value = value[int(part) if isinstance(value, list) else part]
+        except (KeyError, IndexError, ValueError, TypeError):
+            return f"{path}: {rest}"
+    return f"{path} = {show_value(value)}: {rest}"
+
+
+def _choice(key: str, value: Any, at: _Place) -> str:
+    known = ", ".join(at.choices)
+    key = f"{key}.{at.discriminator}"
+    if not isinstance(value, Mapping) or at.discriminator not in value:
+        return f"{key}: missing; one of {known}"
+    chosen = value[at.discriminator]
+    close = difflib.get_close_matches(str(chosen), at.choices, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"{key} = {show_value(chosen)}: must be one of {known}{hint}"
+
+
+def _table_example(value: Any, at: _Place) -> str:
+    """Return an example of the table: of the kind that the value names, or for a user's class."""
+    known = isinstance(value, str) and value in at.choices
+    if not known and "python" in at.choices and str(value).isidentifier():
+        file = f"my_{at.path[0]}.py"
+        return f', e.g. {{ {at.discriminator} = "python", file = "{file}", name = "{value}" }}'
+    if at.choices:
+        needed = {
+            choice: [name for name, field in settings.model_fields.items()
+                     if field.is_required() and name != at.discriminator]
+            for choice, settings in at.choices.items()
+        }  # fmt: skip
+        # The simplest that has settings shows how they are written.
+        chosen = str(value) if known else min(needed, key=lambda one: len(needed[one]) or 99)
+        keys = "".join(f", {name} = ..." for name in needed[chosen])
+        return f', e.g. {{ {at.discriminator} = "{chosen}"{keys} }}'
+    in_list = any(isinstance(part, int) for part in at.path)
+    return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
+
+
+def _purpose(section: type[ScenarioSection] | None, key: str) -> str:
+    field = section.model_fields.get(key) if section is not None else None
+    inner = _section_of(field.annotation) if field is not None else None
+    if inner is not None:
+        text = inner.__doc__ or ""
+    else:
+        text = section.key_descriptions().get(key, "") if section is not None else ""
+    purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
+    if purpose[1:2].islower() or purpose.startswith("A "):  # a word, not M or UDP
+        purpose = purpose[0].lower() + purpose[1:]
+    return f" ({purpose})" if purpose else ""
+
+
+def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
+    known = sorted(section.model_fields) if section is not None else []
+    close = difflib.get_close_matches(key, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"
+
+
+def show_value(value: Any) -> str:
+    """Return a value as JSON, cut off after 60 characters."""
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."

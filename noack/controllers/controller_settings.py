@@ -8,8 +8,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.matrices import Row
-from noack.settings.section import RateHz, ScenarioSection, require_whole_period
+from noack.settings.section import RateHz, Row, ScenarioSection, require_whole_period
 
 
 class ControlModel(NamedTuple):

@@ -17,6 +17,13 @@ PARTIAL = ".partial"
 _NOT_REGULAR = "not a regular file"
 
 
+def shipped_folder(name: str) -> Path:
+    """Return the folder of files that come with noack: in the package, or in the repository."""
+    root = Path(__file__).parents[2]
+    packaged = root / "cosim" / name
+    return packaged if packaged.is_dir() else root / name
+
+
 def require_suffix(path: Path, option: str, suffix: str) -> None:
     """Raise CallerError if the name of a file to be written, given by an option, ends otherwise."""
     if path.suffix != suffix:

@@ -16,9 +16,23 @@ from noack.core.matrix_exponential import exponential
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
+MatrixKey = tuple[tuple[int, ...], bytes]
+"""Shape and bits of a matrix, by which equal matrices are known."""
+
 _CACHED_STEPS = 4096
 _SAFE = 1e-140
 """Squares of vectors between this size and its inverse neither underflow nor overflow."""
+
+
+def matrix_key(matrix: Matrix) -> MatrixKey:
+    """Return the key of a matrix."""
+    return matrix.shape, matrix.tobytes()
+
+
+def matrix_of(key: MatrixKey) -> Matrix:
+    """Return the matrix of a key; it cannot be changed."""
+    shape, data = key
+    return np.frombuffer(data).reshape(shape)
 
 
 def transition(generator: Matrix, dt_ns: int) -> Matrix:
@@ -65,6 +79,20 @@ class Propagator:
         if dt_ns == 0 or self._static:
             return states
         return np.asarray(states @ self.transition(dt_ns).T)
+
+    def leaps(self, states: Matrix, counts: NDArray[np.int64], period_ns: int) -> Matrix:
+        """Return e^{G j dt} of each of k states, (k, n), after its own number j of periods, (k,).
+
+        A number of periods is followed bit by bit, so that a row does not depend on the others.
+        """
+        found = np.array(states)
+        if self._static:
+            return found
+        for bit in range(int(counts.max(initial=0)).bit_length()):
+            rows = np.flatnonzero(counts >> bit & 1)
+            leap, before = self.transition(period_ns << bit), found[rows]
+            found[rows] = sum(leap[:, i] * before[:, i, None] for i in range(found.shape[1]))
+        return found
 
 
 def norm(vector: Vector) -> float:

@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.settings.matrices import Row
-from noack.settings.section import ScenarioSection
+from noack.settings.section import Row, ScenarioSection
 
 Place = Literal["input", "state"]
 

@@ -8,7 +8,7 @@ from pydantic import model_validator
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import normals
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.matrices import Row, require_squares
+from noack.settings.section import Row, require_squares
 
 
 class GaussianDisturbance(DisturbanceSettings):

@@ -7,8 +7,7 @@ from pydantic import FiniteFloat
 
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.matrices import Row
-from noack.settings.section import Positive
+from noack.settings.section import Positive, Row
 
 
 class SineDisturbance(DisturbanceSettings):

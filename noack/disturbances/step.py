@@ -9,8 +9,7 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.matrices import Row
-from noack.settings.section import NonNegative
+from noack.settings.section import NonNegative, Row
 
 
 class StepDisturbance(DisturbanceSettings):

@@ -1,23 +1,49 @@
 """Base classes of a link's features: settings, behaviour, words, description, prediction.
 
 A feature is a loss model, a kind of impairment, a queue discipline, or a constraint on losses: one
-class in its own file, derived from one of the classes at the end.
+class in its own file, derived from one of the classes here. Below them is what several features
+share: random events with a correlation (:class:`CorrelatedChance`), and where in a trace a feature
+begins.
+
+A correlated event: the latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian
+process. The event happens to packet i if z_i exceeds the normal quantile of 1 − p, hence with
+probability p exactly, for every ρ.
 """
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
+from pydantic import Field, FiniteFloat
+
+from noack.core.clock import NS_PER_S
+from noack.core.core_library import core
+from noack.core.random_streams import uniform_pair
 from noack.impairments.loss_guarantee import LossRule
-from noack.impairments.markov_chain import Chain, Pattern
-from noack.impairments.word_reader import WordReader
-from noack.settings.section import ScenarioSection
+from noack.impairments.markov_chain import Chain, Pattern, chance_chain
+from noack.impairments.words import (
+    CORRELATION,
+    OWN_TIME_S,
+    PERCENT,
+    WordReader,
+    brief_percent,
+    percent_text,
+    time_text,
+)
+from noack.settings.section import Correlation, Probability, ScenarioSection
+from noack.settings.user_files import NamedFile
 
 T = TypeVar("T")
 Table = dict[str, Any]
 """A table of settings, before it is validated."""
+Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
+"""In seconds after the trace's first packet."""
+LONGEST_NS = 10**18
+"""Longest trace: 31 years."""
+TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
+"""What ``tc netem`` does differently."""
 
 
 class Word(NamedTuple):
@@ -204,3 +230,98 @@ class Impairment(StageFeature):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         """Return whether packets may be delayed, and reordered, after it; given both before it."""
         return delayed, reordered
+
+
+def read_chance(reader: WordReader) -> dict[str, float]:
+    """Read ``PERCENT [CORRELATION]``."""
+    table = {"probability": reader.value(PERCENT)}
+    if reader.number_follows():
+        table["correlation"] = reader.value(CORRELATION)
+    return table
+
+
+class CorrelatedChance(StageFeature):
+    """Settings of a feature that draws a correlated random event for each packet."""
+
+    probability: Probability
+    """Probability of the event."""
+    correlation: Correlation = 0.0
+    """Between successive packets."""
+
+    behaviour: ClassVar[str]
+    """See :class:`noack.impairments.feature.Stage`."""
+    action: ClassVar[str] = ""
+    """Its action as a Markov chain; see :class:`Chain`; empty: it does not change the loss rate."""
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        chances = ((0.0, 0.0), (0.1, 0.0), (0.5, 0.7), (0.9, 0.0), (1.0, 0.0))
+        return [cls(probability=p, correlation=correlation) for p, correlation in chances]
+
+    @property
+    def chance_text(self) -> str:
+        """The words that :func:`read_chance` reads."""
+        correlation = f" {percent_text(self.correlation)}" if self.correlation else ""
+        return percent_text(self.probability) + correlation
+
+    @property
+    def correlation_meaning(self) -> str:
+        """The explanation of the correlation."""
+        return f", correlation {brief_percent(self.correlation)}" if self.correlation else ""
+
+    def stage(self, tables: StageTables) -> Stage:
+        p = self.probability
+        certain = math.copysign(math.inf, 0.5 - p)
+        numbers = {
+            "probability": p,
+            "threshold": -core.noack_normal_score(p) if 0 < p < 1 else certain,
+            "correlation": self.correlation,
+            "innovation": math.sqrt(1 - self.correlation**2),
+            "gap": 1,
+            "scored": int(tables.scored),
+        }
+        return Stage(self.behaviour, numbers, "chance")
+
+    def chains(self) -> Sequence[Chain]:
+        if not self.action:
+            return ()
+        return (chance_chain(self.probability, self.correlation, self.action),)
+
+    def tc_notes(self) -> Sequence[str]:
+        return (TC_CORRELATION,) if self.correlation else ()
+
+
+def read_offset(reader: WordReader) -> float | str:
+    """Read the word after ``from``."""
+    return "random" if reader.accept("random") else reader.value(OWN_TIME_S)
+
+
+def offset_text(offset: float | str) -> str:
+    """Return the words of an offset; none if the trace is used from its beginning."""
+    if offset == 0:
+        return ""
+    return f" from {offset if isinstance(offset, str) else time_text(offset)}"
+
+
+def offset_meaning(offset: float | str) -> str:
+    """Return where the trace begins, in plain words."""
+    if isinstance(offset, str):
+        return ", from a place that the seed chooses"
+    return f", from {time_text(offset)} after its beginning" if offset else ""
+
+
+def require_inside(offset: float | str, length_ns: int, file: NamedFile | None = None) -> None:
+    """Raise ValueError if an offset is not inside a trace of this length; CallerError of a file."""
+    if not isinstance(offset, str) and round(offset * NS_PER_S) >= max(length_ns, 1):
+        message = f"offset_s: the trace lasts {time_text(length_ns / NS_PER_S)}"
+        if file is not None:
+            file.wrong(message)
+        raise ValueError(message)
+
+
+def offset_ns(offset: float | str, length_ns: int, tables: StageTables) -> int:
+    """Return an offset in ns; a random one is uniform over the trace, for all flows the same."""
+    if isinstance(offset, str):
+        share, _ = uniform_pair(*tables.key)
+        return int(share * length_ns)
+    return round(offset * NS_PER_S)

@@ -1,22 +1,25 @@
 """The settings of one direction of a link: impairments, the guarantee, and the limit.
 
 The ``correlation`` of a probability is the correlation of a latent first-order Gaussian process
-between successive packets of a flow. The probability itself stays exact, unlike in ``tc netem``.
+between successive packets of a flow. The probability itself stays exact, unlike in ``tc netem``. At
+the end are what reports and recorded packet fates use of a link; native/noack.h declares the rest.
 """
 
 from collections.abc import Iterable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from noack.core.errors import CallerError
-from noack.impairments.constraints import AnyConstraint, longest_burst_of, require_consistent
+from noack.core.core_library import core
+from noack.impairments.constraints import AnyConstraint, find_longest_burst, require_consistent
 from noack.impairments.feature import LossModel
 from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.loss import LossOf
 from noack.settings.section import ScenarioSection
 
+NEVER_NS: int = core.NOACK_NEVER_NS
+"""A time that never comes."""
 Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 Constraints = Annotated[tuple[AnyConstraint, ...], Field(max_length=8)]
 
@@ -41,17 +44,17 @@ class LinkSettings(ScenarioSection):
 
         A rate limit counts as the transmission time of a full queue of packets of 1,500 bytes.
         """
-        return sum(one.longest_s for one in self.impairments)
+        return sum(impairment.longest_s for impairment in self.impairments)
 
     @property
     def delay_is_bounded(self) -> bool:
         """Whether that is a true bound; packets that must pass a rate limit may take longer."""
-        return all(one.is_bounded for one in self.impairments)
+        return all(impairment.is_bounded for impairment in self.impairments)
 
     @property
     def longest_burst(self) -> int | None:
         """Maximum number of consecutive losses that the guarantee allows; None: no maximum."""
-        return longest_burst_of(self.mansd, self.constraints)
+        return find_longest_burst(self.mansd, self.constraints)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -76,27 +79,39 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
             )
 
 
-def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSettings:
-    """Return settings with the files' contents instead of their names.
+@dataclass(slots=True)
+class RecordedDecision:
+    """A recorded decision for a packet: the fields of ``noack_recorded``."""
 
-    Args:
-        settings: settings of one direction of a link.
-        folder: folder to which relative names refer.
-        place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
+    fate: int
+    delay_ns: int
+    """Time from arrival to departure; −1: it never left."""
+    copy_delay_ns: int
+    bit: int
+    copy_bit: int
 
-    Raises:
-        CallerError: one line; a file cannot be read, or has wrong content; or a loss rate cannot
-            be kept.
-    """
-    from noack.impairments.kept_loss import with_kept_loss  # it depends on this module
 
-    impairments = tuple(
-        one.without_files(folder, f"{place}.impairments.{number}" if place else "")
-        for number, one in enumerate(settings.impairments)
-    )
-    read = settings.model_copy(update={"impairments": impairments})
-    try:
-        with_kept_loss(read)
-    except ValueError as error:
-        raise CallerError(f"{place}: {error}" if place else str(error)) from None
-    return read
+@dataclass(slots=True)
+class Counters:
+    """Counts of one direction of a link: the fields of ``noack_counters``."""
+
+    received: int = 0
+    received_bytes: int = 0
+    delivered: int = 0
+    """Fates; see :class:`noack.protocol.record_tables.Fate`."""
+    dropped: int = 0
+    forced: int = 0
+    corrupted: int = 0
+    overflowed: int = 0
+    blacked_out: int = 0
+    duplicated: int = 0
+    held_back: int = 0
+    """Held back for the guarantee."""
+    forwarded: int = 0
+    """Packets and copies that have left."""
+    forwarded_bytes: int = 0
+    delivered_out_of_order: int = 0
+    """Packets that left after a later one of their flow: stale at the receiver."""
+    longest_loss_burst: int = 0
+    """Maximum number of consecutive losses of a flow under the present settings."""
+    most_in_flight: int = 0

@@ -20,7 +20,7 @@ _FORBIDDEN, _UNKNOWN = -1, -2
 
 def outcome_letters(delivered: Iterable[bool]) -> str:
     """Return the outcomes of successive packets as text: ``D`` delivered, ``L`` lost."""
-    return "".join("D" if one else "L" for one in delivered)
+    return "".join("D" if outcome else "L" for outcome in delivered)
 
 
 class LossRule(Protocol):
@@ -141,8 +141,8 @@ class DeliveriesBetweenBursts:
         return 0, self.deliveries - state if state else 0
 
     def violation(self, value: float) -> str:
-        found = self.deliveries - value
-        return f"only {found:.0f} delivered between two bursts, at least {self.deliveries} required"
+        least = self.deliveries
+        return f"only {least - value:.0f} delivered between two bursts, at least {least} required"
 
 
 class LossWindow(NamedTuple):
@@ -179,13 +179,13 @@ class LossGuarantee:
         burst = self.longest_burst
         if burst is None:
             return ()
-        found = [LossWindow(burst, burst + 1)]
+        windows = [LossWindow(burst, burst + 1)]
         for rule in self.rules:
             if isinstance(rule, LossesInWindow):
-                found.append(LossWindow(rule.limit, rule.window))
+                windows.append(LossWindow(rule.limit, rule.window))
             elif isinstance(rule, DeliveriesBetweenBursts):
-                found.append(LossWindow(burst, burst + rule.deliveries))
-        return tuple(found)
+                windows.append(LossWindow(burst, burst + rule.deliveries))
+        return tuple(windows)
 
     @property
     def meaning(self) -> str:
@@ -232,12 +232,12 @@ class LossAutomaton:
         return self._after(states, 0)
 
     def _after(self, states: Indices, lost: int) -> Indices:
-        found: Indices = self._next[states, lost]
-        if (unknown := found == _UNKNOWN).any():
+        after: Indices = self._next[states, lost]
+        if (unknown := after == _UNKNOWN).any():
             for state in np.unique(states[unknown]).tolist():
                 self._next[state, lost] = self._number(self._states[state], bool(lost))
-            found = self._next[states, lost]
-        return found
+            after = self._next[states, lost]
+        return after
 
     def _number(self, state: tuple[int, ...], lost: bool) -> int:
         """Return the number of the state after an outcome; −1 if it is not allowed."""

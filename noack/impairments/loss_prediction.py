@@ -1,4 +1,4 @@
-"""The expected loss rate of a link under its guarantee.
+"""The losses of a link, computed: their rate under a guarantee, and the process without one.
 
 Each random feature is a Markov chain that advances with every packet. Together they are one chain
 with transition matrix P; in each state, a packet is not effectively delivered with probability ℓ.
@@ -8,23 +8,39 @@ delivered packet. Then
 * E D = v Σ_{k=1..m} A^k 1 is the expected number of losses before the next delivery, and
 * v is stationary under Σ_{k<m} A^k B + A^m P, since the packet after m losses must pass.
 
-The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}). With windows
-or recovery, the states of the guarantee are part of the chain; see
-:mod:`noack.impairments.guarantee_chain`.
+The loss rate is E D/(E D + 1) (:func:`predict`). For independent losses it is p(1 − p^m)/(1 −
+p^{m+1}). With windows or recovery, the states of the guarantee are part of the chain; see
+:mod:`noack.impairments.markov_chain`.
+
+:class:`LossProcess` is the same chain where nothing limits the losses. All probabilities are those
+of the packets' numbers; when the packets are sent does not matter, even if that depends on earlier
+losses.
+
+``loss 30% keep`` asks for a loss rate under the guarantee and the other impairments (the target
+loss rate). :func:`with_kept_loss` finds the smallest probability for which the predicted rate of
+the whole direction is the target. That may take seconds; a process that must not wait receives what
+another one computed (:func:`remember`).
 """
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.impairments.constraints import guarantee_of
-from noack.impairments.guarantee_chain import constrained_rate, pattern_rate
+from noack.core.errors import CallerError
+from noack.impairments.constraints import join_guarantee
+from noack.impairments.feature import Impairment
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.markov_chain import (
     LONGEST_PATTERN,
     MOST_STATES,
@@ -32,8 +48,25 @@ from noack.impairments.markov_chain import (
     Chain,
     NotPredictableError,
     Pattern,
+    constrained_rate,
+    list_moves,
+    pattern_rate,
     stochastic,
 )
+from noack.impairments.words import brief_percent
+
+_MOST_SQUARED = 600
+"""States of chain and guarantee up to which powers of their matrix are computed."""
+_MOST_STEPS = 20_000
+_ROUNDING = 1e-12
+_PARTS = 16
+"""In so many parts of the possible probabilities the smallest one is searched."""
+_TINY = 1e-12
+_DIGITS = 12
+"""The probability is rounded, so that every machine draws the same losses."""
+_MOST_FOUND = 1000
+_found: dict[str, float] = {}
+"""Probabilities by :func:`_key`."""
 
 
 class LossPrediction(NamedTuple):
@@ -54,17 +87,21 @@ def predict(settings: LinkSettings) -> LossPrediction:
     """
     impairments = settings.impairments
     try:
-        parts = [part for one in impairments for part in one.chains()]
+        parts = [part for impairment in impairments for part in impairment.chains()]
         if settings.constraints:
-            rate = _constrained_rate(parts, guarantee_of(settings.mansd, settings.constraints))
+            rate = _constrained_rate(parts, join_guarantee(settings.mansd, settings.constraints))
         else:
             rate = _capped_rate(parts, settings.mansd)
     except NotPredictableError as error:
         return LossPrediction(None, str(error))
-    notes = list(dict.fromkeys(one.prediction_note for one in impairments if one.prediction_note))
+    notes = list(
+        dict.fromkeys(
+            impairment.prediction_note for impairment in impairments if impairment.prediction_note
+        )
+    )
     delayed, reordered = False, False
-    for one in impairments:
-        delayed, reordered = one.reorders(delayed, reordered)
+    for impairment in impairments:
+        delayed, reordered = impairment.reorders(delayed, reordered)
     if settings.longest_burst != 0 and reordered:
         notes.append("not counting packets delivered out of order (stale)")
     return LossPrediction(rate, "; ".join(notes))
@@ -78,7 +115,7 @@ def joint_chain(settings: LinkSettings) -> tuple[Array, Array, Array]:
     Raises:
         NotPredictableError: there is no such chain; the message is the reason.
     """
-    return _together([part for one in settings.impairments for part in one.chains()])
+    return _together([part for impairment in settings.impairments for part in impairment.chains()])
 
 
 def _constrained_rate(parts: Sequence[Chain | Pattern], guarantee: LossGuarantee) -> float:
@@ -142,7 +179,9 @@ def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
         n, others = len(chain.start), len(start)
         start = np.kron(start, chain.start).astype(np.float64)
         moves = np.kron(moves, chain.moves).astype(np.float64)
-        done = [one._replace(acts=np.repeat(one.acts, n)) for one in done]
+        done = [
+            chain_before._replace(acts=np.repeat(chain_before.acts, n)) for chain_before in done
+        ]
         done.append(chain._replace(acts=np.tile(chain.acts, others)))
     return start, moves, _ineffective(done, states)
 
@@ -191,3 +230,228 @@ def _stationary(start: Array, moves: Array) -> Array:
         mean, power = (mean + power @ mean) / 2, stochastic(power @ power)
     distribution: Array = start @ mean
     return distribution
+
+
+@dataclass(frozen=True)
+class LossProcess:
+    """The random losses of a link's packets."""
+
+    start: Array
+    """(n,) distribution before the first packet."""
+    moves: Array
+    """(n, n) transition matrix."""
+    lost: Array
+    """(n,) probability of a loss in each state."""
+    first_delivered: bool = True
+    """Whether the first packet is delivered in any case."""
+
+    @property
+    def is_independent(self) -> bool:
+        """Whether every packet is lost with the same probability, independently."""
+        given = self._loss_given_state
+        return bool(np.ptp(given) <= _ROUNDING)
+
+    @property
+    def largest_probability(self) -> float:
+        """The largest probability that a packet is lost, given any outcomes before it."""
+        return float(self._loss_given_state.max())
+
+    def tails(self, count: int) -> tuple[Array, float]:
+        """Bound the probability that a packet and the j − 1 packets before it are all lost.
+
+        Returns:
+            The bounds, (count,), for j = 1, 2, …; exact if the chain is stationary. And the largest
+            probability, given any past, that the next ``count`` packets are all lost.
+        """
+        lost, weights, tails = self.moves * self.lost, np.ones(len(self.start)), []
+        stationary = np.abs(self.start @ self.moves - self.start).max() <= _ROUNDING
+        for _ in range(count):
+            weights = lost @ weights
+            tails.append(self.start @ weights if stationary else weights.max())
+        return np.array(tails), float(weights.max())
+
+    def keeps(self, guarantee: LossGuarantee, packets: int) -> float:
+        """Return the probability that the first packets keep a guarantee by chance.
+
+        Raises:
+            NotPredictableError: there are too many states or packets.
+        """
+        n = len(self.start)
+        after_loss, after_delivery = list_moves(guarantee, _MOST_STEPS // n)
+        allowed = after_loss >= 0
+        lost, passed = self.moves * self.lost, self.moves * (1 - self.lost)
+        at = np.zeros((len(after_loss), n))
+        if self.first_delivered and packets > 0:
+            at[after_delivery[0]] = self.start @ self.moves
+            packets -= 1
+        else:
+            at[0] = self.start
+        if at.size <= _MOST_SQUARED:
+            states = np.arange(len(after_loss))
+            matrix = np.zeros((len(states), n, len(states), n))
+            matrix[states[allowed], :, after_loss[allowed]] += lost
+            matrix[states, :, after_delivery] += passed
+            power = np.linalg.matrix_power(matrix.reshape(at.size, at.size), packets)
+            return float(min((at.ravel() @ power).sum(), 1.0))
+        if packets > _MOST_STEPS:
+            raise NotPredictableError(f"{packets} packets are too many to compute with")
+        for _ in range(packets):
+            following = np.zeros_like(at)
+            np.add.at(following, after_delivery, at @ passed)
+            np.add.at(following, after_loss[allowed], at[allowed] @ lost)
+            at = following
+        return float(min(at.sum(), 1.0))
+
+    @property
+    def _loss_given_state(self) -> Array:
+        """The probability of a loss, given each state before it that can be reached; (k,)."""
+        reached, before = self.start > 0, -1
+        while before != (before := int(np.count_nonzero(reached))):
+            reached = reached | (reached @ self.moves > 0)
+        loss_given_state: Array = (self.moves @ self.lost)[reached]
+        return loss_given_state
+
+
+def loss_process(settings: LinkSettings) -> LossProcess:
+    """Return the losses of a link's direction without its guarantee.
+
+    Raises:
+        NotPredictableError: they cannot be computed; the message is the reason.
+    """
+    delayed, reordered = False, False
+    for impairment in settings.impairments:
+        delayed, reordered = impairment.reorders(delayed, reordered)
+        if impairment.prediction_note:
+            raise NotPredictableError(f"the losses are known only {impairment.prediction_note}")
+    if reordered:
+        raise NotPredictableError("packets may arrive out of order, which counts as a loss")
+    start, moves, lost = joint_chain(settings)
+    return LossProcess(start, moves, lost, settings.first_delivered)
+
+
+def expected_loss(settings: LinkSettings) -> LossPrediction:
+    """Predict the loss rate of a direction, see :func:`predict`; a kept one is as asked.
+
+    Raises:
+        ValueError: a loss rate cannot be kept.
+    """
+    return predict(with_kept_loss(settings))
+
+
+def with_kept_loss(settings: LinkSettings) -> LinkSettings:
+    """Return settings with the probability that gives the asked loss rate.
+
+    Raises:
+        ValueError: there is none; one line.
+    """
+    places = [
+        number
+        for number, impairment in enumerate(settings.impairments)
+        if isinstance(impairment, LossOf)
+        and isinstance(impairment.loss, BernoulliLoss)
+        and impairment.loss.keep
+    ]
+    if not places:
+        return settings
+    if len(places) > 1:
+        kept = settings.impairments[places[0]].text()
+        raise ValueError(f"{kept}: only one loss of a direction can be kept")
+    key = _key(settings)
+    if key not in _found:
+        remember({key: _probability(settings, places[0])})
+    return _with_probability(settings, places[0], _found[key])
+
+
+def found_probabilities(*links: LinkSettings) -> dict[str, float]:
+    """Return the probabilities of valid settings, for :func:`remember`; none where none is kept."""
+    keys = [_key(link) for link in links if with_kept_loss(link) is not link]
+    return {key: _found[key] for key in keys}
+
+
+def remember(probabilities: Mapping[str, float]) -> Mapping[str, float]:
+    """Use these probabilities, which another process found, instead of computing them."""
+    while len(_found) > _MOST_FOUND:
+        del _found[next(iter(_found))]
+    _found.update(probabilities)
+    return probabilities
+
+
+def _key(settings: LinkSettings) -> str:
+    """Return all that the prediction depends on."""
+    parts = [impairment.text() for impairment in settings.impairments if _matters(impairment)]
+    return json.dumps(
+        [parts, settings.mansd, *(constraint.text() for constraint in settings.constraints)]
+    )
+
+
+def _matters(impairment: Impairment) -> bool:
+    try:
+        return not impairment.delays or bool(impairment.chains())
+    except NotPredictableError:
+        return True
+
+
+def _with_probability(settings: LinkSettings, number: int, probability: float) -> LinkSettings:
+    kept: Any = settings.impairments[number]
+    loss = kept.loss.model_copy(update={"probability": probability, "keep": False})
+    impairments = list(settings.impairments)
+    impairments[number] = kept.model_copy(update={"loss": loss})
+    return settings.model_copy(update={"impairments": tuple(impairments)})
+
+
+def _probability(settings: LinkSettings, number: int) -> float:
+    from scipy.optimize import brentq  # slow to import
+
+    kept: Any = settings.impairments[number]
+    text, target = kept.text(), kept.loss.probability
+
+    def rate_at(probability: float, of: LinkSettings = settings) -> float:
+        rate, note = predict(_with_probability(of, number, float(probability)))
+        if rate is None:
+            raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
+        return rate
+
+    # Without the guarantee, more packets are lost: all but (1 − p)(1 − others).
+    others = rate_at(0.0, settings.model_copy(update={"mansd": None, "constraints": ()}))
+    if others > target and (others := rate_at(0.0)) > target + _TINY:
+        raise ValueError(
+            f"{text}: impossible, the other impairments lose {brief_percent(others)} already"
+        )
+    least = 0.0 if others >= target else (target - others) / (1 - others)
+    places = np.linspace(least, 1.0, _PARTS + 1)
+    rates = [rate_at(least)]
+    for low, high in pairwise(places):
+        if rates[-1] >= target - _TINY:
+            return round(float(low), _DIGITS)
+        rates.append(rate_at(high))
+        if rates[-1] > target + _TINY:
+            root = brentq(lambda probability: rate_at(probability) - target, low, high, xtol=1e-13)
+            return round(float(root), _DIGITS)
+    if rates[-1] >= target - _TINY:
+        return 1.0
+    most = brief_percent(max(rates))
+    raise ValueError(f"{text}: impossible with this guarantee, which allows at most {most}")
+
+
+def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSettings:
+    """Return settings with the files' contents instead of their names.
+
+    Args:
+        settings: settings of one direction of a link.
+        folder: folder to which relative names refer.
+        place: as in :meth:`noack.impairments.feature.StageFeature.without_files`.
+
+    Raises:
+        CallerError: one line; a file cannot be read, or has wrong content; or a loss rate cannot
+            be kept.
+    """
+    impairments = tuple(
+        impairment.without_files(folder, f"{place}.impairments.{number}" if place else "")
+        for number, impairment in enumerate(settings.impairments)
+    )
+    read = settings.model_copy(update={"impairments": impairments})
+    try:
+        with_kept_loss(read)
+    except ValueError as error:
+        raise CallerError(f"{place}: {error}" if place else str(error)) from None
+    return read

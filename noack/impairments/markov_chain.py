@@ -1,18 +1,30 @@
-"""A feature as a Markov chain that advances with every packet, to predict loss rates."""
+"""A feature as a Markov chain that advances with every packet, and its loss rate under a guarantee.
+
+A guarantee with windows or recovery makes a larger chain. Its state is the joint state s of the
+impairments and the state a of the guarantee's automaton. In s a packet is lost with probability
+ℓ(s), provided that the automaton allows a loss in a; else it is delivered. The loss rate is Σ π(s,
+a) ℓ(s⁺) over the states that allow a loss, with the stationary distribution π, and s⁺ the state of
+the impairments after their step.
+"""
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import core
+from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 
 Array = NDArray[np.float64]
-
 MOST_STATES = 256
 LONGEST_PATTERN = 10_000_000
+MOST_JOINT_STATES = 20_000
+_MOST_STEPS = 1_000_000
+_WARM_UP = 100
+"""Steps of the chain after which a likely state is chosen."""
 
 
 class NotPredictableError(Exception):
@@ -63,7 +75,7 @@ def pattern(period: int, lost: Iterable[int]) -> Pattern:
 
 
 def chance_chain(probability: float, correlation: float, what: str) -> Chain:
-    """Return the chain of :mod:`noack.impairments.correlated_chance`, with its action.
+    """Return the chain of :mod:`noack.impairments.feature`, with its action.
 
     Raises:
         NotPredictableError: the correlation is too high.
@@ -104,3 +116,136 @@ def stochastic(matrix: Array) -> Array:
     rows: Array = np.where(matrix < 1e-100, 0.0, matrix)
     rows /= rows.sum(axis=1, keepdims=True)
     return rows
+
+
+class Moves(NamedTuple):
+    """The a states of a guarantee; state 0 is that before the first packet."""
+
+    after_loss: NDArray[np.int64]
+    """(a,) −1: a loss is not allowed."""
+    after_delivery: NDArray[np.int64]
+    """(a,)"""
+
+
+@lru_cache(maxsize=4)
+def list_moves(guarantee: LossGuarantee, most: int) -> Moves:
+    """Return all states of a guarantee.
+
+    Raises:
+        NotPredictableError: there are more than ``most``.
+    """
+    automaton = LossAutomaton(guarantee)
+    known, lost, delivered = 1, list[int](), list[int]()
+    while len(lost) < known:
+        states = np.arange(len(lost), known)
+        after_loss, after_delivery = automaton.after_loss(states), automaton.after_delivery(states)
+        lost += after_loss.tolist()
+        delivered += after_delivery.tolist()
+        known = max(known, 1 + int(after_loss.max()), 1 + int(after_delivery.max()))
+        if known > most:
+            raise NotPredictableError(
+                f"impairments and guarantee together have more than {MOST_JOINT_STATES} states, "
+                "too many to compute with"
+            )
+    return Moves(np.array(lost), np.array(delivered))
+
+
+def pattern_rate(lost: NDArray[np.bool_], guarantee: LossGuarantee) -> float:
+    """Return the loss rate of a periodic pattern, by following it until a state recurs.
+
+    Raises:
+        NotPredictableError: that takes too long.
+    """
+    automaton, state, losses = LossAutomaton(guarantee), np.zeros(1, np.int64), 0
+    seen: dict[int, tuple[int, int]] = {}
+    for period in range(_MOST_STEPS // len(lost) + 1):
+        if int(state[0]) in seen:
+            first, before = seen[int(state[0])]
+            return (losses - before) / ((period - first) * len(lost))
+        seen[int(state[0])] = period, losses
+        for wish in lost.tolist():
+            after = automaton.after_loss(state) if wish else state
+            if wish and after[0] >= 0:
+                state, losses = after, losses + 1
+            else:
+                state = automaton.after_delivery(state)
+    raise NotPredictableError("the losses repeat only after too many packets to compute with")
+
+
+def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGuarantee) -> float:
+    """Return the loss rate of a joint chain of n states.
+
+    Args:
+        start: (n,) distribution before the first packet.
+        moves: (n, n) transition matrix.
+        lost: (n,) probability in each state that the packet is lost, if it may be.
+        guarantee: the guarantee.
+
+    Raises:
+        NotPredictableError: there are too many states, or the rate depends on chance.
+    """
+    from scipy import sparse
+
+    n = len(start)
+    after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // n)
+    count = len(after_loss)
+    allowed = after_loss >= 0
+
+    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> Any:
+        places = np.flatnonzero(which)
+        shape = (count, count)
+        return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
+
+    joint = (
+        sparse.kron(to(after_loss, allowed), moves * lost)
+        + sparse.kron(to(after_delivery, allowed), moves * (1 - lost))
+        + sparse.kron(to(after_delivery, ~allowed), moves)
+    ).tocsr()
+    at_start = np.zeros(count * n)
+    at_start[:n] = start
+    distribution = _stationary(joint, at_start).reshape(count, n)
+    return float((distribution[allowed] @ moves @ lost).sum())
+
+
+def _stationary(joint: Any, start: Array) -> Array:
+    """Return the stationary distribution of the states that remain possible."""
+    from scipy.sparse import csgraph
+
+    steps = csgraph.dijkstra(joint, indices=np.flatnonzero(start), unweighted=True, min_only=True)
+    places = np.flatnonzero(np.isfinite(steps))
+    part = joint[places][:, places]
+    _, labels = csgraph.connected_components(part, connection="strong")
+    sources, targets = part.nonzero()
+    leaves = labels[sources] != labels[targets]
+    closed = np.setdiff1d(labels, labels[sources[leaves]])
+    if len(closed) > 1:
+        raise NotPredictableError("the loss rate depends on what happens at the beginning")
+    kept = np.flatnonzero(labels == closed[0])
+    distribution = np.zeros(len(start))
+    distribution[places[kept]] = _balance(part[kept][:, kept])
+    return distribution
+
+
+def _balance(moves: Any) -> Array:
+    """Return the stationary distribution π = πP of an irreducible chain.
+
+    With π = 1 for a likely state, the other equations are a regular, well-conditioned system. It is
+    sparse: few states of the guarantee follow a state.
+    """
+    from scipy.sparse import eye_array, linalg
+
+    count = moves.shape[0]
+    distribution: Array = np.ones(count)
+    if count == 1:
+        return distribution
+    for _ in range(_WARM_UP):
+        distribution = (distribution + moves.T @ distribution) / 2
+    others = np.delete(np.arange(count), likely := int(np.argmax(distribution)))
+    system = (eye_array(count) - moves.T).tocsc()
+    flow = moves[[likely]].toarray()[0, others]
+    distribution[likely] = 1.0
+    distribution[others] = np.maximum(
+        linalg.splu(system[others][:, others].tocsc()).solve(flow), 0.0
+    )
+    distribution /= distribution.sum()
+    return distribution

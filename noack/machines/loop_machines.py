@@ -3,27 +3,157 @@
 A driver in C (live, in virtual time, in replay) makes the steps. It returns to this class where a
 step needs Python: users' code, changes of settings, rows to take. One input at a time goes through
 :meth:`LoopMachines.handle` and :meth:`LoopMachines.on_timer`, which make the same steps.
+
+What a role describes of each machine is a *part*: it fills the core's structure, and answers the
+questions at which a step stops (``enum noack_question`` in native/noack.h).
+
+The loops may have vectors of different sizes. The rows of a table then have room for the longest;
+what a loop's own row lacks is missing in them (:func:`row_layout`).
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from functools import cache
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ParameterChange
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_key
+from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
-from noack.machines.machine_parts import NEVER_NS, MachinePart, next_change_ns
 from noack.protocol.machine_interface import Notice, Output, Record
-from noack.protocol.record_tables import LOOP, RecordShape, tables
+from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow, Message
 
 Rows = NDArray[np.void]
-
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
+NEVER_NS = 2**63 - 1
+
+
+class Role(NamedTuple):
+    """What the machines of a process have in common."""
+
+    name: str
+    structure: str
+    """Name of the core's structure of one machine, and of the field of ``noack_process``."""
+    receives: Flow
+    tables: tuple[str | None, str | None, str | None]
+    """The record's tables of ticks, messages and acknowledgements."""
+    changes: str | None = None
+    """The table of announced changes of settings; None: none can be announced."""
+
+    @property
+    def number(self) -> int:
+        """The role's number in the core."""
+        return int(getattr(core, f"NOACK_{self.name.upper()}"))
+
+
+class MachinePart(Protocol):
+    """The description of one loop's machine, and what only Python can do for it."""
+
+    role: Role
+
+    @property
+    def schedule(self) -> ChangeSchedule | None:
+        """The announced changes of its settings; None if they cannot change."""
+        ...
+
+    @property
+    def counts_every_message(self) -> bool:
+        """Whether :meth:`inspect` needs all rows, not only those of messages after losses."""
+        ...
+
+    @property
+    def shape(self) -> RecordShape:
+        """The sizes of the rows that it writes."""
+        ...
+
+    def fill(self, structure: Any, memory: CoreMemory) -> None:
+        """Fill the core's structure, at the start of the machine's work."""
+        ...
+
+    def redraw(self, structure: Any, memory: CoreMemory) -> None:
+        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
+        ...
+
+    def answer(self, question: int, structure: Any) -> Sequence[Notice]:
+        """Do what a step needs before it goes on; return lines for the log."""
+        ...
+
+    def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
+        """Return lines for the log about new rows of received messages."""
+        ...
+
+    def note(self, structure: Any, note: Any) -> Notice:
+        """Return the line for the log that a step has asked for by a ``noack_note``."""
+        ...
+
+
+Part = TypeVar("Part", bound=MachinePart)
+
+
+def alike_parts(
+    loops: Sequence[Scenario],
+    make: Callable[[Scenario], Part],
+    redrawn: Callable[[Part, Scenario], Part],
+) -> tuple[list[Part], list[int]]:
+    """Return the part of each loop, and the number of the first loop that is alike.
+
+    Loops are alike if they differ in their draws only. ``make`` makes the part of the first of
+    them, ``redrawn`` one with the draws of another loop.
+    """
+    parts: list[Part] = []
+    alike: list[int] = []
+    firsts: dict[tuple[int, ...], int] = {}
+    for number, loop in enumerate(loops):
+        first = firsts.setdefault(settings_key(loop), number)
+        parts.append(make(loop) if first == number else redrawn(parts[first], loop))
+        alike.append(first)
+    return parts, alike
+
+
+def set_machine(
+    machine: Any,
+    *,
+    n: int,
+    m: int,
+    entries: int,
+    flow: Flow,
+    first_number: int = 0,
+    period_ns: int = 0,
+    first_ns: int = 0,
+    horizon_ns: int,
+    step: int = 0,
+) -> None:
+    """Fill a ``noack_machine`` at its start."""
+    machine.n, machine.m = n, m
+    machine.first_number = machine.inputs = first_number
+    machine.period_ns, machine.first_ns, machine.horizon_ns = period_ns, first_ns, horizon_ns
+    machine.step, machine.reached_ns, machine.change_ns = step, -1, NEVER_NS
+    machine.received.flow, machine.received.entries = flow, entries
+    machine.acknowledgements.flow = Flow.ACKNOWLEDGEMENT
+    for reception in (machine.received, machine.acknowledgements):
+        reception.newest, reception.not_after_ns = -1, horizon_ns
+
+
+def take_changes(schedule: ChangeSchedule | None, machine: Any) -> Sequence[Any]:
+    """Return the changes that are due at the time at which a step asked, in order."""
+    found: list[Any] = []
+    while schedule is not None and (due := schedule.take(machine.change_ns)) is not None:
+        found.append(due)
+    machine.change_ns = next_change_ns(schedule)
+    return found
+
+
+def next_change_ns(schedule: ChangeSchedule | None) -> int:
+    """Return the time of the next change."""
+    if schedule is None or schedule.next_ns is None:
+        return NEVER_NS
+    return schedule.next_ns
 
 
 class LoopMachines:
@@ -34,11 +164,10 @@ class LoopMachines:
         phases_ns: when each loop begins, in the run's time; by default 0.
         alike: the number of the first loop, for each loop, from which it differs in draws only; by
             default its own.
-        numbered: whether rows begin with the number of their loop.
         rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
-        ValueError: the core refuses a machine's numbers, or the loops' rows differ.
+        ValueError: the core refuses a machine's numbers.
     """
 
     def __init__(
@@ -47,15 +176,11 @@ class LoopMachines:
         phases_ns: Sequence[int] | None = None,
         *,
         alike: Sequence[int] | None = None,
-        numbered: bool = False,
         rows: int | None = None,
     ) -> None:
         self.parts = tuple(parts)
         self.role = self.parts[0].role
-        if any(part.shape != self.parts[0].shape for part in self.parts):
-            raise ValueError(f"the rows of these {self.role.name}s have different columns")
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
-        self.numbered = numbered
         self._memory = CoreMemory()
         self._notices: list[Notice] = []
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
@@ -96,15 +221,27 @@ class LoopMachines:
     def _fill_tables(self, rows: int) -> None:
         self.core.notes = pointer_to(self._notes, "noack_note *")
         self.core.note_places = len(self._notes)
-        types = row_types(self.parts[0].shape, numbered=self.numbered)
+        shapes = [part.shape for part in self.parts]
+        types = row_types(shapes)
         for number, name in enumerate(self.role.tables):
             if name is None or name not in types:
                 continue
             self._tables[number] = np.zeros(rows, types[name])
             table = self.core.tables[number]
-            table.prefix_bytes = 2 * self.numbered
             table.row_bytes, table.places = types[name].itemsize, rows
             table.rows = pointer_to(self._tables[number], "uint8_t *")
+            if len(set(shapes)) > 1:
+                table.layouts = self._layouts(name, types[name], shapes)
+
+    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> Any:
+        """Return the layout of each loop's rows in a table; loops of a shape share it."""
+
+        @cache
+        def layout(shape: RecordShape) -> Any:
+            own = tables(**asdict(shape)).get(name)
+            return ffi.NULL if own is None else self._memory.integers(row_layout(own, whole))
+
+        return self._memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
 
     def next_deadline_ns(self) -> int | None:
         """The earliest tick of all loops, in the run's time."""
@@ -151,22 +288,26 @@ class LoopMachines:
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Announce a change of settings to every machine; its time is that of the run.
 
-        Raise CallerError, and change nothing, if these machines' settings cannot change.
+        Raise CallerError, and change nothing, if these machines' settings cannot change, or if a
+        loop's scenario would be invalid.
         """
-        table = self.role.changes
-        if table is None or any(part.schedule is None for part in self.parts):
-            raise CallerError(f"the settings of this {self.role.name} cannot be changed")
+        table, schedules = self.role.changes, [part.schedule for part in self.parts]
+        own = [change._replace(t_ns=max(change.t_ns - ns, 0)) for ns in self.phases_ns]
+        for schedule, of_loop, structure in zip(schedules, own, self.machines, strict=True):
+            if table is None or schedule is None:
+                raise CallerError(f"the settings of this {self.role.name} cannot be changed")
+            schedule.check(of_loop, structure.machine.reached_ns)
         outputs: list[Record | Notice] = []
-        for loop, (part, phase_ns) in enumerate(zip(self.parts, self.phases_ns, strict=True)):
+        for loop, schedule in enumerate(schedules):
+            assert table is not None
+            assert schedule is not None
             machine = self.machines[loop].machine
-            own = change._replace(t_ns=max(change.t_ns - phase_ns, 0))
-            assert part.schedule is not None
-            announced = part.schedule.announce(
-                table, own, machine.inputs, now_ns - phase_ns, machine.reached_ns
+            announced = schedule.announce(
+                table, own[loop], machine.inputs, now_ns - self.phases_ns[loop], machine.reached_ns
             )
             machine.inputs += 1
-            machine.change_ns = next_change_ns(part.schedule)
-            outputs += [self._of_loop(loop, output) for output in announced]
+            machine.change_ns = next_change_ns(schedule)
+            outputs += [_with_loop(loop, output) for output in announced]
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
@@ -216,12 +357,11 @@ class LoopMachines:
         return [*records, *self.take_notices()]
 
     def _inspect(self, rows: Rows) -> None:
-        if len(self.parts) == 1:
-            self._keep_notices(0, self.parts[0].inspect(rows))
-            return
-        for row in self._notable(rows):
-            loop = int(row[LOOP])
-            self._keep_notices(loop, self.parts[loop].inspect(row[None]))
+        notable = self._notable(rows)
+        for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
+            if len(own):
+                loop = int(own[LOOP][0])
+                self._keep_notices(loop, self.parts[loop].inspect(own))
 
     def _notable(self, rows: Rows) -> Rows:
         """Return the rows that a part may have to say something about."""
@@ -232,15 +372,14 @@ class LoopMachines:
         return rows[notable]
 
     def _keep_notices(self, loop: int, notices: Sequence[Notice]) -> None:
-        self._notices += [self._of_loop(loop, notice) for notice in notices]
+        self._notices += [notice._replace(loop=loop) for notice in notices]
 
-    def _of_loop(self, loop: int, output: Any) -> Any:
-        """Return an output of a loop's machine with the number of the loop."""
-        if not self.numbered:
-            return output
-        if isinstance(output, Record):
-            return Record(output.table, (loop, *output.row))
-        return output._replace(loop=loop)
+
+def _with_loop(loop: int, output: Record | Notice) -> Record | Notice:
+    """Return an output of a loop's machine with the number of the loop."""
+    if isinstance(output, Record):
+        return Record(output.table, (loop, *output.row))
+    return output._replace(loop=loop)
 
 
 def message_of(given: Any) -> Message:
@@ -250,10 +389,29 @@ def message_of(given: Any) -> Message:
     return Message(Flow(given.flow), given.sequence, given.t_ns, vector, given.loop)
 
 
-def row_types(shape: RecordShape, *, numbered: bool) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of the tables; ``numbered``: with the number of the loop in front."""
-    sizes = vars(shape)
-    types = tables(sizes["n"], sizes["m"], **{k: v for k, v in sizes.items() if k not in "nm"})
-    if not numbered:
-        return types
+def row_types(shapes: Iterable[RecordShape]) -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of the tables of loops; a row begins with the number of its loop."""
+    types = tables(**asdict(largest(shapes)))
     return {name: np.dtype([(LOOP, "<u2"), *kind.descr]) for name, kind in types.items()}
+
+
+def row_layout(own: np.dtype[np.void], whole: np.dtype[np.void]) -> NDArray[np.int64]:
+    """Return which word of a loop's own row each word of a table's row is.
+
+    A vector of the loop is the beginning of the table's; the rest of it is NaN. A column that the
+    loop does not have is 0.
+
+    Args:
+        own: the row type of the loop, without its number.
+        whole: the row type of the table, with the number of the loop.
+    """
+    own_fields: Mapping[str, Any] = own.fields or {}
+    fields: Mapping[str, Any] = whole.fields or {}
+    layout = np.full((whole.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
+    for name in own.names or ():
+        kind, begin = own_fields[name][:2]
+        room, at = fields[name][:2]
+        first, words = (at - core.NOACK_LOOP_BYTES) // 8, kind.itemsize // 8
+        layout[first : first + room.itemsize // 8] = core.NOACK_MISSING_NAN
+        layout[first : first + words] = begin // 8 + np.arange(words)
+    return layout

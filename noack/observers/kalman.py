@@ -14,9 +14,8 @@ from pydantic import model_validator
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.observers.estimation_model import EstimationModel, NoiseVariances
-from noack.observers.observer_settings import ObserverSettings
-from noack.settings.matrices import Row, Rows, require_length, require_shape, require_squares
+from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
+from noack.settings.section import Row, Rows, require_length, require_shape, require_squares
 
 
 class KalmanSettings(ObserverSettings):

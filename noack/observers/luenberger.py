@@ -15,10 +15,13 @@ from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.observers.estimation_model import EstimationModel, NoiseVariances
-from noack.observers.observability import observer_gain
-from noack.observers.observer_settings import ObserverSettings
-from noack.settings.matrices import Rows, require_shape
+from noack.observers.observer_settings import (
+    EstimationModel,
+    NoiseVariances,
+    ObserverSettings,
+    observer_gain,
+)
+from noack.settings.section import Rows, require_shape
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 

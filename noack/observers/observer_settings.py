@@ -1,16 +1,67 @@
-"""The settings that every kind of observer has; native/loop/observer.c is what it does."""
+"""The settings that every kind of observer has, and the discrete-time model that observers use.
+
+native/loop/observer.c is what an observer does. Over a step h of the plant the model is x⁺ = Âd x +
+B̂d u + q, y = C x + v. The time between two measurements is T = steps · h. At the end:
+observability of a pair (A, C), and pole placement for an observer.
+"""
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector
-from noack.observers.estimation_model import EstimationModel, NoiseVariances
-from noack.settings.matrices import Row, require_length
-from noack.settings.section import ScenarioSection
+from noack.settings.section import Row, ScenarioSection, require_length
+
+_RANK_TOLERANCE = 1e-9
+_POLE_TOLERANCE = 1e-6
+
+
+class NoiseVariances(NamedTuple):
+    """Variances of the random disturbances and the noise of a scenario, entry by entry."""
+
+    at_state: Vector
+    """Of the disturbances at = "state", (n,)."""
+    at_input: Vector
+    """Of the disturbances at = "input", (m,)."""
+    output: Vector
+    """Of the measurement noise v, (p,)."""
+
+
+class EstimationModel(NamedTuple):
+    """The model on the plant's time grid, with the covariances of its noise."""
+
+    Ad: Matrix
+    """Âd, (n, n)."""
+    Bd: Matrix
+    """B̂d, (n, m)."""
+    Gd: Matrix
+    """Effect of a disturbance w of ẋ that is constant over a step, (n, n)."""
+    C: Matrix
+    """(p, n)"""
+    Q: Matrix
+    """Covariance of q, (n, n)."""
+    R: Matrix
+    """Covariance of v, (p, p)."""
+    steps: int
+    """Steps of the plant between two measurements."""
+
+    def process_covariance(self, at_state: Vector, at_input: Vector) -> Matrix:
+        """Return the covariance of q for independent disturbances with these variances."""
+        return _covariance(self.Gd, at_state) + _covariance(self.Bd, at_input)
+
+    def between_measurements(self) -> tuple[Matrix, Matrix]:
+        """Return Â^(T), and the covariance of the process noise over T, (n, n) each."""
+        A, Q = np.eye(len(self.Ad)), np.zeros_like(self.Q)
+        for _ in range(self.steps):
+            A, Q = self.Ad @ A, self.Ad @ Q @ self.Ad.T + self.Q
+        return A, Q
+
+
+def _covariance(through: Matrix, variance: Vector) -> Matrix:
+    return np.asarray(through @ np.diag(variance) @ through.T)
 
 
 class ObserverSettings(ScenarioSection):
@@ -62,3 +113,46 @@ class ObserverSettings(ScenarioSection):
             "p": p, "Ad": assumed.Ad, "Bd": assumed.Bd, "C": assumed.C, "x": x, "t_ns": -1,
             "gain": np.zeros((n, p)), "scratch": np.zeros(3 * n * n + n * p + p * p + 2 * n + p),
         })  # fmt: skip
+
+
+def unobservable_mode(A: Matrix, C: Matrix, *, stable_too: bool = False) -> complex | None:
+    """Return an eigenvalue of A whose mode does not appear in y = C x; None if there is none.
+
+    The test of Popov, Belevitch and Hautus: the columns of [λI − A; C] are independent. By default
+    only modes that do not decay are tested (detectability), with ``stable_too`` all modes
+    (observability).
+    """
+    n = len(A)
+    scale = max(float(np.linalg.norm(A, 2)), 1.0)
+    scaled_C = C / max(float(np.linalg.norm(C, 2)), np.finfo(float).tiny)
+    for eigenvalue in np.linalg.eigvals(A):
+        if abs(eigenvalue) < 1 - _RANK_TOLERANCE and not stable_too:
+            continue
+        tested = np.vstack([(eigenvalue * np.eye(n) - A) / scale, scaled_C])
+        if np.linalg.svd(tested, compute_uv=False)[-1] < _RANK_TOLERANCE:
+            return complex(eigenvalue)
+    return None
+
+
+def observer_gain(A: Matrix, C: Matrix, poles: tuple[complex, ...]) -> Matrix:
+    """Return L, shape (n, p), for which (I − L C) A has these eigenvalues.
+
+    L is the state feedback of the dual pair (Aᵀ, (CA)ᵀ), by the method of Tits and Yang, which is
+    robust if there is more than one output. The poles are n eigenvalues, each complex one with its
+    conjugate.
+
+    Raises:
+        ValueError: the eigenvalues cannot be placed.
+    """
+    # Imported here: observers with a given gain do not need this large module.
+    from scipy.signal import place_poles
+
+    if unobservable_mode(A, C, stable_too=True) is not None:
+        raise ValueError("(Â, C) is not observable")
+    placed = place_poles(A.T, (C @ A).T, np.array(poles), maxiter=100, rtol=1e-3)
+    gain = np.ascontiguousarray(placed.gain_matrix.T)
+    reached = np.linalg.eigvals((np.eye(len(A)) - gain @ C) @ A)
+    error = np.abs(np.sort_complex(reached) - np.sort_complex(np.array(poles))).max()
+    if not error < _POLE_TOLERANCE:
+        raise ValueError(f"rounding moves them by {error:.1g}; take poles farther apart")
+    return gain

@@ -16,8 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.plant_settings import PlantSettings, PlantStart
-from noack.plants.systems.plant_system import SystemFailedError
+from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
 from noack.settings.section import NonNegative, Positive
 
 _MAX_CHANGES = 10_000

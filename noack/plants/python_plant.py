@@ -11,9 +11,16 @@ import numpy as np
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, PlantStart
-from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
-from noack.settings.user_class import (
+from noack.plants.plant_settings import (
+    Names,
+    OdeSystem,
+    PlantEquations,
+    PlantSettings,
+    PlantStart,
+    PlantSystem,
+    SystemFailedError,
+)
+from noack.settings.user_files import (
     ClassSettings,
     new_instance,
     read_only,
@@ -63,7 +70,7 @@ class PythonSystem:
         self._user_code = partial(user_code, settings, _PLACE, CallerError)
         with self._user_code():
             plant, self.about = new_instance(settings, _PLACE)
-            self._system = self._system_of(plant, x0, m)
+            self._system = self._make_system(plant, x0, m)
             self.x, self.z = x0, np.zeros(self._recorded)
             self._copy_state()
         self._user_code = partial(user_code, settings, _PLACE, SystemFailedError)
@@ -83,7 +90,7 @@ class PythonSystem:
         if self._recorded:
             self.z = real_vector("z", self._system.z, self._recorded)
 
-    def _system_of(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
+    def _make_system(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
             both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
             raise TypeError(f"it has {both} advance; one of them is needed")
@@ -104,8 +111,6 @@ class PythonSystem:
 
         derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
-        from noack.plants.systems.ode_integrator import OdeSystem
-
         equations = PlantEquations(
             derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
         )

@@ -47,7 +47,6 @@ HEADER_ROW = np.dtype(
 )  # fmt: skip
 """The same as a row of an array."""
 HEADER_BYTES = _HEADER.size
-FLOW_OFFSET = 3
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 
 

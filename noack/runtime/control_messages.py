@@ -17,7 +17,7 @@ from pydantic import (
     ValidationError,
 )
 
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import PeerError
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
@@ -29,7 +29,7 @@ Ranges = tuple[tuple[Count, Count], ...]  # half-open ranges of numbers
 class ControlMessage(BaseModel):
     """A message; further fields are allowed."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="allow")
+    model_config = ConfigDict(frozen=True, strict=True, extra="allow", defer_build=True)
 
 
 def _require_number(host: str) -> str:
@@ -77,7 +77,7 @@ class ChangeAnnouncement(ControlMessage):
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
     kept_losses: dict[str, FiniteFloat] = {}
-    """Probabilities for :func:`noack.impairments.kept_loss.remember`."""
+    """Probabilities for :func:`noack.impairments.loss_prediction.remember`."""
 
 
 class ChangeRequest(ControlMessage):

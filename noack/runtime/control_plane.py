@@ -17,9 +17,9 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.config.parameter_changes import ParameterChange
-from noack.config.scenario import MOST_CHANGES
+from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
-from noack.impairments.kept_loss import remember
+from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.control_messages import ChangeAnnouncement, parse_message
 from noack.runtime.join_ticket import Ticket

@@ -15,9 +15,9 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from noack.config.scenario import Scenario
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import CallerError, PeerError
-from noack.impairments.kept_loss import found_probabilities, remember
+from noack.impairments.loss_prediction import found_probabilities, remember
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.runtime.address import LOOPBACK
 from noack.runtime.control_messages import NumericHost, SocketAddress

@@ -5,8 +5,11 @@ messages, and collects the rows of the record. It returns to Python at housekeep
 rows is full, if users' code is to answer, and for each datagram that is encrypted.
 """
 
+import os
 import socket
+import weakref
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, TypedDict
 
 import numpy as np
@@ -29,6 +32,7 @@ from noack.runtime.process_life import RunProcess
 from noack.runtime.real_time_loop import RecordSink
 from noack.runtime.udp_sockets import CountingSocket, errors_by_text
 
+_UDP_GRO = 104
 _AT_ONCE_NS = -(2**63)
 """Do what is due, and do not wait."""
 
@@ -98,7 +102,7 @@ class LiveDriver:
             "noack_driver *",
             {
                 "process": machines.core, "wire": wire.core[0], "clock": {"speed": 1.0},
-                "spin_ns": spin_ns, "rest_ns": rest_ns, "sender": -1,
+                "spin_ns": spin_ns, "rest_ns": rest_ns,
                 "scratch": ffi.cast("void *", -(-self._scratch.ctypes.data // 64) * 64),
             },
         )  # fmt: skip
@@ -106,34 +110,35 @@ class LiveDriver:
             machine.received.not_before_ns = admitted_ns - phase_ns
             machine.acknowledgements.not_before_ns = admitted_ns - phase_ns
         self._check()
-        core.noack_driver_open(self.core)
+        if number := core.noack_driver_open(self.core):
+            raise OSError(number, os.strerror(number))
+        self.close = weakref.finalize(self, core.noack_driver_close, self.core)
+        """Close its timer."""
 
     def open(
         self,
-        sender: socket.socket,
+        senders: Sequence[socket.socket],
         receivers: Sequence[socket.socket],
         sources: Sequence[Address],
-        destinations: Sequence[Address | None],
     ) -> None:
         """Use these sockets from now on.
 
         Args:
-            sender: an unconnected socket.
+            senders: connected to where the messages of every run go; also to where
+                acknowledgements do.
             receivers: the sockets of the peers.
             sources: where the messages of every run come from; also where acknowledgements do.
-            destinations: where they go to.
         """
-        self.core.sender = sender.fileno()
+        for place, sender in enumerate(senders):
+            self.core.senders[place] = sender.fileno()
         self.core.receiver_count = len(receivers)
         for place, receiver in enumerate(receivers):
             self.core.receivers[place] = receiver.fileno()
-        for peers, addresses in (
-            (self.core.sources, sources),
-            (self.core.destinations, destinations),
-        ):
-            for place, address in enumerate(addresses):
-                if address is not None:
-                    peers[place].name, peers[place].name_bytes = packed_name(address)
+            if self.core.process.loops > 1:  # several datagrams then come as one message
+                with suppress(OSError):
+                    receiver.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
+        for peer, address in zip(self.core.sources, sources, strict=False):
+            peer.name, peer.name_bytes = packed_name(address)
         self._check()
 
     def set_clock(self, clock: RunClock) -> None:
@@ -254,11 +259,12 @@ class LoopChannel(CountingSocket):
         acknowledges_to: Address | None = None,
     ) -> None:
         sources = [source] if acknowledged_by is None else [source, acknowledged_by]
-        super().__init__(endpoint, destination, sources)
+        destinations = [destination, *([] if acknowledges_to is None else [acknowledges_to])]
+        super().__init__(endpoint, destinations, sources)
         self._driver, self._sends = driver, sends
         self._expected = sources
         self._is_acknowledged = acknowledged_by is not None
-        driver.open(endpoint, self.peer_sockets, sources, (destination, acknowledges_to))
+        driver.open(self.senders, self.peer_sockets, sources)
 
     def take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         """Pass a datagram to the driver, which rejects all but those of the peers."""
@@ -281,3 +287,8 @@ class LoopChannel(CountingSocket):
             "loops": driver.reports(),
             **({"acknowledgements": driver.acknowledgements()} if self._is_acknowledged else {}),
         }
+
+    def close(self) -> None:
+        """Close the sockets that it opened itself, and the driver's timer."""
+        super().close()
+        self._driver.close()

@@ -1,8 +1,8 @@
 """Locking a process's memory, so that its loop does not wait for a page.
 
-All mappings are locked, but only those of up to 16 MiB are loaded beforehand. The larger ones are
-mostly unused: buffers of BLAS (32 MiB each), of which the loop uses some pages. These are locked
-when they are first used.
+All mappings are locked. Those of up to 16 MiB with code or with data that the process may write
+are loaded beforehand. The larger ones are mostly unused: buffers of BLAS (32 MiB each), of which
+the loop uses some pages. These are locked when they are first used, as are constants of libraries.
 
 What this process shares with the fork server is not copied beforehand: a page of it is in memory,
 and the loop writes to few of them, each of which then takes a microsecond. Nor are the stacks of
@@ -21,8 +21,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _MADV_POPULATE_READ, _MADV_POPULATE_WRITE = 22, 23
 _LARGE_BYTES = 16 * 2**20
 _MAPPINGS = Path("/proc/self/smaps")
-_MAPPING = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (.).*\n((?:[A-Z].*\n)*)", re.MULTILINE)
-_SHARED = re.compile(r"^Shared_Dirty: +[1-9]", re.MULTILINE)
+_MAPPING = re.compile(
+    r"^([0-9a-f]+)-([0-9a-f]+) (...)(?s:.*?)^Shared_Dirty: +([0-9]+)", re.MULTILINE
+)
 
 
 def lock_memory() -> None:
@@ -46,7 +47,7 @@ def lock_memory() -> None:
 
 
 class _Mapping(NamedTuple):
-    """Readable memory of this process."""
+    """Memory of this process that is loaded."""
 
     first: int
     bytes: int
@@ -54,13 +55,14 @@ class _Mapping(NamedTuple):
 
 
 def _mappings() -> Iterator[_Mapping]:
+    """Yield the code, and what this process alone may write."""
     guard_end = 0
     for found in _MAPPING.finditer(_MAPPINGS.read_text()):
-        first, end = int(found[1], 16), int(found[2], 16)
-        writable, is_stack = found[0].split(maxsplit=2)[1][1] == "w", guard_end == first
-        if found[3] == "-":  # without any access; a thread's stack begins with such a guard
+        first, end, rights = int(found[1], 16), int(found[2], 16), found[3]
+        is_stack = guard_end == first
+        if rights == "---":  # a thread's stack begins with such a guard
             guard_end = end
-            continue
-        own = writable and not is_stack and not _SHARED.search(found[4])
-        advice = _MADV_POPULATE_WRITE if own else _MADV_POPULATE_READ
-        yield _Mapping(first, end - first, advice)
+        elif rights[2] == "x":
+            yield _Mapping(first, end - first, _MADV_POPULATE_READ)
+        elif rights[1] == "w" and not is_stack and found[4] == "0":
+            yield _Mapping(first, end - first, _MADV_POPULATE_WRITE)

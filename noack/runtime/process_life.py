@@ -15,11 +15,10 @@ from functools import cached_property
 from itertools import chain, repeat
 from typing import Any, Protocol
 
-from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import resolved_loops, run_tables
-from noack.config.scenario import Scenario
-from noack.config.scenario_changes import prepare_changes
+from noack.config.scenario import Scenario, loops_of, phases_ns
+from noack.config.scenario_checks import prepare_changes
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Notice, Record, Start
@@ -167,7 +166,7 @@ class RunProcess:
         """How long to gather the ticks of many loops."""
         if len(self.phases_ns) <= _FEW_LOOPS:
             return 0
-        period_ns = loops_of(self.scenario)[0].timing.plant_period_ns
+        period_ns = min(loop.timing.plant_period_ns for loop in loops_of(self.scenario))
         return min(int(period_ns / _REST_SHARE / self.scenario.speed), _LONGEST_REST_NS)
 
     @contextmanager
@@ -289,7 +288,7 @@ class RunProcess:
     @property
     def _end_ns(self) -> int:
         """The last horizon of all loops."""
-        return loops_of(self.scenario)[0].timing.horizon_ns + max(self.phases_ns)
+        return self.scenario.timing.horizon_ns + max(self.phases_ns)
 
     def fail(self, error: BaseException) -> None:
         """Stop with an error as the reason."""

@@ -4,7 +4,7 @@ import select
 from collections.abc import Callable
 from typing import NamedTuple
 
-from noack.config.sections.run_sections import ClocksSection
+from noack.config.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S
 from noack.core.clock_offset import ClockOffset, Restart, RestartCause
 from noack.core.errors import PeerError
@@ -175,16 +175,10 @@ def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
     Raises:
-        PeerError: it is another clock, and nobody answers requests for its time, or the run has
-            several loops.
+        PeerError: it is another clock, and nobody answers requests for its time.
     """
     if not reads_other_clock(ticket):
         return None
-    if ticket.scenario.loops is not None:
-        raise PeerError(
-            "this process and the run's coordinator have different clocks; a run of several loops "
-            "needs hosts with one clock"
-        )
     if ticket.time_reference is None:
         raise PeerError(
             "this process and the run's coordinator have different clocks, and the coordinator's "

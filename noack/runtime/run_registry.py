@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import zenoh
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from noack.config.validation_messages import brief
+from noack.config.toml_file import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import lock_file
 from noack.runtime.control_messages import ChangeReply, parse_message

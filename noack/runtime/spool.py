@@ -132,6 +132,20 @@ def spool_files(folder: Path, table: str) -> list[Path]:
     return sorted(folder.glob(f"{table}.*"))
 
 
+def batches_in(data: memoryview) -> tuple[list[memoryview], int]:
+    """Return the rows of the complete batches at the begin of some data, and their length."""
+    found, begin, rows = [], 0, _CHUNK.size
+    while rows <= len(data) and (end := rows + _CHUNK.unpack_from(data, begin)[1]) <= len(data):
+        found.append(data[rows:end])
+        begin, rows = end, end + _CHUNK.size
+    return found, begin
+
+
+def batch_bytes(data: memoryview) -> int | None:
+    """Return the length of the batch that begins with some data; None if they are too short."""
+    return None if len(data) < _CHUNK.size else _CHUNK.size + int(_CHUNK.unpack_from(data)[1])
+
+
 def chunks_in(path: Path, begin: int = 0, end: int | None = None) -> Iterator[Chunk]:
     """Yield the complete batches of a file from the offset ``begin`` up to ``end``."""
     with path.open("rb", buffering=_READ_BYTES) as file:

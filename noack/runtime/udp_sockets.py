@@ -76,13 +76,14 @@ def errors_by_text(errors: Sequence[int]) -> dict[str, int]:
 class CountingSocket(ABC):
     """The sockets of a process in the loop, and what they count.
 
-    The core reads the socket of each peer and sends. Python reads, at every turn of housekeeping,
-    what other sources send to the process's socket (:mod:`noack.runtime.peer_sockets`). At the
-    first turn it passes on what the peers sent before their sockets were open.
+    The core reads the socket of each peer, and sends by sockets that are connected to the
+    destinations. Python reads, at every turn of housekeeping, what other sources send to the
+    process's port (:mod:`noack.runtime.peer_sockets`). At the first turn it passes on what the
+    peers sent before their sockets were open.
 
     Args:
         endpoint: the process's socket, from :func:`bind`; it stays unconnected.
-        destination: where most datagrams go.
+        destinations: where datagrams go, most of them to the first.
         peers: the addresses that datagrams are expected from.
 
     Raises:
@@ -93,13 +94,20 @@ class CountingSocket(ABC):
     """A longer datagram is cut, and rejected by its length."""
 
     def __init__(
-        self, endpoint: socket.socket, destination: Address, peers: Sequence[Address]
+        self, endpoint: socket.socket, destinations: Sequence[Address], peers: Sequence[Address]
     ) -> None:
-        self._endpoint, self._destination, self._peers = endpoint, destination, frozenset(peers)
-        self.peer_sockets = open_beside(endpoint, peers)
-        if not self.peer_sockets:
+        self._destination, self._peers = destinations[0], frozenset(peers)
+        others = [address for address in dict.fromkeys(destinations) if address not in peers]
+        opened = open_beside(endpoint, [*peers, *others])
+        if not opened:
             raise PeerError("the system refused to open a socket for each peer")
-        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
+        self._opened = dict(zip([*dict.fromkeys(peers), *others], opened, strict=True))
+        self.peer_sockets = [self._opened[address] for address in dict.fromkeys(peers)]
+        self.senders = [self._opened[address] for address in destinations]
+        """Sockets connected to the destinations."""
+        self._unexpected = [endpoint, *(self._opened[address] for address in others)]
+        for unexpected in self._unexpected:
+            unexpected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
         self._flood, self._sources = FloodWatch(), SourceCount(peers)
         self._counted: Counter[Address] = Counter()
         self._begins = True
@@ -121,19 +129,24 @@ class CountingSocket(ABC):
         self._begins = False
 
     def _read(self, now_ns: int, sink: RecordSink) -> bool:
-        """Read a datagram; return whether there was one."""
-        try:
-            data, source = self._endpoint.recvfrom(self.most_bytes)
-        except BlockingIOError:
-            return False
-        except OSError:  # an ICMP error of an earlier datagram
+        """Read a datagram from a source that is no peer; return whether there was one."""
+        for endpoint in self._unexpected:
+            try:
+                data, source = endpoint.recvfrom(self.most_bytes)
+            except BlockingIOError:
+                continue
+            except OSError:  # an ICMP error of an earlier datagram
+                return True
+            self._take(data, source, now_ns, sink)
             return True
+        return False
+
+    def _take(self, data: bytes, source: SocketName, now_ns: int, sink: RecordSink) -> None:
         address = source[:2]
         self._sources.add(address)
         if address not in self._peers:
             self._flood.left -= 1
         self.take(data, source, now_ns, sink)
-        return True
 
     def count_received(self, source: Address, total: int) -> None:
         """Note how many datagrams the core has received from a peer so far."""
@@ -144,7 +157,7 @@ class CountingSocket(ABC):
         """Counters, for the run's summary."""
         drops = [drops_of(one) for one in self.peer_sockets]
         return {
-            "local": text_of(self._endpoint.getsockname()),
+            "local": text_of(self._unexpected[0].getsockname()),
             "destination": text_of(self._destination),
             "received_from": self._sources.report(),
             "lost_in_kernel": None if None in drops else sum(n for n in drops if n is not None),
@@ -162,8 +175,8 @@ class CountingSocket(ABC):
 
     def close(self) -> None:
         """Close the sockets that it opened itself."""
-        for one in self.peer_sockets:
-            one.close()
+        for opened in self._opened.values():
+            opened.close()
 
     def _shed(self) -> int:
-        return drops_of(self._endpoint) or 0
+        return sum(drops_of(endpoint) or 0 for endpoint in self._unexpected)

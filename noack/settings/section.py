@@ -1,16 +1,34 @@
-"""The base of every table in a settings file, and the types of its numbers."""
+"""What every table of a settings file is made of: base class, numbers, vectors, matrices, kinds.
+
+A kind of settings is one module: a module in the kind's folder adds it (:func:`kinds_in`).
+"""
 
 import ast
 import inspect
+import json
 import sys
-from functools import cache
+from collections.abc import Iterable, Mapping
+from functools import cache, reduce
+from importlib import import_module
 from itertools import pairwise
-from typing import Annotated, Any
+from operator import or_
+from pkgutil import iter_modules
+from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, GetJsonSchemaHandler
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    FiniteFloat,
+    GetJsonSchemaHandler,
+    Tag,
+)
 from pydantic_core import CoreSchema
 
 from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix
+from noack.protocol.wire_format import MAX_DIMENSION
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -24,7 +42,8 @@ _LEAST_RATE_HZ = 1e-9  # lowest rate; its period in nanoseconds fits into 64 bit
 class ScenarioSection(BaseModel):
     """A frozen table of a settings file that refuses unknown keys."""
 
-    # Validators are built at their first use, that of a scenario with those of all its tables.
+    # Validators are built at their first use, that of a scenario with those of all its tables. So
+    # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     @classmethod
@@ -86,3 +105,101 @@ def require_whole_period(rate_hz: float, key: str) -> None:
             f"{key}: the period must be a whole number of nanoseconds; "
             f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
         )
+
+
+Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+"""A vector."""
+Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+"""A matrix by rows."""
+
+_LARGEST = 1e100
+_LONGEST_SHOWN = 60
+
+
+def rows_of(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix by rows."""
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
+    """Return (rows, columns) of a matrix; raise ValueError if its rows differ in length."""
+    widths = {len(row) for row in rows}
+    if len(widths) > 1:
+        raise ValueError(f"{key}: all rows need the same length, found lengths {sorted(widths)}")
+    return len(rows), widths.pop()
+
+
+def require_shape(
+    rows: tuple[tuple[float, ...], ...] | None, key: str, expected: tuple[int, int], why: str
+) -> None:
+    """Raise ValueError if a matrix is given and does not have the expected shape."""
+    if rows is None:
+        return
+    found = shape(rows, key)
+    if found != expected:
+        raise ValueError(
+            f"{key}: expected {expected[0]} x {expected[1]} ({why}), found {found[0]} x {found[1]}"
+            + (_transposed(rows) if found == expected[::-1] else "")
+        )
+
+
+def _transposed(rows: Iterable[Iterable[float]]) -> str:
+    other = json.dumps([list(column) for column in zip(*rows, strict=True)])
+    return "; looks transposed" + (f": try {other}" if len(other) <= _LONGEST_SHOWN else "")
+
+
+def require_length(row: tuple[object, ...] | None, key: str, expected: int, why: str) -> None:
+    """Raise ValueError if a vector or list of names is given and has another length."""
+    if row is not None and len(row) != expected:
+        raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
+
+
+def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-widths") -> None:
+    """Raise ValueError if an entry of a vector is negative; ``what`` names the entries."""
+    if any(entry < 0 for entry in row):
+        raise ValueError(f"{key}: {what} cannot be negative")
+
+
+def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
+    """Raise ValueError if an entry is negative, or its square overflows."""
+    require_non_negative(row, key, what)
+    if any(entry > _LARGEST for entry in row):
+        raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")
+
+
+Settings = TypeVar("Settings", bound=ScenarioSection)
+
+
+def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[str, type[Settings]]:
+    """Return the settings classes that the modules of a package define, by their kind.
+
+    They are subclasses of ``base``. The field ``key``, a ``Literal`` of one value, names the kind.
+    Subpackages are not searched.
+    """
+    found: dict[str, type[Settings]] = {}
+    for entry in iter_modules(import_module(package).__path__, f"{package}."):
+        if entry.ispkg:
+            continue
+        for one in vars(import_module(entry.name)).values():
+            if isinstance(one, type) and issubclass(one, base) and one.__module__ == entry.name:
+                names = get_args(one.model_fields[key].annotation)  # empty for a base class
+                found |= dict.fromkeys(names, one)
+    return found
+
+
+def union_of(
+    kinds: Mapping[str, type[ScenarioSection]], key: str = "kind", default: str | None = None
+) -> Any:
+    """Return the type of a table that is one of these kinds, for pydantic.
+
+    The field ``key`` names the kind; it may be omitted in a table of the kind ``default``.
+    """
+    if default is None:
+        return Annotated[reduce(or_, kinds.values()), Discriminator(key)]
+
+    def kind(given: object) -> str:
+        value = given.get(key, default) if isinstance(given, dict) else getattr(given, key, default)
+        return str(value)
+
+    tagged = [Annotated[settings, Tag(name)] for name, settings in kinds.items()]
+    return Annotated[reduce(or_, tagged), Discriminator(kind)]

@@ -1,1 +1,21 @@
-"""Identities, bounds and certificates of the theory."""
+"""What is certified of a loop, and why: five folders, to be read in this order.
+
+1. ``paper``: the identity (I1), the bounds of ‖e_c‖ that follow from it along a run, and the
+   paper's theorems as printed.
+2. ``bounds``: the numbers on which certificates rest. Suprema and integrals of responses, enclosed
+   between samples; the gains of a loop; what a trigger and the disturbances contribute.
+3. ``certificates``: the inequalities between all signals of a loop, their solution, and what it
+   guarantees of a scenario, with its assumptions.
+4. ``margins``: for a time-triggered sensor, or one with a longest time between events, whether all
+   loss patterns are stable. This is a question about products of matrices, and needs no bounds of
+   signals.
+5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
+
+The docstring of each folder says what follows from what. Labels such as eq:LossEv3 are those of the
+paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
+the files. Modules are imported in the order bounds, paper, certificates, random_losses, margins:
+the paper's formulas need enclosed suprema, too.
+
+Modules of scipy are imported in the functions that use them: their import takes longer than that of
+everything else here, and most certificates do not need them.
+"""

@@ -3,23 +3,386 @@
 * Two captures, of the sender's and of the receiver's end: the datagrams are matched by payload. The
   clocks differ, unless the user says otherwise.
 * One capture with both ends, such as the emulator writes: the same, with one clock.
-* One capture of the receiver's end: numbers and sending times from the datagrams of
-  ``noack measure``; or numbers at a known place of the payload, for a sender with a fixed period.
+* One capture of the receiver's end: numbers and sending times from the datagrams of ``noack
+  measure``; or numbers at a known place of the payload, for a sender with a fixed period.
 
 A flow is a pair of addresses at an interface. The largest is taken, unless the user names another.
 """
 
-from collections.abc import Sequence
+import hashlib
+import os
+import re
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import IO
+from typing import IO, NamedTuple
 
-from noack.traces.capture_blocks import is_capture
-from noack.traces.capture_flows import CaptureFlows
-from noack.traces.capture_matching import matched_trace, one_capture, two_captures
-from noack.traces.capture_numbers import SequenceField, trace_of_numbers, trace_of_probe
-from noack.traces.packet_trace import MAX_PACKETS, PacketTrace, TraceRecordError
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.protocol.probe_format import MAGIC, ProbeKind, decode_probe
+from noack.traces.capture_packets import (
+    CapturedFlow,
+    CutCaptureError,
+    captured_packets,
+    find_udp,
+    is_capture,
+)
+from noack.traces.packet_trace import (
+    MAX_PACKETS,
+    Int64s,
+    PacketTrace,
+    TraceRecordError,
+    envelope_slope,
+    packet_trace,
+    relative_delays,
+)
 from noack.traces.trace_formats import TraceFormat
-from noack.traces.udp_headers import CapturedFlow
+
+_MOST_FLOWS = 1_000_000
+_KEY = os.urandom(16)
+"""Payloads are compared by a keyed hash, so that nobody can make two with the same."""
+_FIELD = re.compile(r"([0-9]{1,5}):([1-8])(:little)?")
+_MOST = 2**62
+
+
+class CapturedDatagram(NamedTuple):
+    """A UDP datagram of a capture."""
+
+    t_ns: int
+    flow: CapturedFlow
+    payload: bytes
+    is_cut: bool
+    """Whether only its beginning was captured."""
+    is_outbound: bool
+
+
+class Payloads(NamedTuple):
+    """Captured datagrams, sorted by time."""
+
+    t_ns: Int64s
+    hashes: Int64s
+    """Of the payloads."""
+    flow: Int64s
+    """Places of the flows in :attr:`CaptureFlows.names`."""
+
+
+class CaptureFlows:
+    """A capture that has been read once: its flows, the largest first.
+
+    Raises:
+        ValueError: it is not a capture, or has no UDP datagrams.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.notes: list[str] = []
+        """Lines about the capture."""
+        counts: Counter[CapturedFlow] = Counter()
+        for datagram in self.datagrams(self.notes):
+            counts[datagram.flow] += 1
+            if len(counts) > _MOST_FLOWS:
+                raise ValueError(f"has more than {_MOST_FLOWS} flows; filter the capture first")
+        if not counts:
+            cut = self.notes[0].partition(";")[0] if self.notes else ""
+            raise ValueError(f"has no UDP datagrams{': ' if cut else ''}{cut}")
+        self.names, self._counts = zip(*counts.most_common(), strict=True)
+
+    def choose(self, number: int) -> CapturedFlow:
+        """Return the flow of a number; 1 is the largest. Raise ValueError if there is none."""
+        if not 1 <= number <= len(self.names):
+            raise ValueError(f"has no flow {number}; its flows are 1 to {len(self.names)}")
+        flow: CapturedFlow = self.names[number - 1]
+        many = len(self.names)
+        others = f"; --flow chooses another of the {many} flows" if many > 1 else ""
+        self.notes.append(f"flow {number}: {flow}, {self._counts[number - 1]} datagrams{others}")
+        return flow
+
+    def datagrams(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
+        """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
+        try:
+            for packet in captured_packets(self._file):
+                datagram = find_udp(packet.interface, packet.link_type, packet.data)
+                if datagram is None or _is_end_of_probe(datagram[1]):
+                    continue
+                flow, payload, is_complete = datagram
+                yield CapturedDatagram(
+                    packet.t_ns, flow, payload, not is_complete, packet.is_outbound
+                )
+        except CutCaptureError as error:
+            if notes is not None:
+                notes.append(f"the capture {error}; what is before is used")
+
+    def payloads(self) -> Payloads:
+        """Return all complete datagrams."""
+        numbers = {flow: number for number, flow in enumerate(self.names)}
+        columns = array("q"), array("q"), array("q")
+        for datagram in self.datagrams():
+            if not datagram.is_cut:
+                digest = hashlib.blake2b(datagram.payload, digest_size=8, key=_KEY).digest()
+                hashed = int.from_bytes(digest, "little", signed=True)
+                values = datagram.t_ns, hashed, numbers[datagram.flow]
+                for column, value in zip(columns, values, strict=True):
+                    column.append(value)
+        order = np.argsort(np.array(columns[0]), kind="stable")
+        return Payloads(*(np.array(column)[order] for column in columns))
+
+
+def _is_end_of_probe(payload: bytes) -> bool:
+    return payload[:4] == MAGIC and payload[5:6] in (b"\4", b"\5")
+
+
+class _Matches(NamedTuple):
+    """Datagrams at the receiver's end with the payload of a sent one."""
+
+    received: Int64s
+    """Places among the received datagrams."""
+    sent: Int64s
+    """Places among the sent datagrams."""
+
+
+def two_captures(
+    sender: CaptureFlows, flow: CapturedFlow, receiver: CaptureFlows
+) -> tuple[Payloads, Payloads]:
+    """Return the datagrams of a flow at its sender, and all that may be the same at the receiver.
+
+    The addresses may differ (NAT, a relay); only the reverse flow of an echo is left out.
+    """
+    back = [k for k, name in enumerate(receiver.names) if name.is_reverse_of(flow)]
+    received = receiver.payloads()
+    sent = sender.payloads()
+    return (
+        _where(sent, sent.flow == sender.names.index(flow)),
+        _where(received, ~np.isin(received.flow, back)),
+    )
+
+
+def one_capture(
+    flows: CaptureFlows, flow: CapturedFlow, notes: list[str]
+) -> tuple[Payloads, Payloads] | None:
+    """Return the datagrams at the two ends in one capture; None if it has one end only."""
+    everything = flows.payloads()
+    number = flows.names.index(flow)
+    mine = _where(everything, everything.flow == number)
+    back = [k for k, name in enumerate(flows.names) if name.is_reverse_of(flow)]
+    others = _where(everything, ~np.isin(everything.flow, [number, *back]))
+    if not len(mine.t_ns):
+        return None
+    matches = _matches(mine, others)
+    if not len(matches.sent):
+        return None
+    of_flow = others.flow[matches.received]
+    counts = np.bincount(of_flow)
+    delays_ns = others.t_ns[matches.received] - mine.t_ns[matches.sent]
+    # A reverse flow with the same payloads (an echo) takes longer.
+    likely = np.flatnonzero(2 * counts > counts.max())
+    medians = {int(k): float(np.median(delays_ns[of_flow == k])) for k in likely}
+    other = min(medians, key=lambda k: abs(medians[k]))
+    notes.append(f"the other end: {flows.names[other]}")
+    theirs = _where(others, others.flow == other)
+    return (mine, theirs) if medians[other] >= 0 else (theirs, mine)
+
+
+def matched_trace(
+    sent: Payloads, received: Payloads, clocks_differ: bool, most: int, notes: list[str]
+) -> PacketTrace:
+    """Return the trace of the sent datagrams.
+
+    Raises:
+        ValueError: payloads are repeated, or none has arrived.
+    """
+    repeated = len(sent.hashes) - len(np.unique(sent.hashes))
+    if repeated:
+        raise ValueError(
+            f"{repeated} of {len(sent.hashes)} datagrams have the payload of another one, and "
+            "cannot be matched; if they are numbered, give the receiver's capture with "
+            "--sequence-at OFFSET:BYTES"
+        )
+    matches = _matches(sent, received)
+    arrived, first = np.unique(matches.sent, return_index=True)
+    if not len(arrived):
+        raise ValueError(
+            "none of the complete datagrams sent is in the receiver's capture; are both captures "
+            "of whole packets (tcpdump -s 0), and of the same time?"
+        )
+    if len(matches.sent) > len(arrived):
+        notes.append(f"duplicates at the receiver: {len(matches.sent) - len(arrived)}")
+    for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
+        if outside:
+            notes.append(
+                f"the {where} {outside} sent datagrams did not arrive; if the receiver's capture "
+                "did not run then, they are no losses"
+            )
+    received_ns = np.zeros(len(sent.t_ns), np.int64)
+    received_ns[arrived] = received.t_ns[matches.received[first]]
+    lost = np.ones(len(sent.t_ns), bool)
+    lost[arrived] = False
+    trace = packet_trace(
+        sent.t_ns, received_ns, lost, clocks_differ=clocks_differ, most_packets=most
+    )
+    return relative_delays(trace) if clocks_differ else trace
+
+
+def _where(payloads: Payloads, flags: NDArray[np.bool_]) -> Payloads:
+    return Payloads(*(column[flags] for column in payloads))
+
+
+def _matches(sent: Payloads, received: Payloads) -> _Matches:
+    if not len(sent.hashes):
+        return _Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    hashes, places = np.unique(sent.hashes, return_index=True)
+    at = np.minimum(np.searchsorted(hashes, received.hashes), len(hashes) - 1)
+    known = np.flatnonzero(hashes[at] == received.hashes)
+    return _Matches(known, places[at[known]])
+
+
+class SequenceField(NamedTuple):
+    """Where a payload has its sequence number."""
+
+    offset: int
+    size_bytes: int
+    is_little: bool
+
+    @classmethod
+    def parse(cls, text: str) -> "SequenceField":
+        """Parse ``OFFSET:BYTES`` or ``OFFSET:BYTES:little``; raise ValueError if it is neither."""
+        match = _FIELD.fullmatch(text)
+        if match is None:
+            raise ValueError(
+                f"expected OFFSET:BYTES with 1 to 8 bytes, e.g. 2:2 for RTP, or 8:4:little; "
+                f"found {text!r}"
+            )
+        return cls(int(match[1]), int(match[2]), match[3] is not None)
+
+    def read(self, payload: bytes) -> int | None:
+        """Return the number; None if the payload is too short."""
+        part = payload[self.offset : self.offset + self.size_bytes]
+        if len(part) < self.size_bytes:
+            return None
+        return int.from_bytes(part, "little" if self.is_little else "big")
+
+
+class _Numbered(NamedTuple):
+    number: Int64s
+    received_ns: Int64s
+    sent_ns: Int64s
+
+
+def _numbered(
+    flows: CaptureFlows, flow: CapturedFlow, read: Callable[[bytes], tuple[int, int] | None]
+) -> _Numbered:
+    """Return the numbers, times of arrival and of sending of a flow, and check its direction."""
+    columns = array("q"), array("q"), array("q")
+    outbound = 0
+    for datagram in flows.datagrams():
+        if datagram.flow == flow and (fields := read(datagram.payload)) is not None:
+            outbound += datagram.is_outbound
+            values = fields[0], datagram.t_ns, fields[1]
+            for column, value in zip(columns, values, strict=True):
+                column.append(value)
+    if columns[0] and outbound == len(columns[0]):
+        raise ValueError(
+            "shows the sender's end only, where nothing is lost yet; capture at the receiver, or "
+            "give the captures of both ends"
+        )
+    return _Numbered(*map(np.array, columns))
+
+
+def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
+    order = np.lexsort((numbered.received_ns, numbered.number))
+    number = numbered.number[order]
+    first = order[np.flatnonzero(np.diff(number, prepend=number[0] - 1))]
+    if len(first) < len(order):
+        notes.append(f"duplicates: {len(order) - len(first)}; the first counts")
+    return _Numbered(*(column[first] for column in numbered))
+
+
+def trace_of_probe(
+    flows: CaptureFlows, flow: CapturedFlow, most_packets: int, notes: list[str]
+) -> PacketTrace:
+    """Return the trace of a probe of `noack measure`: the datagrams have their sending times."""
+    sessions: Counter[int] = Counter()
+
+    def read(payload: bytes) -> tuple[int, int] | None:
+        try:
+            content = decode_probe(payload)
+        except ValueError:
+            return None
+        if content.kind not in (ProbeKind.PROBE, ProbeKind.REQUEST):
+            return None
+        sessions[content.session] += 1
+        return content.sequence, content.sent_ns
+
+    numbered = _numbered(flows, flow, read)
+    if not len(numbered.number):
+        raise ValueError(
+            "has one end only, and no datagrams of `noack measure`; give the captures of both "
+            "ends, or say where the payload has a sequence number: --sequence-at OFFSET:BYTES"
+        )
+    if len(sessions) > 1:
+        raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
+    numbered = _first_of_each(numbered, notes)
+    nothing_lost = np.zeros(len(numbered.number), bool)
+    trace = packet_trace(
+        numbered.sent_ns, numbered.received_ns, nothing_lost, numbered.number,
+        clocks_differ=True, most_packets=most_packets,
+    )  # fmt: skip
+    return relative_delays(trace)
+
+
+def trace_of_numbers(
+    flows: CaptureFlows,
+    flow: CapturedFlow,
+    field: SequenceField,
+    most_packets: int,
+    notes: list[str],
+) -> PacketTrace:
+    """Return the trace of a sender with a constant period; the payloads have a number each."""
+    bits = 8 * field.size_bytes
+
+    def read(payload: bytes) -> tuple[int, int] | None:
+        number = field.read(payload)
+        return None if number is None or number >= _MOST else (number, 0)
+
+    numbered = _numbered(flows, flow, read)
+    if len(numbered.number) < 2:
+        raise ValueError(
+            f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
+        )
+    order = np.argsort(numbered.received_ns, kind="stable")
+    number = _unwrapped(numbered.number[order], bits)
+    numbered = _first_of_each(
+        numbered._replace(number=number, received_ns=numbered.received_ns[order]), notes
+    )
+    k, received_ns = (
+        numbered.number - numbered.number[0],
+        numbered.received_ns - numbered.received_ns.min(),
+    )
+    if k[-1] >= most_packets:
+        raise ValueError(
+            f"the sequence numbers span {k[-1] + 1} packets; at most {most_packets} can "
+            "be; check --sequence-at"
+        )
+    period_ns = max(envelope_slope(k, received_ns), 0.0)
+    sent_ns = np.rint(period_ns * k).astype(np.int64)
+    notes.append(
+        f"the capture has no sending times: the sender's period is assumed to be constant, "
+        f"{period_ns / 1e6:.6g} ms (lower envelope of the arrivals); delays are relative"
+    )
+    return packet_trace(
+        sent_ns, received_ns, np.zeros(len(k), bool), numbered.number,
+        clocks_differ=True, most_packets=most_packets,
+    )  # fmt: skip
+
+
+def _unwrapped(number: Int64s, bits: int) -> NDArray[np.int64]:
+    """Return numbers in the order of arrival without wrap-around; ``bits`` is the field's size."""
+    if bits > 32:
+        return number
+    half = 1 << bits - 1
+    steps = (np.diff(number) + half) % (1 << bits) - half
+    return np.concatenate((number[:1], number[0] + np.cumsum(steps)))
 
 
 @dataclass(frozen=True)
@@ -67,10 +430,10 @@ def _trace(
         notes += receiver.notes
         ends = two_captures(flows, flow, receiver)
     else:
-        found = one_capture(flows, flow, notes)
-        if found is None:
+        both_ends = one_capture(flows, flow, notes)
+        if both_ends is None:
             return trace_of_probe(flows, flow, most, notes)
-        ends = found
+        ends = both_ends
     differ = bool(others) if options.clocks_differ is None else options.clocks_differ
     return matched_trace(*ends, differ, most, notes)
 

@@ -17,8 +17,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from noack.core.errors import shortened
-from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace
-from noack.traces.relative_delay import relative_delays
+from noack.traces.packet_trace import PacketTrace, TraceRecordError, packet_trace, relative_delays
 from noack.traces.trace_formats import TraceFormat
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -52,23 +51,23 @@ class _Column(NamedTuple):
 
 def _columns(header: Sequence[str]) -> tuple[_Column | None, _Column, _Column]:
     """Return the columns of numbers (if there is one), of sending and of receiving times."""
-    found: dict[str, _Column] = {}
-    for place, name in enumerate(header):
+    columns: dict[str, _Column] = {}
+    for index, name in enumerate(header):
         time = _TIME_COLUMN.fullmatch(name)
         what = time[1].removesuffix(_OTHER) if time else name
-        if what in found and (time or what == "sequence"):
+        if what in columns and (time or what == "sequence"):
             raise ValueError(
-                f"line 1: has the columns {found[what].name} and {name}; one is needed"
+                f"line 1: has the columns {columns[what].name} and {name}; one is needed"
             )
         if time or what == "sequence":
-            found[what] = _Column(name, place, _UNITS_NS[time[2]] if time else 1)
+            columns[what] = _Column(name, index, _UNITS_NS[time[2]] if time else 1)
     for what in ("sent", "received"):
-        if what not in found:
+        if what not in columns:
             raise ValueError(
                 f"line 1: has no column {what}_ms (or _s, _us, _ns); "
                 f"its columns: {shortened(', '.join(header))}"
             )
-    return found.get("sequence"), found["sent"], found["received"]
+    return columns.get("sequence"), columns["sent"], columns["received"]
 
 
 def _lines(file: IO[bytes]) -> Iterator[str]:

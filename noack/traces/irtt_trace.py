@@ -92,7 +92,7 @@ def _entries(texts: Iterator[str]) -> Iterator[Any]:
         text += piece
 
 
-def _values(entry: Any, place: int) -> tuple[int, int, int, str]:
+def _values(entry: Any, index: int) -> tuple[int, int, int, str]:
     """Return number, times of sending and receiving, and whether and where it was lost."""
     try:
         client = entry["timestamps"]["client"]
@@ -100,13 +100,13 @@ def _values(entry: Any, place: int) -> tuple[int, int, int, str]:
         way = str(entry["lost"]).lower()
         received_ns = LOST_NS if way in _WAYS else client["receive"]["monotonic"]
         values = number, sent_ns, received_ns
-        if way not in ("false", *_WAYS) or not all(type(one) is int for one in values):
+        if way not in ("false", *_WAYS) or not all(type(value) is int for value in values):
             raise TypeError
-        if not all(abs(one) < _MOST for one in values):
-            raise ValueError(f"round trip {place + 1}: has a number that is too large")
+        if not all(abs(value) < _MOST for value in values):
+            raise ValueError(f"round trip {index + 1}: has a number that is too large")
     except (KeyError, TypeError, IndexError):
         raise ValueError(
-            f"round trip {place + 1}: expected seqno, lost, and timestamps of the client with "
+            f"round trip {index + 1}: expected seqno, lost, and timestamps of the client with "
             "send and receive, in ns of the monotonic clock"
         ) from None
     return (*values, way)

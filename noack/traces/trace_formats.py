@@ -1,4 +1,7 @@
-"""Formats of packet traces, one module of this folder each; :func:`read_trace` finds the format."""
+"""Formats of packet traces, one module of this folder each, and the traces that come with noack.
+
+:func:`read_trace` finds the format of a file.
+"""
 
 import gzip
 import zlib
@@ -9,12 +12,14 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import IO, Any
 
-from noack.core.errors import CallerError, one_line, why
+from noack.core.errors import CallerError, one_line, shortened, why
 from noack.core.file_access import open_regular
 from noack.traces.packet_trace import MAX_PACKETS, PacketTrace
 
 _HEAD_BYTES = 4096
 _GZIP = b"\x1f\x8b"
+_FOLDER = Path(__file__).parent / "shipped"
+_LONGEST = 100
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,9 @@ class TraceFormat:
 def _formats() -> Sequence[TraceFormat]:
     entries = iter_modules(import_module(__package__).__path__, f"{__package__}.")
     modules = (vars(import_module(entry.name)) for entry in entries if entry.name != __name__)
-    return [one for module in modules for one in module.values() if isinstance(one, TraceFormat)]
+    return [
+        value for module in modules for value in module.values() if isinstance(value, TraceFormat)
+    ]
 
 
 def read_trace(
@@ -65,15 +72,17 @@ def read_trace(
     try:
         with open_regular(path) as file:
             head, file = _decompressed(file)
-            found = next((one for one in known if one.recognises(head)), None)
-            if found is None:
-                names = ", ".join(sorted(one.name for one in known))
+            known_format = next(
+                (candidate for candidate in known if candidate.recognises(head)), None
+            )
+            if known_format is None:
+                names = ", ".join(sorted(candidate.name for candidate in known))
                 raise ValueError(
                     f"not a packet trace; {names} can be read, also compressed by gzip"
-                    f"{''.join(f', {one}' for one in others)}; a CSV file "
+                    f"{''.join(f', {other}' for other in others)}; a CSV file "
                     "begins with a header, e.g. sequence,sent_ms,received_ms"
                 )
-            return found.read(file, most_packets, clocks_differ)
+            return known_format.read(file, most_packets, clocks_differ)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise CallerError(f"{place or path}: cannot be decompressed: {one_line(error)}") from None
     except (OSError, ValueError) as error:
@@ -91,3 +100,26 @@ def _decompressed(file: IO[bytes]) -> tuple[bytes, IO[bytes]]:
     head = content.read(_HEAD_BYTES)
     content.seek(0)
     return head, content
+
+
+def find_trace(name: str, folder: Path = Path(), named: str = "") -> Path:
+    """Return the path of a trace given by path, or by the name of a shipped one.
+
+    Args:
+        name: as the user gave it.
+        folder: a relative path is relative to it.
+        named: what a message calls the name; by default the name.
+
+    Raises:
+        CallerError: a bare name that is neither that of a file nor that of a shipped trace.
+    """
+    path = folder / name
+    if len(Path(name).parts) != 1 or Path(name).suffix or len(name) > _LONGEST or path.exists():
+        return path
+    shipped = {path.stem: path for path in _FOLDER.glob("*/*.csv")}
+    if name in shipped:
+        return shipped[name]
+    raise CallerError(
+        f"{named or shortened(name)}: no such file, nor a shipped trace; "
+        f"there are {', '.join(sorted(shipped))}"
+    )

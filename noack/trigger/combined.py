@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Self
 from pydantic import field_validator
 
 from noack.core.linear_systems import Matrix
-from noack.settings.matrices import Rows
+from noack.settings.section import Rows
 from noack.trigger.policy_settings import Interval, PolicySettings
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 if TYPE_CHECKING:
-    AnyTrigger = PolicySettings  # noack.config.feature_kinds inserts the union of all policies
+    AnyTrigger = PolicySettings  # noack.config.sections inserts the union of all policies
 
 
 class CombinedSettings(PolicySettings):

@@ -10,7 +10,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
@@ -80,3 +83,8 @@ class DecayingTrigger:
     def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""
         return max(self.beta * math.exp(-self.alpha_per_s * t_ns * 1e-9), self.floor)
+
+    def thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
+        """Return the threshold at k times, (k,)."""
+        decayed = self.beta * np.exp(-self.alpha_per_s * t_ns * 1e-9)
+        return np.asarray(np.maximum(decayed, self.floor))

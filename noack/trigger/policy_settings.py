@@ -2,7 +2,7 @@
 
 A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
 field ``policy``, and the behaviour that the settings describe;
-:mod:`noack.config.feature_kinds` finds it there.
+:mod:`noack.config.sections` finds it there.
 """
 
 import warnings
@@ -15,9 +15,8 @@ from pydantic import Field, FiniteFloat
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.settings.matrices import Rows, require_shape
-from noack.settings.section import ScenarioSection
-from noack.trigger.trigger_policy import Policy
+from noack.settings.section import Rows, ScenarioSection, require_shape
+from noack.trigger.trigger_rule import Policy
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
 Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]

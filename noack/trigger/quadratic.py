@@ -13,8 +13,7 @@ from pydantic import Field
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.settings.matrices import Rows, require_shape
-from noack.settings.section import NonNegative
+from noack.settings.section import NonNegative, Rows, require_shape
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import NEVER_NS, QuadraticForm, TriggerRule, quadratic_form
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from controller_node.controller import Controller, controller_of
+from controller_node.controller import Controller
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
@@ -24,7 +24,7 @@ from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import machine, state_of
+from tests.machine_parts import controller_of, machine, state_of
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])

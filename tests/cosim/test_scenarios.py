@@ -27,14 +27,14 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix
 from noack.plants.four_tank import FourTankSettings
+from noack.plants.plant_settings import OdeSystem
 from noack.plants.quadrotor import QuadrotorSettings
-from noack.plants.systems.ode_integrator import OdeSystem
 from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-SHARED = ("shared_bottleneck", "shared_channel")  # several loops on one network
+SHARED = ("different_loops", "shared_bottleneck", "shared_channel")  # several loops on one network
 NAMES = sorted({path.stem for path in SCENARIOS.glob("*.toml")} - {*SHARED})
 ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5, "lane_5g_rural": 0.5}
 """‖x(T)‖ / ‖x(0)‖. The F-16 starts with sideslip in rad and ends with a small rudder angle in °;

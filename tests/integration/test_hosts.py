@@ -11,11 +11,15 @@ from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks._report import MeasurementError
 from benchmarks._two_hosts import TwoHosts, two_hosts
-from cosim.record.run_record import load_record
+from cosim.record.run_record import load_record, load_run
+from noack.config.scenario import phases_ns
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
 from tests.integration import conftest as live
 
@@ -39,10 +43,14 @@ def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
     """Start a command of noack on a host, with a runtime directory of the host's own."""
     with ExitStack() as stack:
 
-        def begin(host: int, *arguments: str, path: Path | None = None) -> subprocess.Popen[str]:
+        def begin(
+            host: int, *arguments: str, path: Path | None = None, ahead_s: int = 0
+        ) -> subprocess.Popen[str]:
             runtime = tmp_path / f"host {host}"
             runtime.mkdir(exist_ok=True)
-            command = hosts.inside(host, *live.noack_command(*arguments))
+            clock = ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"]
+            command = [*(clock if ahead_s else ()), *live.noack_command(*arguments)]
+            command = hosts.inside(host, *command)
             environment = os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
             if path is not None:
                 environment["PATH"] = f"{path}:{environment['PATH']}"
@@ -103,6 +111,75 @@ def test_two_hosts_carry_a_run(start: Start, hosts: TwoHosts, tmp_path: Path, ip
     tables = load_record((tmp_path / "runs" / "latest").resolve())
     assert len(tables["plant_step"]) == 4 * live.RATE_HZ + 1
     assert not (tmp_path / "invitation.json").exists()
+
+
+SEVERAL = """
+name = "three"
+horizon_s = 4.0
+
+[model]
+A = [[0.0, 1.0], [2.0, 0.0]]
+B = [[0.0], [1.0]]
+gain = [[-6.0, -3.0]]
+
+[plant]
+initial_state = [0.2, 0.0]
+initial_state_halfwidth = [0.1, 0.1]
+rate_hz = 100.0
+
+[controller]
+rate_hz = 100.0
+
+[trigger]
+policy = "periodic"
+period_s = 0.05
+
+[network]
+mansd = 2
+loss = { model = "bernoulli", probability = 0.3 }
+
+[clocks]
+largest_error_us = 1e6  # a busy machine gives wide bounds
+
+[[loops]]
+name = "one"
+
+[[loops]]
+name = "late"
+count = 2
+phase = 0.5
+"""
+AHEAD_S = 3
+
+
+def test_several_loops_run_on_hosts_with_different_clocks(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "three.toml").write_text(SEVERAL)
+    recording = start(0, "record", "three.toml", "--listen", "10.83.3.1", "--json", *live.BARE)
+    live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
+    assert recording.poll() is None, recording.communicate()
+    at_home = [start(0, role) for role in ("plant", "sensor")]
+    away = [start(1, role, *INVITED, ahead_s=AHEAD_S) for role in ("netem", "controller")]
+    for process in (*at_home, *away):
+        _, stderr = ended(process)
+        assert process.returncode == 0, stderr
+    stdout, stderr = ended(recording)
+    assert recording.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert summary["network"]["replay"]["bit_exact"]
+    for loop in summary["loops"]:
+        assert loop["missing_samples"] == loop["unintended_losses"] == 0
+        assert loop["replay"]["bit_exact"]
+        assert 0 < loop["conditions"]["clock_error_s"] < 1
+    run = load_run((tmp_path / "runs" / "latest").resolve())
+    phase_ns = phases_ns(run.scenario)[1]
+    assert phase_ns > 0
+    for table in CLOCK_TABLES:
+        one, late, _ = (record[table] for record in run.loops)
+        assert len(one) > 0
+        assert (one["t_ns"] - late["t_ns"] == phase_ns).all()  # each loop has its own time
+        known = one[one["error_ns"] != LOST_NS]
+        true_ns = -AHEAD_S * NS_PER_S * (OWNER[table] in ("netem", "controller"))
+        assert (np.abs(known["offset_ns"] - true_ns) <= known["error_ns"]).all()
 
 
 def test_an_invitation_is_for_its_role_and_its_time(start: Start, tmp_path: Path) -> None:

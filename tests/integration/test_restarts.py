@@ -13,7 +13,7 @@ from noack.config.scenario_file import load
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import read_chunks
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 from tests.integration import conftest as live
 
 LOOP = ("plant_step", "sensor_measurement", "controller_step")

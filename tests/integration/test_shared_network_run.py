@@ -12,7 +12,7 @@ from cosim.analysis.summary_model import read_summary
 from cosim.output.network_table import network_rows
 from cosim.record.packet_outcomes import updates_in
 from cosim.record.run_record import RunRecord, load_record, load_run
-from noack.config.loops import phases_ns
+from noack.config.scenario import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
 from tests.integration import conftest as live
 from tests.integration.test_restarts import goes_on, spooled

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.simulation.batch.batch_interface import run_with_events
+from cosim.simulation.batch import run_with_events
 from cosim.simulation.exact_simulation import ExactSimulation
 from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.trigger.decaying import DecayingTrigger

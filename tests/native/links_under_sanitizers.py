@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from netem.link_state import LinkState
 from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.link_records import NEVER_NS, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
 from tests.netem.any_settings import capped, computable, harsh
 
 LATEST_NS, LARGEST_BYTES = 2**61, 65_535

@@ -87,7 +87,7 @@ def machines_of(role: str, of: Sizes, seeds: list[int], scale: float, **more: An
             else plant(seed, of, min(scale, 1e3))  # others are refused before
             for seed in seeds
         ]  # fmt: skip
-        own = LoopMachines(parts, numbered=True, **more)
+        own = LoopMachines(parts, **more)
         for one in own.machines:
             if role == "plant":
                 one.x[0] *= scale

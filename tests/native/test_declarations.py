@@ -6,7 +6,7 @@ from pathlib import Path
 from noack.core.core_library import core, dtype_of, ffi
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.kinds import IMPAIRMENTS
-from noack.impairments.link_records import Counters, RecordedDecision
+from noack.impairments.link_settings import Counters, RecordedDecision
 from noack.protocol.record_tables import Fate
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 
 MOST = 1_000_000
 

@@ -9,15 +9,15 @@ import pytest
 
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
-from noack.impairments import kept_loss
-from noack.impairments.kept_loss import (
+from noack.impairments import loss_prediction
+from noack.impairments.loss_prediction import (
     expected_loss,
     found_probabilities,
+    predict,
+    read_files,
     remember,
     with_kept_loss,
 )
-from noack.impairments.link_settings import read_files
-from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
 
 DECISIONS = 2_000_000
@@ -58,8 +58,8 @@ def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> N
     settings = settings_of("loss 10% keep loss 5% mansd 1 delay 1ms")
     found = found_probabilities(settings, settings_of("delay 1ms"))
     assert list(found.values()) == [with_kept_loss(settings).impairments[0].loss.probability]  # type: ignore[attr-defined]
-    monkeypatch.setattr(kept_loss, "_found", {})
-    monkeypatch.setattr(kept_loss, "predict", None)
+    monkeypatch.setattr(loss_prediction, "_found", {})
+    monkeypatch.setattr(loss_prediction, "predict", None)
     remember(json.loads(json.dumps(found)))
     assert found_probabilities(settings_of("loss 10% keep loss 5% delay 9ms mansd 1")) == found
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):

@@ -7,8 +7,7 @@ from netem import link_state
 from netem.link_state import LinkState
 from noack.core.core_library import address_of
 from noack.impairments.kinds.delay import Delay
-from noack.impairments.link_records import NEVER_NS
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 
 
 def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:

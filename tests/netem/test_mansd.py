@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from netem.link_state import LinkState
 from netem.words.words_to_settings import settings_of
 from noack.core.core_library import core, ffi
-from noack.impairments.constraints import guarantee_of
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.constraints import join_guarantee
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.impairments.loss_guarantee import LossAutomaton
 from tests.netem import any_settings
 from tests.netem.loss_language import is_allowed
@@ -315,7 +314,7 @@ def test_the_link_and_the_rules_of_the_analysis_are_one_guarantee(
     own = settings_of(f"mansd {mansd}").model_copy(update={"constraints": constraints})
     link = LinkState(own, 0, "a")
     link.start_flow(0, 0)
-    automaton, place = LossAutomaton(guarantee_of(mansd, constraints)), np.zeros(1, np.int64)
+    automaton, place = LossAutomaton(join_guarantee(mansd, constraints)), np.zeros(1, np.int64)
     for packet, wish in enumerate(wishes):
         must_pass = core.noack_must_pass(link.core, 0)
         assert must_pass == (automaton.after_loss(place)[0] < 0)

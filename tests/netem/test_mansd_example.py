@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_records import NEVER_NS, RecordedDecision
+from noack.impairments.link_settings import NEVER_NS, RecordedDecision
 from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link
 

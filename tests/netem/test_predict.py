@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_records import NEVER_NS
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.impairments.loss_prediction import predict
 from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link

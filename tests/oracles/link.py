@@ -14,8 +14,7 @@ from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped
 from netem.link_state import LinkState
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
-from noack.impairments.link_records import NEVER_NS, Counters, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, Counters, LinkSettings, RecordedDecision
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,

@@ -7,7 +7,7 @@ import numpy as np
 
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
-from noack.config.scenario_changes import with_settings
+from noack.config.scenario_checks import with_settings
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import SignalSource
 from tests.oracles.trigger_rules import Array, Rule

@@ -16,10 +16,8 @@ from noack.disturbances.uniform import UniformDisturbance
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
-from plant_server.disturbance_signal import BLOCK, disturbance_of
-from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.plant import plant_of
-from tests.machine_parts import state_of
+from plant_server.plant import BLOCK, MeasurementModel, disturbance_of, measurement_model_of
+from tests.machine_parts import plant_of, state_of
 
 STEPS = 4000
 

@@ -14,8 +14,7 @@ from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.plant import plant_of
-from tests.machine_parts import linear_plant, state_of
+from tests.machine_parts import linear_plant, plant_of, state_of
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])

@@ -12,7 +12,7 @@ from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from plant_server.plant import plant_of
+from tests.machine_parts import plant_of
 
 MS = 1_000_000
 K = np.array([[-3.0, -1.5]])

@@ -8,26 +8,27 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.config.resolution import resolve, tables_of
+from noack.config.resolution import assumed_model, resolve, steady_state, tables_of, true_model
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.config.state_estimation import assumed_model, steady_state, true_model
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.machines.loop_machines import LoopMachines
-from noack.observers.estimation_model import EstimationModel
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
-from noack.observers.observability import observer_gain, unobservable_mode
-from noack.observers.observer_settings import ObserverSettings
+from noack.observers.observer_settings import (
+    EstimationModel,
+    ObserverSettings,
+    observer_gain,
+    unobservable_mode,
+)
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.trigger.absolute import AbsoluteTrigger
-from sensor_node.observer import Observer
-from sensor_node.sensor import Sensor, sensor_of
-from tests.machine_parts import machine
+from sensor_node.sensor import Observer, Sensor
+from tests.machine_parts import machine, sensor_of
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])

@@ -16,8 +16,8 @@ from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.decaying import DecayingTrigger
-from sensor_node.sensor import Sensor, sensor_of
-from tests.machine_parts import machine, state_of
+from sensor_node.sensor import Sensor
+from tests.machine_parts import machine, sensor_of, state_of
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))
@@ -156,7 +156,7 @@ def test_the_sensor_acts_on_measurements_only() -> None:
     sensor = machine(Sensor(ZOH, DecayingTrigger(0.5, 0.25)))
     sensor.handle(measurement(0, 0, [1.0]), 0)
     assert sensor.next_deadline_ns() is None
-    assert sensor.on_timer(10**9) == ()
+    assert not sensor.on_timer(10**9)
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])

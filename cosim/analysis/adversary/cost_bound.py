@@ -17,11 +17,10 @@ import numpy as np
 from cosim.analysis.adversary.objective import weight_of
 from cosim.analysis.adversary.pattern_tree import Ceiling
 from cosim.analysis.adversary.search_nodes import Nodes
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from cosim.simulation.continuous import ContinuousLoop
 from noack.core.linear_systems import Vector
-from noack.theory.enclosure import response
-from noack.theory.error_gains import ErrorGains, Output
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError, response
+from noack.theory.bounds.gains import ErrorGains, Output
 
 
 def cost_ceiling(

@@ -11,7 +11,7 @@ from cosim.analysis.adversary.search_nodes import (
     root,
     together,
 )
-from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEventsError
+from cosim.simulation.continuous import MAX_EVENTS, TooManyEventsError
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 

@@ -1,6 +1,6 @@
 """The objectives that the adversary maximises along a run.
 
-z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous.continuous_loop`. The level decays like
+z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous`. The level decays like
 the threshold, t_0 < t_1 < … are the run's events, and T is the horizon:
 
 * error: sup_{t ≤ T} ‖W e_c(t)‖ / level(t), the observed Δ;
@@ -17,7 +17,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from cosim.simulation.continuous import ContinuousLoop
 from noack.core.linear_systems import Matrix
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.pattern_flow import Flags, Segments
-from cosim.simulation.sampled.sampled_loop import Numbers, Runs, SampledLoop, Scales
+from cosim.simulation.sampled_loop import Numbers, Runs, SampledLoop, Scales
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _TINY = float(np.finfo(np.float64).tiny)
 

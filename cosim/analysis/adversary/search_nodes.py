@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.adversary.pattern_flow import Flags, PatternFlow, Segments
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.continuous import TooManyEventsError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from cosim.analysis.adversary.objective import Measure, Objective, weight_of
 from cosim.analysis.adversary.pattern_flow import Flags, Segments
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.continuous import ContinuousLoop, ContinuousRun
 from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
 from noack.core.core_library import core
 from noack.core.errors import CallerError

@@ -16,7 +16,7 @@ import numpy as np
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.sampled_flow import SampledFlow
 from cosim.analysis.adversary.sampled_run import SampledRun
-from cosim.simulation.sampled.sampled_loop import (
+from cosim.simulation.sampled_loop import (
     Numbers,
     Runs,
     SampledLoop,

@@ -25,16 +25,19 @@ from cosim.analysis.adversary.search_nodes import Pattern, PatternSearch, Search
 from cosim.analysis.adversary.segments import SegmentFlow, evaluate
 from cosim.analysis.adversary.worst_disturbance import Bounds, bounds_of, worst_causes
 from cosim.analysis.adversary.worst_run import Worst, certified_value, reported
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
-from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.sampled.sampled_loop import SampledLoop
+from cosim.simulation.continuous import (
+    ContinuousRun,
+    continuous_loop_of,
+    network_fates,
+    simulate_continuous,
+)
+from cosim.simulation.sampled_loop import SampledLoop
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 
 NODES = 500_000
 BEAM = 512

@@ -15,8 +15,8 @@ from cosim.analysis.adversary.segments import Valued
 from noack.config.scenario import Scenario
 from noack.core.number_format import number
 from noack.impairments.loss_guarantee import outcome_letters
-from noack.theory.certificate_terms import Constants
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _BREACH = 1 + 1e-9
 

@@ -17,7 +17,7 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.record.run_record import Rows
 from noack.config.scenario import Scenario
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 
 _MOST_WAITING = 100_000
 """Largest number of rows that wait for a process without output (some minutes of a run). If there

@@ -9,7 +9,7 @@ import numpy as np
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 ROUNDING = 1e-9
 """Relative rounding error of an exact computation over a run of 10,000 steps."""

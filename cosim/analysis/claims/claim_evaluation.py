@@ -21,8 +21,8 @@ from cosim.analysis.claims.observed_conditions import VoidFrom
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.decimate import decimate
-from noack.theory.certified_bounds import OWN_PLANT
-from noack.theory.scenario_certificates import outside_box
+from noack.theory.certificates.conditions import OWN_PLANT
+from noack.theory.certificates.scenario_certificates import outside_box
 
 _IDEAL_LOOP = (
     "assumes a continuous trigger, and a network and input without delay, which no sampled loop has"

@@ -6,7 +6,8 @@ the controller received: there x_s = x, and x_c is reset to x. There are no clai
 
 Such a part starts with an input of the part before: until the plant applies the first input of the
 new part, u was computed from older updates. ‖u − Kx‖ is recorded, and the certificate holds if it
-covers input errors of this size (:class:`noack.theory.scenario_certificates.CertificateScope`).
+covers input errors of this size; see ``CertificateScope`` in
+:mod:`noack.theory.certificates.scenario_certificates`.
 
 The processes of a stopped run end some milliseconds apart. Claims and conditions are checked up to
 the last time that all of them reached, because the loop is incomplete after it.
@@ -14,7 +15,7 @@ the last time that all of them reached, because the loop is incomplete after it.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -42,8 +43,8 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
-from noack.theory.persistent_causes import forcing_of
-from noack.theory.setpoint_shift import about_setpoint, void_at_setpoint
+from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.certificates.conditions import about_setpoint, void_at_setpoint
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
@@ -54,6 +55,12 @@ _PACES = {
     "controller": (CONTROLLER_STEP, "t_ns"),
 }
 """By process: the table and column with the times of its steps."""
+
+
+@lru_cache(maxsize=1)
+def claims_of(record: RunRecord) -> "RunClaims":
+    """Return the claims about a run; the summary and the report use the same ones."""
+    return RunClaims(record)
 
 
 @dataclass(frozen=True)
@@ -195,9 +202,9 @@ def _part_of(
         if table in SETTINGS:
             part = part[:0]
         elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
-            part = part[part["t_ns"] >= origin_ns]
+            part = part.compress(part["t_ns"] >= origin_ns)
         elif table == NETEM_PACKET or table in CLOCK_TABLES:
-            part = part[part["now_ns"] >= origin_ns]
+            part = part.compress(part["now_ns"] >= origin_ns)
         elif table == CONTROLLER_DELIVERY and sequence is not None:
             part = part[part["sequence"] >= sequence]
         rows = _shifted(part, origin_ns, x_r, u_r)
@@ -268,7 +275,7 @@ def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
-    pushes, forcing = 0.0, forcing_of(own.scenario, loop.B)
+    pushes, forcing = 0.0, bound_forcing(own.scenario, loop.B)
     if forcing is not None:
         pushes = float(np.linalg.norm(loop.K @ loop.A @ forcing.limited, axis=0).sum())
     bend = dt_s**2 / 8 * grown * (row_norms(speed @ (loop.K @ loop.A).T) + pushes)
@@ -308,7 +315,7 @@ def up_to_common_end(record: RunRecord) -> RunRecord:
 
     def derive(table: str, rows: Rows) -> Rows:
         if table in CLOCK_TABLES:  # their rows have numbers of their own
-            return rows[rows["t_ns"] <= end_ns]
-        return rows[rows["input"] < before[OWNER[table]]]
+            return rows.compress(rows["t_ns"] <= end_ns)
+        return rows.compress(rows["input"] < before[OWNER[table]])
 
     return record.derived(record.scenario, derive)

@@ -8,7 +8,7 @@ import numpy as np
 from cosim.analysis.claims.input_origins import Batches, columns
 from cosim.analysis.claims.observed_conditions import SampledSeries, clock_cause, lost_cause
 from cosim.record.run_record import Rows
-from noack.config.sections.run_sections import ClocksSection
+from noack.config.run_sections import ClocksSection
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import LOST_NS
 from noack.protocol.topology import LOOP_ROLES

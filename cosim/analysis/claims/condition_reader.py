@@ -50,6 +50,10 @@ READ = (
     NETEM_PACKET,
 )  # fmt: skip
 """The tables that the conditions depend on."""
+_COLUMNS = (
+    "input", "sequence", "t_ns", "event", "actuation", "u", "entry", "model_t_ns", "error_ns",
+    "flow", "fate", "release_ns", "copy_ns", "bit", "head",
+)  # fmt: skip
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
@@ -57,7 +61,7 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
     reader = ConditionReader(record.scenario)
     parts: list[ObservedConditions] = []
     read = [table for table in (*READ, *CLOCK_TABLES) if table in record.tables]
-    for i, part in enumerate(record.slices(*read)):
+    for i, part in enumerate(record.slices(*read, columns=_COLUMNS)):
         if i:
             parts.append(combined([reader.observed()]))
         for table, rows in part.items():
@@ -110,7 +114,7 @@ class ConditionReader:
 
     def _measured(self, rows: Rows) -> None:
         self._measurements.add(rows)
-        events = rows[rows["event"] != NO_SEQUENCE]
+        events = rows.compress(rows["event"] != NO_SEQUENCE)
         self._updates.events(events["event"], events["t_ns"])
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:

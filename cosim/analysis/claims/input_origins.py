@@ -13,7 +13,7 @@ from cosim.record.run_record import Rows
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import NO_SEQUENCE
-from plant_server.watchdog import too_old
+from plant_server.plant import too_old
 
 Times = NDArray[np.int64]
 Batches = list[tuple[NDArray[Any], ...]]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LongestBurst, LossRule
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.run_conditions import ideal_conditions
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.conditions import ideal_conditions
 
 _TOLERANCE_S = 1e-9
 
@@ -141,7 +141,7 @@ class AssumptionViolation(NamedTuple):
 
 
 class ObservedConditions(NamedTuple):
-    """The conditions of :class:`noack.theory.certificate_terms.NetworkConditions`, as observed."""
+    """The conditions of :class:`noack.theory.bounds.terms.NetworkConditions`, as observed."""
 
     losses: PacketLosses
     """Updates that the controller never received, or received too late."""

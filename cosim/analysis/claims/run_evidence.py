@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -23,20 +23,33 @@ from cosim.analysis.claims.observed_conditions import (
     guarantee_causes,
 )
 from cosim.analysis.claims.trajectory_delta import trajectory_delta
-from cosim.record.align import AlignedRun, IdentityResidual, aligned_parts, in_common
+from cosim.analysis.signal_statistics import (
+    SampleFacts,
+    SampleFactsReader,
+    shares_update,
+    signal_statistics,
+)
+from cosim.record.align import AlignedRun, aligned_parts, identity_residual
 from cosim.record.run_record import RunRecord
 from cosim.record.since_event import UNKNOWN, EventFollower, SinceEvent
 from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_bounds import ErrorMonitor
-from noack.theory.known_state import KnownStateBounds, known_state_bounds
-from noack.theory.paper_bounds import Theorem2, theorem_2
-from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify, certify_box
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
+from noack.theory.certificates.conditions import (
+    allowed_conditions,
+    ideal_conditions,
+    nominal_conditions,
+)
+from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.paper.error_bounds import ErrorMonitor
+from noack.theory.paper.theorems import Theorem2, theorem_2
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
@@ -65,7 +78,7 @@ class Samples:
     joined: AlignedRun
     in_common: NDArray[np.bool_]
     """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
-    error_bounds: tuple[Reals, Reals]
+    error_bounds: Sequence[Reals]
     """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
     residual: Reals
     """Residual of (I1), (k,)."""
@@ -88,18 +101,6 @@ class Samples:
         return np.asarray(np.isfinite(self.true_x).all(axis=1))
 
 
-class SampleFacts(NamedTuple):
-    """What claims need to know about all samples of a run before they are checked."""
-
-    any_in_common: bool = False
-    gap_s: float | None = None
-    """First time at which the controller's error is not known, although it was before."""
-    largest_state: float = 0.0
-    """Largest entry of x_s, and of x_c where it is known, before the end of the claims."""
-    longest_update_ns: int = 0
-    """Longest time between two updates of the controller, or to the end of the run."""
-
-
 @dataclass(frozen=True)
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
@@ -116,53 +117,31 @@ class RunEvidence:
         monitor = ErrorMonitor(
             self.record.loop.H, policy_of(scenario), scenario.timing.measurement_period_ns
         )
-        residual = IdentityResidual(scenario)
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
         for part in aligned_parts(self.record):
             rows, joined = part.rows, part.aligned
-            common = _common(scenario, joined)
-            bounds = monitor.samples(
+            common = shares_update(scenario, joined)
+            bounds = monitor.take(
                 rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], joined.received
             )
-            bounds[~common] = np.nan
+            both = (np.where(common, one, np.nan) for one in (bounds.identity, bounds.printed))
+            residual = identity_residual(scenario, joined, bounds.missed)
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])
             passed = event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
             last_ns = event_ns[-1:]
-            both = bounds[:, 0], bounds[:, 1]
             true_x = joined.x if part.true_x is None else part.true_x
             since = follower.take(rows, joined)
-            yield Samples(joined, common, both, residual.take(part), true_x, passed, since)
+            yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
 
     @cached_property
     def facts(self) -> SampleFacts:
         """What must be known about all samples before the claims are checked."""
-        found, fresh_ns, newest, last_ns = SampleFacts(), None, -1, 0
+        if math.isinf(self.part.until_s):
+            return signal_statistics(self.record).facts
+        reader = SampleFactsReader(self.record.scenario, self.part.until_s)
         for part in aligned_parts(self.record):
-            joined = part.aligned
-            if not len(joined.t_ns):
-                continue
-            common, t_s = _common(self.record.scenario, joined), joined.t_ns * 1e-9
-            started = np.logical_or.accumulate(common) | found.any_in_common
-            gaps = np.flatnonzero(started & ~common)
-            if found.gap_s is None and len(gaps):
-                found = found._replace(gap_s=float(t_s[gaps[0]]))
-            until = t_s < self.part.until_s
-            both = np.concatenate([joined.x_s[until], joined.x_c[common & until]])
-            changes = joined.t_ns[np.flatnonzero(np.diff(joined.received, prepend=newest))]
-            ends_ns = changes if fresh_ns is None else np.append(fresh_ns, changes)
-            longest_ns = int(np.diff(ends_ns).max(initial=found.longest_update_ns))
-            fresh_ns = ends_ns[-1] if len(ends_ns) else None
-            newest, last_ns = int(joined.received[-1]), int(joined.t_ns[-1])
-            largest = float(np.abs(both[np.isfinite(both)]).max(initial=found.largest_state))
-            found = found._replace(
-                any_in_common=bool(started[-1]),
-                largest_state=largest,
-                longest_update_ns=longest_ns,
-            )
-        if fresh_ns is not None:
-            longest_ns = max(found.longest_update_ns, int(last_ns - fresh_ns))
-            found = found._replace(longest_update_ns=longest_ns)
-        return found
+            reader.take(part.aligned)
+        return reader.facts
 
     @cached_property
     def trajectory_delta(self) -> float | None:
@@ -302,12 +281,6 @@ class RunEvidence:
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
             return None
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
-
-
-def _common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
-    """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
-    return np.asarray(finite & in_common(scenario, joined))
 
 
 def scheduled_certificates(

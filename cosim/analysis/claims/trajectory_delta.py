@@ -15,7 +15,7 @@ from cosim.record.align import aligned_parts
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
-from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
+from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1
 
 
 class _Start(NamedTuple):

@@ -157,10 +157,10 @@ class InputReplay:
             _settings(recorded["change"].tobytes()),
         )  # fmt: skip
         outputs = self._machine.announce(change, int(recorded["now_ns"]))
-        emitted = [one for one in outputs if type(one) is Record]
-        assert len(emitted) == 1
+        (emitted,) = (output for output in outputs if type(output) is Record)
+        values = emitted.row if self._is_network else emitted.row[1:]  # without the loop's number
         replayed = np.zeros(1, rows.dtype)[0]
-        for name, value in zip(_own_names(rows.dtype), emitted[0].row, strict=True):
+        for name, value in zip(_own_names(rows.dtype), values, strict=True):
             replayed[name] = value
         if LOOP in (rows.dtype.names or ()):
             replayed[LOOP] = recorded[LOOP]

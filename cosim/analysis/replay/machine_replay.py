@@ -4,16 +4,15 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from controller_node.controller import controller_of
+from controller_node.controller import controllers_of
 from cosim.analysis.replay.input_replay import InputReplay, Numbers, table_and_row
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.process_lives import Life
+from cosim.record.process_lives import RowCounts
 from cosim.record.record_source import Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import Channel, channel_of
-from noack.config.loops import loops_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import GENERATION, Start
 from noack.protocol.record_tables import (
@@ -22,14 +21,14 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import SENDS
 from noack.protocol.wire_format import Flow
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
+from plant_server.plant import plants_of
+from sensor_node.sensor import sensors_of
 
 _MACHINES: Mapping[str, Callable[[Scenario, Start], LoopMachines | Channel]] = {
-    "plant": plant_of,
-    "sensor": sensor_of,
+    "plant": lambda loop, start: plants_of((loop,), start=start),
+    "sensor": lambda loop, start: sensors_of((loop,), start=start),
     "netem": lambda scenario, start: channel_of(scenario, start, loops=len(loops_of(scenario))),
-    "controller": controller_of,
+    "controller": lambda loop, start: controllers_of((loop,), start=start),
 }
 
 
@@ -42,7 +41,7 @@ class MachineReplay:
     def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
         self._numbers = record.life_numbers(role)
-        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.lives(role)]
+        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -61,7 +60,7 @@ class MachineReplay:
             return
         places = {table: self._numbers.places(rows) for table, rows in owned.items()}
         for i in range(len(self._lives)):
-            yield {table: rows[places[table] == i] for table, rows in owned.items()}
+            yield {table: rows.compress(places[table] == i) for table, rows in owned.items()}
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
@@ -77,7 +76,7 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: RowCounts) -> None:
         self._role, self._scenario, self._life = role, scenario, life
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli import command as cli
-from cosim.cli.execute_campaign import Workers, execute_campaign, worker_pool
+from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.command_line import print_to_stderr
 
@@ -244,8 +244,8 @@ def _plan(
 
 def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, dict[str, Any]]:
     from cosim.studies.capacity.capacity_plan import MODEL, PERIODIC, ZOH
+    from noack.config.run_sections import NAME_PATTERN
     from noack.config.scenario_file import value_of
-    from noack.config.sections.loop_section import NAME_PATTERN
 
     found: dict[str, dict[str, Any]] = {}
     for text in policies:

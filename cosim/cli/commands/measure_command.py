@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from cosim.cli import command as cli
 from cosim.cli import measure_options as given
 from noack.core.errors import CallerError, ExitStatus
-from noack.traces.shipped_traces import find_trace
+from noack.traces.trace_formats import find_trace
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions

@@ -20,7 +20,7 @@ from cosim.measurement.live.stamped_socket import StampedSocket, host_number
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, NeverStartedError, PeerError, why
 from noack.core.file_access import open_growing
-from noack.impairments.quantities import OWN_TIME_S
+from noack.impairments.words import OWN_TIME_S
 from noack.protocol.probe_format import (
     LONGEST_PERIOD_NS,
     MAX_PROBE_BYTES,

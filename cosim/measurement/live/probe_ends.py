@@ -22,8 +22,7 @@ from noack.protocol.probe_format import (
     decode_probe,
     encode_probe,
 )
-from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
-from noack.traces.relative_delay import relative_delays
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace, relative_delays
 
 
 class ProbeResult(NamedTuple):

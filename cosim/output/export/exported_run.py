@@ -9,7 +9,7 @@ from cosim.analysis.summary_model import read_summary
 from cosim.record.environment import kind_of
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
 from cosim.record.run_record import RunRecord, load_run
-from noack.config.loops import phases_ns
+from noack.config.scenario import phases_ns
 
 
 @dataclass(frozen=True)

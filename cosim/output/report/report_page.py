@@ -10,7 +10,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.claims.claims_by_part import claims_of
 from cosim.analysis.fidelity import is_against
 from cosim.analysis.over_time import WorstLoop, worst_loop
 from cosim.analysis.summary_model import RunSummary
@@ -73,7 +73,7 @@ def write_report(
 def envelopes_of(record: RunRecord) -> Sequence[Envelope]:
     """Return the certified bounds of a loop, to be drawn with the quantities that they bound."""
     try:
-        return RunClaims(record).envelopes()
+        return claims_of(record).envelopes()
     except Exception:  # the figures are useful without them
         return []
 

@@ -42,9 +42,8 @@ from cosim.output.viewer.recording_text import about
 from cosim.record.decimate import Reals, is_long
 from cosim.record.environment import Kind
 from cosim.record.run_directory import RECORDING_FILE
-from noack.config.loops import loop_names, phases_ns
 from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loop_names, phases_ns
 
 PICTURED = 12
 """Up to so many loops are shown one by one, with their pictures."""

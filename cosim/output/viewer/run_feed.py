@@ -21,9 +21,8 @@ from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.loop_rows import rows_by_loop
 from cosim.record.run_record import Rows
-from noack.config.loops import phases_ns
-from noack.config.resolution import loop_of, resolved_loops
-from noack.config.scenario import Scenario
+from noack.config.resolution import loop_of, resolved_loops, tables_of
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (
@@ -59,11 +58,12 @@ class LoopFeed:
     def __init__(self, scenario: Scenario, view: RunView) -> None:
         (loop,) = resolved_loops(scenario)
         self._feed, self._phases_ns = ViewFeed(loop, view), phases_ns(scenario)
+        self._types = [tables_of(loop)]
         self.log, self.advance = self._feed.log, self._feed.advance
 
     def add(self, table: str, rows: Rows) -> None:
         """Add rows that follow the previously added ones."""
-        for _, own in rows_by_loop(table, rows, self._phases_ns):
+        for _, own in rows_by_loop(table, rows, self._phases_ns, self._types):
             self._feed.add(table, own)
 
 
@@ -82,7 +82,7 @@ class NetworkFeed:
         loops = resolved_loops(scenario)
         self._view, self._warn = view, warn
         self._wall_ns = NS_PER_S * scenario.speed
-        self._phases_ns = phases_ns(scenario)
+        self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._together = _AllLoops(scenario, loops, view)
         self._feeds = {
             number: ViewFeed(loops[number], one, certified=False)
@@ -135,7 +135,9 @@ class NetworkFeed:
         """Begin a round: give each loop its rows."""
         waiting, self._waiting = self._waiting, {}
         for table, batches in waiting.items():
-            for loop, rows in rows_by_loop(table, np.concatenate(batches), self._phases_ns):
+            for loop, rows in rows_by_loop(
+                table, np.concatenate(batches), self._phases_ns, self._types
+            ):
                 if loop in self._feeds:
                     self._feeds[loop].add(table, rows)
         self._handed_ns, self._due = self._together.newest_ns, [*self._feeds]
@@ -163,16 +165,20 @@ class _AllLoops:
         self, scenario: Scenario, loops: Sequence[Scenario], view: NetworkRecording
     ) -> None:
         self._view, self._horizon_ns = view, scenario.timing.horizon_ns
-        self._period_ns = loops[0].timing.controller_period_ns
-        self._loops = [loop_of(one) for one in loops]
-        self._rest = np.stack(
-            [np.zeros(one.n) if one.setpoint is None else one.setpoint for one in self._loops]
-        )
+        self._periods_ns = np.array([loop.timing.controller_period_ns for loop in loops])
+        self._loops = [loop_of(loop) for loop in loops]
+        sizes = np.array([loop.n for loop in self._loops])
+        self._entries = np.arange(sizes.max()) < sizes[:, None]
+        """(loops, n) which entries of a vector each loop has; the others are 0 here."""
+        self._rest = np.zeros(self._entries.shape)
+        for rest, loop in zip(self._rest, self._loops, strict=True):
+            if loop.setpoint is not None:
+                rest[: loop.n] = loop.setpoint
         self._transitions: dict[int, Any] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(phases_ns(scenario))
         numbers = [(name, "<i8") for name in (LOOP, "input", "t_ns")]
-        self._none = self._newest = np.zeros(0, [*numbers, ("x", "<f8", (self._loops[0].n,))])
+        self._none = self._newest = np.zeros(0, [*numbers, ("x", "<f8", (sizes.max(),))])
         """Of each loop, the newest row of the controller that was used."""
         self._measured: list[Rows] = []
         self._models: list[Rows] = []
@@ -242,7 +248,7 @@ class _AllLoops:
         keys, wanted = _keys(models), _keys(measured)
         place = np.searchsorted(keys, wanted, "right") - 1
         age_ns = wanted - keys[place] if len(keys) else wanted
-        known = (place >= 0) & (age_ns >= 0) & (age_ns <= self._period_ns)
+        known = (place >= 0) & (age_ns >= 0) & (age_ns <= self._periods_ns[measured[LOOP]])
         known &= at_ns >= self._first_ns[measured[LOOP]]
         measured, age_ns, x_c = measured[known], age_ns[known], models["x"][place[known]]
         for dt_ns in np.unique(age_ns).tolist():
@@ -254,9 +260,10 @@ class _AllLoops:
     def _flow(self, dt_ns: int, loops: Any, x_c: Any) -> Any:
         """Return models of controllers, (k, n), a time later, with the set-points of the start."""
         if dt_ns not in self._transitions:
-            self._transitions[dt_ns] = np.stack(
-                [Propagator(one.H).transition(dt_ns) for one in self._loops]
-            )
+            transitions = np.zeros((*self._entries.shape, self._entries.shape[1]))
+            for matrix, loop in zip(transitions, self._loops, strict=True):
+                matrix[: loop.n, : loop.n] = Propagator(loop.H).transition(dt_ns)
+            self._transitions[dt_ns] = transitions
         rest = self._rest[loops]
         return rest + np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
 
@@ -275,7 +282,8 @@ class _AllLoops:
         """Return the needed columns of rows."""
         found = np.empty(len(rows), self._none.dtype)
         found[LOOP], found["input"] = rows[LOOP], rows["input"]
-        found["t_ns"], found["x"] = rows[time_name], rows[vector_name]
+        found["t_ns"] = rows[time_name]
+        found["x"] = np.where(self._entries[rows[LOOP]], rows[vector_name], 0.0)
         return found
 
 

@@ -41,11 +41,14 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_bounds import ErrorMonitor
-from noack.theory.known_state import KnownStateBounds, known_state_bounds
-from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    ScenarioCertificate,
+    known_state_bounds,
+)
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.paper.error_bounds import ErrorMonitor
 
 LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""
@@ -250,7 +253,7 @@ class ViewFeed:
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
         e_s = rows["x_s"] - rows["x"]
-        return self._monitor.samples(rows["t_ns"], e_s, rows["event"], joined.received)[:, 0]
+        return self._monitor.take(rows["t_ns"], e_s, rows["event"], joined.received).identity
 
     def _kept(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
         """Return the rows to show of curves, (k,) or (k, n)."""

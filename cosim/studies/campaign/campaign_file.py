@@ -13,11 +13,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
-from cosim.simulation.batch.batch_interface import ROW
+from cosim.simulation.batch import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.config import toml_file
-from noack.settings.matrices import Rows
-from noack.settings.section import NonNegative, ScenarioSection, Seed
+from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch.batch_interface import ROW, Setting, run_batch, setting_of
-from cosim.simulation.continuous.network_fates import timeless
+from cosim.simulation.batch import ROW, Setting, run_batch, setting_of
+from cosim.simulation.continuous import timeless
 from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error
@@ -26,7 +26,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
-from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import Rows, require_shape
 
 SCENARIOS = "scenarios"
 

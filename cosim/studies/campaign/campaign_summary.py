@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.studies.campaign.campaign_file import Campaign, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store

@@ -15,15 +15,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch.batch_status import OK
+from cosim.simulation.exact_simulation import OK
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.impairments.loss_process import loss_process
+from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.theory.error_gains import Output, error_gains
-from noack.theory.kernel_bounds import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import Output, error_gains
 
 Metric = Literal[
     "transmissions",

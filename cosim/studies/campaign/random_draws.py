@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch.batch_interface import Population
+from cosim.simulation.batch import Population
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms, words
 

@@ -24,12 +24,12 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, in_common
 from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.batch.batch_interface import ROW
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.batch import ROW
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
+from noack.config.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import (

@@ -21,10 +21,9 @@ import numpy as np
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
 from cosim.studies.campaign.sampled_draws import cost_of
-from noack.config.loops import loop_scenario
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.sections.loop_section import LoopSection
+from noack.config.run_sections import LoopSection
+from noack.config.scenario import Scenario, loop_scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.rate import Rate

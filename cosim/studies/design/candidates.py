@@ -10,16 +10,16 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch.batch_interface import Population, run_batch, setting_of
+from cosim.simulation.batch import Population, run_batch, setting_of
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.design.design_space import Candidate, DesignSpace
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.number_format import plus_minus
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import certify, certify_box, outside_box
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 
 Bounded = Literal["state", "error"]
 Bounds = Mapping[Bounded, float]

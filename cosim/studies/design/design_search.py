@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from cosim.simulation.batch.batch_interface import Population
+from cosim.simulation.batch import Population
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.candidates import (

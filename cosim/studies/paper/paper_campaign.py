@@ -15,20 +15,19 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.continuous.continuous_report import run_continuous
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_workers import Chunk, Runner
 from cosim.studies.campaign.chunk_store import Progress
 from noack.config.resolution import loop_of, resolve
+from noack.config.run_sections import SeedsSection
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa, transition
-from noack.theory.certificate_terms import Constants
-from noack.theory.paper_bounds import theorem_2
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.paper.theorems import theorem_2
 
 Mode = Literal["model", "zoh"]
 MODES: Mapping[Mode, str] = {"model": "MB-ET", "zoh": "ZOH-ET"}

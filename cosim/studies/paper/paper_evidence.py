@@ -11,9 +11,13 @@ import numpy as np
 from scipy.linalg import schur
 
 from cosim.record.align import align_tables
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_report import run_continuous
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import (
+    ContinuousLoop,
+    ContinuousRun,
+    continuous_loop_of,
+    run_continuous,
+    simulate_continuous,
+)
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.paper.paper_campaign import MODES, open_loop_eigenvalues, resolved_draw
 from noack.config.named_models import lane_following
@@ -22,7 +26,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
-from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
+from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1
 from noack.trigger.decaying import DecayingTrigger
 
 Numbers = dict[str, Any]

@@ -13,8 +13,7 @@ from cosim.output import palette
 from cosim.output.report.axes import Shown, finish, layout, logarithmic
 from cosim.output.report.figure_style import INK, printed, styled
 from cosim.output.report.signal_figures import paper_figure
-from cosim.simulation.continuous.continuous_run import ContinuousRun
-from cosim.simulation.continuous.network_fates import timeless
+from cosim.simulation.continuous import ContinuousRun, timeless
 from cosim.studies.paper.paper_campaign import MODES, Mode
 from cosim.studies.paper.paper_results import Results
 from netem.channel import UPDATE_LINK

@@ -1,10 +1,4 @@
-"""The page's data: all draws, as in ``paper.json``, the format of their numbers, and the claims.
-
-The claims are those of the paper's text, each with a verdict from the draws. A claim is confirmed
-if it holds in at least 95 % of the draws, both in the base ensemble and in every variation of a
-setting that the paper does not specify. It is partly confirmed if it holds in at least half of the
-draws of the base ensemble. Otherwise it is not confirmed.
-"""
+"""The page's data: all draws, as in ``paper.json``, and the format of their numbers."""
 
 import json
 import math

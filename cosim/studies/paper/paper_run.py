@@ -1,156 +1,106 @@
-"""Simulates the ensemble; writes the page, its figures and its numbers; prints the claims.
+"""Simulates the ensemble; writes the page, its figures and its numbers; prints the claims."""
 
-The page ``paper.md`` is the text of a template with the numbers of the results.
-"""
-
-import re
-import textwrap
-from collections.abc import Callable, Iterator
-from functools import partial
+import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from rich.console import Console
+from rich.table import Table
 
-from cosim.studies.campaign.metrics import paired, quartiles
-from cosim.studies.paper.paper_campaign import BASE, MODES, OTHER_EXAMPLES, STEP_S, settings_of
-from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
-from cosim.studies.paper.paper_results import HORIZON_S, Results, number, percent, spread
-from noack.core.linear_systems import Vector
+from cosim.output.report.figure_files import save_figure
+from cosim.simulation.continuous import run_continuous
+from cosim.studies.campaign.campaign_workers import local
+from cosim.studies.campaign.chunk_store import Progress
+from cosim.studies.campaign.metrics import quartiles
+from cosim.studies.paper.paper_campaign import BASE, MODES, load_campaign, resolved_draw, run_parts
+from cosim.studies.paper.paper_claims import PaperVerdict, claims
+from cosim.studies.paper.paper_evidence import evidence
+from cosim.studies.paper.paper_figures import draw_figure, ensemble_figure
+from cosim.studies.paper.paper_page import render
+from cosim.studies.paper.paper_results import REPRESENTED, Results, dumps, results_of
+from noack.core.errors import CallerError, MachineError, why
+from noack.core.file_access import write_whole
 
-_COLUMNS, _GLUE = 100, "\N{NO-BREAK SPACE}"
-_ITEM = re.compile(r"\* |\d+\. ")
-"""The mark of a list item in Markdown."""
-_LOST = "lost"
-_MEASURES = (
-    ("transmissions", "events"),
-    ("deliveries", "deliveries"),
-    ("share lost", _LOST),
-    ("median time between transmissions, s", "gap_median_s"),
-    ("median time between deliveries, s", "reception_median_s"),
-    ("shortest inter-event time, s", "gap_min_s"),
-    ("settling time to 5 %, s", "settled_5_s"),
-    ("settling time to 1 %, s", "settled_1_s"),
-    ("sup ‖e_c‖e^(αt)/β", "controller_error"),
-    ("sup ‖x‖/‖x(0)‖", "peak"),
-    (f"‖x‖ at {HORIZON_S:g} s", "final_norm"),
-)
+PAGE, FIGURES, RESULTS = "paper.md", "figures", "paper.json"
+FEWEST_DRAWS = 4
+_STYLES = {
+    PaperVerdict.CONFIRMED: "green",
+    PaperVerdict.PARTLY: "yellow",
+    PaperVerdict.NOT_CONFIRMED: "bold red",
+}
 
 
-def render(results: Results) -> str:
-    """Return the page in Markdown."""
-    templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
-    templates.filters |= {"n": number, "percent": percent, "spread": spread}
-    text = templates.get_template("paper.md.jinja").render(
-        draws=results.count(),
-        representative=results.representative,
-        settings=settings_of(results.representative),
-        horizon_s=HORIZON_S,
-        step_s=STEP_S,
-        confirmed_from=CONFIRMED_FROM,
-        partly_from=PARTLY_FROM,
-        claims=list(claims(results)),
-        compared=list(_compared(results)),
-        varied=list(_varied(results)),
-        column=results.column,
-        certified=partial(results.column, table="certified"),
-        printed=partial(results.column, table="printed"),
-        **_shares(results),
-        **results.evidence,
-    )
-    return _wrapped(text)
+def reproduce(draws: int, workers: int, progress: Progress | None = None) -> Results:
+    """Compute all results of the page for a base ensemble of this number of draws.
+
+    Raises:
+        CallerError: there are too few draws.
+    """
+    if draws < FEWEST_DRAWS:
+        raise CallerError(f"--draws {draws}: quartiles need at least {FEWEST_DRAWS} draws")
+    with local(workers) as runner:
+        parts = run_parts(draws, runner, progress)
+    representative = results_of(parts, {}).representative
+    return results_of(parts, evidence(load_campaign()[1][BASE], representative))
 
 
-def _wrapped(text: str) -> str:
-    """Wrap the paragraphs of a Markdown page at 100 columns; tables and code stay as they are."""
-    lines: list[str] = []
-    paragraph, code = "", False
-    for line in text.splitlines():
-        start = line.lstrip()
-        fence = start.startswith("```")
-        kept = code or fence or not start or start[0] in "|#!<"
-        code ^= fence
-        if paragraph and (kept or _ITEM.match(start)):
-            lines += _filled(paragraph)
-            paragraph = ""
-        if kept:
-            lines.append(line)
-        else:
-            paragraph = f"{paragraph} {start}" if paragraph else line
-    return "\n".join([*lines, *_filled(paragraph), ""])
+def make_folder(folder: Path) -> None:
+    """Make the page's folder before the simulations start.
+
+    Raises:
+        MachineError: it cannot be made.
+    """
+    try:
+        (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
 
 
-def _filled(paragraph: str) -> list[str]:
-    start = paragraph.lstrip()
-    item = _ITEM.match(start)
-    begin = len(paragraph) - len(start) + (item.end() if item else 0)
-    # No line may begin with an operator that Markdown reads as a list mark.
-    glued = paragraph[:begin] + re.sub(r" (?=[-+>=*] )", _GLUE, paragraph[begin:])
-    lines = textwrap.wrap(
-        glued, _COLUMNS, subsequent_indent=" " * begin,
-        break_long_words=False, break_on_hyphens=False,
-    )  # fmt: skip
-    return [line.replace(_GLUE, " ") for line in lines]
+def write_page(results: Results, folder: Path) -> list[Path]:
+    """Write page, figures and numbers into the folder made for them; return their paths.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    figures = folder / FIGURES
+    written = [
+        write_whole(folder / PAGE, render(results)),
+        write_whole(figures / RESULTS, dumps(results)),
+    ]
+    drawn = {"ensemble.png": ensemble_figure(results)}
+    for mode, name in MODES.items():
+        resolved = resolved_draw(load_campaign()[1][BASE], results.representative, mode)
+        run = run_continuous(resolved)
+        drawn[f"{name.lower()}.svg"] = draw_figure(run, resolved, results.representative)
+    for name, figure in drawn.items():
+        written.append(figures / f"paper-{name}")
+        save_figure(figure, written[-1])
+    return written
 
 
-def _shares(results: Results) -> dict[str, Any]:
-    column = results.column
-    events, settled = _both(results, "events"), _both(results, "settled_5_s")
-    margin_per_s = results.evidence["example"]["alpha_per_s"]
+def document(results: Results, written: list[Path]) -> dict[str, Any]:
+    """Return the results as JSON: quartiles of the base ensemble, claims, files."""
+    found = {name: quartiles(results.column(name))._asdict() for name in REPRESENTED}
     return {
-        "fewer": (events[0] < events[1]).mean(),
-        "times": quartiles(events[1] / events[0]).median,
-        "later": (settled[1] > settled[0]).mean(),
-        "settle": np.isfinite(_both(results, "settled_1_s")).all(axis=0).mean(),
-        "unstabilised": int((column("slowest_closed") > -margin_per_s).sum()),
-        "not_unstable": (column("fastest_open") <= 0).mean(),
-        "stretches": {m: float((column(f"{m}.deliveries") - 1).sum()) for m in MODES},
-        "growing": {m: float(column(f"{m}.growing").sum()) for m in MODES},
+        "draws": results.count(),
+        "representative": results.representative,
+        "quartiles": {
+            name: {key: value if math.isfinite(value) else None for key, value in one.items()}
+            for name, one in found.items()
+        },
+        "claims": [claim._asdict() for claim in claims(results)],
+        "files": [str(path) for path in written],
     }
 
 
-def _compared(results: Results) -> Iterator[dict[str, str]]:
-    """Return the rows of the main table: a measure of both loops."""
-    for what, name in _MEASURES:
-        model, zoh = _both(results, name)
-        yield {
-            "what": what,
-            "model": spread(model),
-            "zoh": spread(zoh),
-            "difference": spread(paired(zoh, model)),
-            "larger": percent((zoh > model).mean()),
-        }
-
-
-def _varied(results: Results) -> Iterator[dict[str, str]]:
-    """Return the rows of the table of variations."""
-    for name in results.variations:
-        events, settled, gap_min, lost = (
-            _both(results, measure, name)
-            for measure in ("events", "settled_5_s", "gap_min_s", _LOST)
-        )
-        yield {
-            "what": name + (" *" if name in OTHER_EXAMPLES else ""),
-            "draws": number(results.count(name)),
-            "events": _medians(events),
-            "lost": _medians(lost, percent),
-            "gap_min": _medians(gap_min),
-            "settled": _medians(settled),
-            "more": percent((events[1] > events[0]).mean()),
-            "later": percent((settled[1] > settled[0]).mean()),
-        }
-
-
-def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
-    """Return a measure of MB-ET and of ZOH-ET."""
-    if name == _LOST:
-        return [results.lost(mode, variation) for mode in MODES]
-    return [results.column(f"{mode}.{name}", variation) for mode in MODES]
-
-
-def _medians(both: list[Vector], written: Callable[[float], str] = number) -> str:
-    return " / ".join(written(quartiles(values).median) for values in both)
+def print_claims(console: Console, found: dict[str, Any]) -> None:
+    """Print the claims and the paths of a :func:`document`."""
+    table = Table(title=f"Section V over {found['draws']:,} draws", show_lines=True)
+    for heading in ("the paper says", "verdict", "numbers"):
+        table.add_column(heading)
+    for claim in found["claims"]:
+        style = _STYLES[claim["verdict"]]
+        table.add_row(claim["gist"], f"[{style}]{claim['verdict']}[/]", claim["why"])
+    console.print(table)
+    for file in found["files"]:
+        console.print(file, highlight=False, soft_wrap=True, markup=False)

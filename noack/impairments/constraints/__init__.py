@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from noack.impairments.feature import Constraint
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.settings.registry import kinds_in, union_of
+from noack.settings.section import kinds_in, union_of
 
 _KINDS = kinds_in(__name__, Constraint)
 CONSTRAINTS = tuple(_KINDS.values())
@@ -19,18 +19,18 @@ else:
     AnyConstraint = union_of(_KINDS)
 
 
-def longest_burst_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> int | None:
+def find_longest_burst(mansd: int | None, constraints: Sequence[AnyConstraint]) -> int | None:
     """Return the maximum number of consecutive losses that cap and constraints allow together.
 
     None: there is no maximum.
     """
-    return guarantee_of(mansd, constraints).longest_burst
+    return join_guarantee(mansd, constraints).longest_burst
 
 
-def guarantee_of(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
+def join_guarantee(mansd: int | None, constraints: Sequence[AnyConstraint]) -> LossGuarantee:
     """Return the rules of cap and constraints together."""
     cap = () if mansd is None else (LongestBurst(mansd),)
-    return LossGuarantee((*cap, *(one.rule for one in constraints)))
+    return LossGuarantee((*cap, *(constraint.rule for constraint in constraints)))
 
 
 def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) -> None:
@@ -40,11 +40,13 @@ def require_consistent(mansd: int | None, constraints: Sequence[AnyConstraint]) 
         ValueError: they cannot; the message begins with the key.
     """
     seen: set[str] = set()
-    for number, one in enumerate(constraints):
-        if one.scope in seen:
-            raise ValueError(f"constraints.{number}: {one.text()}: there is a {one.scope} already")
-        seen.add(one.scope)
-    if constraints and longest_burst_of(mansd, constraints) is None:
+    for number, constraint in enumerate(constraints):
+        if constraint.scope in seen:
+            raise ValueError(
+                f"constraints.{number}: {constraint.text()}: there is a {constraint.scope} already"
+            )
+        seen.add(constraint.scope)
+    if constraints and find_longest_burst(mansd, constraints) is None:
         raise ValueError(
             f"constraints: {constraints[0].text()}: needs a maximum of losses, too: "
             "mansd or at_most (atmost)"

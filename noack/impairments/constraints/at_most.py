@@ -7,8 +7,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.feature import Constraint, Table, Word
 from noack.impairments.loss_guarantee import LossesInWindow
-from noack.impairments.quantities import COUNT
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, WordReader
 
 
 def _read(reader: WordReader) -> Table:

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from noack.impairments.feature import Constraint, Word
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts
-from noack.impairments.quantities import COUNT
+from noack.impairments.words import COUNT
 
 
 class Recovery(Constraint):

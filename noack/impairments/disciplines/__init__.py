@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from noack.impairments.feature import QueueDiscipline
-from noack.settings.registry import kinds_in, union_of
+from noack.settings.section import kinds_in, union_of
 
 _KINDS = kinds_in(__name__, QueueDiscipline)
 DISCIPLINES = tuple(_KINDS.values())

@@ -7,8 +7,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
 from noack.impairments.feature import QueueDiscipline, Stage, Table, Word
-from noack.impairments.quantities import COUNT, OWN_TIME_S, time_text
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, OWN_TIME_S, WordReader, time_text
 
 
 def _read(reader: WordReader) -> Table:

@@ -13,9 +13,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import shortened
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.quantities import OWN_TIME_S, TIME, time_text
-from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.impairments.words import OWN_TIME_S, TIME, WordReader, time_text
+from noack.settings.user_files import NamedFile
 
 _EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
 MOST_INTERVALS = 1_000_000
@@ -26,10 +25,10 @@ _TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
 def _read(reader: WordReader) -> Table:
     intervals: list[tuple[float, ...]] = []
     for part in reader.word(_EXPECTED).split(","):
-        found = re.fullmatch(f"({TIME})-({TIME})", part)
-        if found is None:
+        match = re.fullmatch(f"({TIME})-({TIME})", part)
+        if match is None:
             reader.wrong(f"expected {_EXPECTED}")
-        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in found.groups()))
+        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in match.groups()))
     return {"intervals_s": intervals, **_read_every(reader)}
 
 

@@ -1,12 +1,14 @@
 """Delay: a constant, and a random part, drawn as the quantile of a uniform number.
 
 Random parts have mean 0: uniform within ± jitter; normal, Pareto (shape 3) and their mixture with
-the jitter as standard deviation. Empirical ones are interpolated between the observed values.
+the jitter as standard deviation. Empirical ones are interpolated between the observed values, which
+a file may hold: delays, or a distribution table of ``tc``.
 """
 
 import math
+import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self, get_args
 
@@ -14,29 +16,42 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
-from noack.impairments.correlated_chance import TC_CORRELATION
-from noack.impairments.delay_files import read_samples
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
-from noack.impairments.quantities import (
+from noack.impairments.feature import (
+    TC_CORRELATION,
+    Impairment,
+    Stage,
+    StageTables,
+    Table,
+    Word,
+    add_numbers,
+)
+from noack.impairments.words import (
     CORRELATION,
     OWN_TIME_S,
     SIGNED_PERCENT,
     TIME_S,
+    WordReader,
     brief_percent,
     percent_text,
     time_text,
 )
-from noack.impairments.word_reader import WordReader
 from noack.settings.section import Correlation
+from noack.settings.user_files import NamedFile
 
 Distribution = Literal["uniform", "normal", "pareto", "paretonormal", "empirical"]
 SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")
 """Names of distributions; any other word after ``distribution`` is a file's name."""
 MOST_DELAY_S = 3600.0
 """Maximum of a setting: the sum of a few Pareto delays must fit into 64 bits of ns."""
-
+MAX_SAMPLES = 1_000_000
 _NOTEWORTHY = 1e-4
 """Minimum share of delays cut at 0 that is reported; a normal distribution always has some."""
+TABLE_SUFFIX = ".dist"
+"""Suffix of tc's distribution tables."""
+_TABLE_SCALE = 8192
+"""The number that represents 1 in a table of tc."""
+_UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_DELAY = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z]*)")
 
 
 def _read(reader: WordReader) -> Table:
@@ -265,3 +280,54 @@ class Delay(Impairment):
         if "pareto" in self.distribution:
             notes.append("its table of the Pareto distribution ends at four times the jitter")
         return notes
+
+
+def read_samples(
+    name: str, jitter_s: float, most_s: float, folder: Path, place: str
+) -> tuple[float, ...]:
+    """Return the delays in a file, in seconds; the jitter scales a distribution table.
+
+    Args:
+        name: name of the file, relative to ``folder``.
+        jitter_s: the jitter.
+        most_s: maximum delay.
+        folder: the folder.
+        place: position of the file name in the settings, for messages.
+
+    Raises:
+        CallerError: one line; the file cannot be read, or has wrong content.
+    """
+    file = NamedFile(name, folder, place)
+    if Path(name).suffix == TABLE_SUFFIX:
+        if jitter_s == 0:
+            file.wrong("a distribution table is scaled by the jitter, which is 0; give a jitter")
+        samples_s = [jitter_s * entry / _TABLE_SCALE for entry in _table(file)]
+    else:
+        if jitter_s != 0:
+            file.wrong(
+                "observed delays are taken as they are, and have no jitter beside them; "
+                f"a distribution table of tc is named *{TABLE_SUFFIX}"
+            )
+        samples_s = list(_observed_s(file))
+    if not 2 <= len(samples_s) <= MAX_SAMPLES:
+        file.wrong(f"has {len(samples_s)} delays; expected 2 to {MAX_SAMPLES}")
+    if max(map(abs, samples_s)) > most_s:
+        file.wrong(f"has a delay beyond {most_s:g} s")
+    return tuple(samples_s)
+
+
+def _table(file: NamedFile) -> Iterator[int]:
+    for number, line in file.lines():
+        for word in line.split():
+            if not re.fullmatch("-?[0-9]{1,5}", word):
+                file.wrong(f"line {number}: {word[:20]}: expected whole numbers, 8192 for 1")
+            yield int(word)
+
+
+def _observed_s(file: NamedFile) -> Iterator[float]:
+    for number, line in file.lines():
+        match = _DELAY.fullmatch(line)
+        scale = _UNITS_S.get(match[2]) if match else None
+        if match is None or scale is None:
+            file.wrong(f"line {number}: {line[:20]}: expected one delay, e.g. 0.0125 or 12.5ms")
+        yield float(match[1]) * scale

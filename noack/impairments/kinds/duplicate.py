@@ -2,9 +2,8 @@
 
 from typing import ClassVar, Literal
 
-from noack.impairments.correlated_chance import CorrelatedChance, read_chance
-from noack.impairments.feature import Impairment, Word
-from noack.impairments.quantities import brief_percent
+from noack.impairments.feature import CorrelatedChance, Impairment, Word, read_chance
+from noack.impairments.words import brief_percent
 from noack.settings.section import Probability
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, Self
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
 from noack.impairments.loss_models import LOSS_MODELS, Loss
 from noack.impairments.markov_chain import Chain, Pattern
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import WordReader
 
 _MODELS = {
     word.name: (model, word) for model in LOSS_MODELS for word in model.words if word.read

@@ -12,19 +12,23 @@ from pydantic import Field, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import shortened
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
-from noack.impairments.quantities import COUNT, SIGNED_COUNT, brief_number
-from noack.impairments.trace_offset import (
+from noack.impairments.feature import (
     LONGEST_NS,
+    Impairment,
     Offset,
+    Stage,
+    StageTables,
+    Table,
+    Word,
+    add_numbers,
     offset_meaning,
     offset_ns,
     offset_text,
     read_offset,
     require_inside,
 )
-from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.impairments.words import COUNT, SIGNED_COUNT, WordReader, brief_number
+from noack.settings.user_files import NamedFile
 
 OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000

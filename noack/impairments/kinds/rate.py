@@ -9,8 +9,14 @@ from pydantic import Field, model_validator
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
-from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text, without_defaults
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import (
+    COUNT,
+    RATE_BPS,
+    SIGNED_COUNT,
+    WordReader,
+    rate_text,
+    without_defaults,
+)
 
 _QUEUE = 1000
 _HEADERS_BYTES = 28
@@ -48,7 +54,7 @@ class Rate(Impairment):
     """Payload of a link-layer cell, e.g. 48; 0: no cells."""
     cell_overhead_bytes: Annotated[int, Field(ge=0, le=1000)] = 0
     """Header of a cell, e.g. 5."""
-    discipline: Discipline = TailDrop()
+    discipline: Discipline = TailDrop.model_construct()
     """Which packets the queue drops."""
 
     words: ClassVar = (
@@ -109,12 +115,12 @@ class Rate(Impairment):
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
-        disciplines = [one for kind in DISCIPLINES for one in kind.examples()]
+        disciplines = [example for kind in DISCIPLINES for example in kind.examples()]
         rates = ((5_000_000, 1), (5_000_000, 50), (10**8, 5))
         return [
             *(
-                cls(rate_bps=rate_bps, queue=queue, discipline=one)
-                for rate_bps, queue in rates for one in disciplines
+                cls(rate_bps=rate_bps, queue=queue, discipline=discipline)
+                for rate_bps, queue in rates for discipline in disciplines
             ),
             cls(rate_bps=10**9, overhead_bytes=-10, cell_bytes=48, cell_overhead_bytes=5),
         ]  # fmt: skip
@@ -139,7 +145,9 @@ class Rate(Impairment):
 
     def stage(self, tables: StageTables) -> Stage:
         names = ("rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes")
-        return self.discipline.queue_stage({one: getattr(self, one) for one in names}, self.queue)
+        return self.discipline.queue_stage(
+            {name: getattr(self, name) for name in names}, self.queue
+        )
 
     def tc_text(self) -> str:
         cells = (self.cell_bytes, self.cell_overhead_bytes)

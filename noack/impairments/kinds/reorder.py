@@ -5,10 +5,16 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
-from noack.impairments.correlated_chance import CorrelatedChance, read_chance
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
-from noack.impairments.quantities import COUNT, brief_percent
-from noack.impairments.word_reader import WordReader
+from noack.impairments.feature import (
+    CorrelatedChance,
+    Impairment,
+    Stage,
+    StageTables,
+    Table,
+    Word,
+    read_chance,
+)
+from noack.impairments.words import COUNT, WordReader, brief_percent
 from noack.settings.section import Probability
 
 
@@ -67,5 +73,5 @@ class Reorder(CorrelatedChance, Impairment):
         return stage._replace(numbers={**stage.numbers, "gap": self.gap})
 
     def tc_lacks(self, before: Sequence[Impairment]) -> str:
-        delayed = any(getattr(one, "delay_s", 0) for one in before)
+        delayed = any(getattr(impairment, "delay_s", 0) for impairment in before)
         return "" if delayed else "reordering without a delay before it"

@@ -11,32 +11,36 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
-from noack.impairments.markov_chain import NotPredictableError, Pattern
-from noack.impairments.quantities import (
-    OWN_TIME_NS,
-    PERCENT,
-    TIME,
-    brief_number,
-    brief_percent,
-    percent_text,
-    time_ns_text,
-)
-from noack.impairments.trace_offset import (
+from noack.impairments.feature import (
     LONGEST_NS,
+    Impairment,
     Offset,
+    Stage,
+    StageTables,
+    Table,
+    Word,
+    add_numbers,
     offset_meaning,
     offset_ns,
     offset_text,
     read_offset,
     require_inside,
 )
-from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.impairments.markov_chain import NotPredictableError, Pattern
+from noack.impairments.words import (
+    OWN_TIME_NS,
+    PERCENT,
+    TIME,
+    WordReader,
+    brief_number,
+    brief_percent,
+    percent_text,
+    time_ns_text,
+)
 from noack.settings.section import Probability
+from noack.settings.user_files import NamedFile
 from noack.traces.packet_trace import LOST_NS, PacketTrace
-from noack.traces.shipped_traces import find_trace
-from noack.traces.trace_formats import read_trace
+from noack.traces.trace_formats import find_trace, read_trace
 
 MOST_RECORDS = 1_000_000
 LONGEST_DELAY_NS = 3600 * NS_PER_S
@@ -58,11 +62,11 @@ def _read(reader: WordReader) -> Table:
 def _read_records(reader: WordReader) -> Table:
     sent_ns, delays_ns = [], []
     for part in reader.word(_EXPECTED).split(","):
-        found = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
-        if found is None:
+        match = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
+        if match is None:
             reader.wrong(f"expected {_EXPECTED}")
-        sent_ns.append(reader.read(found[1], OWN_TIME_NS))
-        delays_ns.append(LOST_NS if found[2] == "lost" else reader.read(found[2], OWN_TIME_NS))
+        sent_ns.append(reader.read(match[1], OWN_TIME_NS))
+        delays_ns.append(LOST_NS if match[2] == "lost" else reader.read(match[2], OWN_TIME_NS))
     return {"sent_ns": sent_ns, "delays_ns": delays_ns}
 
 
@@ -224,15 +228,15 @@ class Replay(Impairment):
 
     def _applied_ns(self) -> Sequence[int]:
         """Return the delays as a stage has them: a lost packet has that of its predecessor."""
-        found: list[int] = []
+        applied_ns: list[int] = []
         latest_ns = 0
         for delay_ns in self.delays_ns or ():
             if delay_ns >= 0:
                 latest_ns = (
                     delay_ns if self.delay_share == 1 else round(delay_ns * self.delay_share)
                 )
-            found.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
-        return found
+            applied_ns.append(latest_ns if delay_ns >= 0 else -1 - latest_ns)
+        return applied_ns
 
     def chains(self) -> Sequence[Pattern]:
         if self.delays_ns is None:

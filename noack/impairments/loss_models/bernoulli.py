@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
-from noack.impairments.correlated_chance import CorrelatedChance, read_chance
-from noack.impairments.feature import Impairment, LossModel, Word
-from noack.impairments.quantities import brief_percent
-from noack.impairments.word_reader import WordReader
+from noack.impairments.feature import CorrelatedChance, Impairment, LossModel, Word, read_chance
+from noack.impairments.words import WordReader, brief_percent
 from noack.settings.section import Correlation, Probability
 
 

@@ -11,8 +11,7 @@ from pydantic import model_validator
 
 from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
 from noack.impairments.markov_chain import Chain
-from noack.impairments.quantities import PERCENT, brief_percent, percent_text, percents_text
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import PERCENT, WordReader, brief_percent, percent_text, percents_text
 from noack.settings.section import Probability
 
 

@@ -26,10 +26,11 @@ from noack.impairments.feature import (
     Word,
 )
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.quantities import (
+from noack.impairments.words import (
     NUMBER,
     OWN_TIME_S,
     PERCENT,
+    WordReader,
     brief_number,
     brief_percent,
     number_text,
@@ -37,7 +38,6 @@ from noack.impairments.quantities import (
     percents_text,
     time_text,
 )
-from noack.impairments.word_reader import WordReader
 from noack.settings.section import Probability
 
 
@@ -147,7 +147,11 @@ class GilbertElliottLoss(LossModel):
         ]
         means = cls(mean_loss=0.4, mean_burst=3.0)
         common = {"state": "link", "step_s": 0.002}
-        return [*chains, means, *(one.model_copy(update=common) for one in (chains[1], means))]
+        return [
+            *chains,
+            means,
+            *(example.model_copy(update=common) for example in (chains[1], means)),
+        ]
 
     def text(self) -> str:
         common = "" if self.step_s is None else f" common {time_text(self.step_s)}"

@@ -8,17 +8,16 @@ from pydantic import Field, model_validator
 
 from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
 from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
-from noack.impairments.quantities import COUNT
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, WordReader
 
 _EXPECTED = "losses per packets, e.g. 2/100"
 
 
 def _read(reader: WordReader) -> Table:
-    found = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
-    if found is None:
+    match = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
+    if match is None:
         reader.wrong(f"expected {_EXPECTED}")
-    burst, period = (reader.read(part, COUNT) for part in found.groups())
+    burst, period = (reader.read(part, COUNT) for part in match.groups())
     table: Table = {"burst": burst, "period": period}
     if reader.accept("from"):
         table["first"] = reader.value(COUNT)

@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word, add_numbers
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
-from noack.impairments.quantities import COUNT
-from noack.impairments.word_reader import WordReader
+from noack.impairments.words import COUNT, WordReader
 
 MAX_SCRIPT = 10_000_000
 _EXPECTED = "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or none"

@@ -11,8 +11,8 @@ from pydantic import Field
 from noack.impairments.feature import LossModel, StageTables, Table, Word
 from noack.impairments.loss_models.scripted import MAX_SCRIPT, ScriptedLoss
 from noack.impairments.markov_chain import NotPredictableError, Pattern
-from noack.impairments.word_reader import WordReader
-from noack.settings.named_file import NamedFile
+from noack.impairments.words import WordReader
+from noack.settings.user_files import NamedFile
 
 _SPACES = b" \t\r\n\v\f"
 

@@ -95,11 +95,10 @@ def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
 
-def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
+def while_compiling(what: str, kept: bool) -> str:
     """Return the line that explains the wait for a compilation."""
     once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
-    time = " ..." if about_s is None else f"; this takes about {about_s:.0f} s"
-    return f"compiling {what} for this machine, {once}{time}"
+    return f"compiling {what} for this machine, {once} ..."
 
 
 def _forget_old(folder: Path, name: str) -> None:
@@ -114,13 +113,14 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
 
     Without a folder numba must not cache at all: it could load code of other sources elsewhere.
     """
+    numba: Any = importlib.import_module("numba")  # an extra of noack, and slow to import
     if folder is None:
-        compiling: Callable[[Callable[..., Any]], Any] = _numba().njit(**options)
+        compiling: Callable[[Callable[..., Any]], Any] = numba.njit(**options)
         return compiling
 
     def compile_and_keep(function: Callable[..., Any]) -> Any:
-        _numba().config.CACHE_DIR = str(folder)
-        dispatcher = _numba().njit(function, cache=True, **options)
+        numba.config.CACHE_DIR = str(folder)
+        dispatcher = numba.njit(function, cache=True, **options)
         dispatcher.compile = _one_at_a_time(dispatcher.compile, folder / ".lock")
         return dispatcher
 
@@ -128,62 +128,16 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
 
 
 def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any], Any]:
-    """Allow one process to compile at a time; the others then read the cache."""
+    """Allow one process to compile at a time; the others then read the cache. Delay Ctrl-C."""
 
     def compile_alone(signature: Any) -> Any:
-        with compiling_alone(lock):
+        with ExitStack() as stack:
+            with suppress(OSError):  # without file locks every process compiles
+                stack.enter_context(locked(lock, wait=True))
+            stack.enter_context(_to_the_end())
             return compiling(signature)
 
     return compile_alone
-
-
-@contextmanager
-def compiling_alone(lock: Path) -> Iterator[None]:
-    """Exclude other processes that compile for the same folder; delay Ctrl-C."""
-    with ExitStack() as stack:
-        with suppress(OSError):  # without file locks every process compiles
-            stack.enter_context(locked(lock, wait=True))
-        with _to_the_end(), _optimised_once():
-            yield
-
-
-@contextmanager
-def _optimised_once() -> Iterator[None]:
-    """Let LLVM optimise a function together with all that it calls, and these not before.
-
-    numba optimises each function, with all that it calls, when it is compiled. Code would so be
-    optimised again at each level of calls: this takes half of the time of a compilation.
-    """
-    event: Any = importlib.import_module("numba.core.event")
-    registry: Any = importlib.import_module("numba.core.registry")
-    tools, name = registry.cpu_target.target_context.codegen(), "_module_pass_manager"
-    passes = getattr(tools, name, None)
-    if passes is None or name in vars(tools):  # another numba; another thread compiles, too
-        yield
-        return
-    compiled: list[Any] = []
-
-    class Compiled(event.Listener):  # type: ignore[misc]
-        """Keeps the functions that are being compiled, the innermost last."""
-
-        def on_start(self, event: Any) -> None:
-            compiled.append(event.data["dispatcher"])
-
-        def on_end(self, _: Any) -> None:
-            compiled.pop()
-
-    def choose(**options: Any) -> Any:
-        is_part = compiled and type(compiled[-1]._cache).__name__ == "NullCache"
-        if is_part and "cost" not in options:
-            options = {"opt": 0, "loop_vectorize": False, "slp_vectorize": False}
-        return passes(**options)
-
-    setattr(tools, name, choose)
-    try:
-        with event.install_listener("numba:compile", Compiled()):
-            yield
-    finally:
-        vars(tools).pop(name, None)
 
 
 @contextmanager
@@ -200,11 +154,7 @@ def _to_the_end() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, found in delayed.items():
-            signal.signal(number, found)
+        for number, handler in delayed.items():
+            signal.signal(number, handler)
         if came:
             signal.raise_signal(came[0])
-
-
-def _numba() -> Any:
-    return importlib.import_module("numba")

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import logm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.plants.systems.plant_system import PlantSystem
+from noack.plants.plant_settings import PlantSystem
 
 _STEP_NS = 10_000_000
 _OFF = 1e-4
@@ -69,7 +69,7 @@ def linearise(
         return unknown
     step = after @ np.linalg.inv(before)
     missed = np.linalg.matrix_power(step, ahead) @ before - later
-    sizes = np.maximum(*(np.linalg.norm(one[:n], axis=0) for one in (before, later)))
+    sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (before, later)))
     if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
         return unknown
     with warnings.catch_warnings(action="ignore"):  # a singular matrix: the result is checked next

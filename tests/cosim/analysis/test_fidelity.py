@@ -14,7 +14,7 @@ from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.output.fidelity_table import summary_rows
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load

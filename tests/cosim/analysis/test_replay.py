@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller_node.controller import controller_of
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference
 from cosim.simulation.virtual_time import simulate
@@ -36,6 +35,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
+from tests.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[3]
 SHORT = (

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.cli.completion import run_directories
 from noack.config.scenario import Scenario
-from noack.config.validation_messages import keys
+from noack.config.toml_file import keys
 
 
 def completed(line: str) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -30,8 +31,47 @@ def test_help_imports_no_large_library(words: list[str]) -> None:
 def test_a_command_with_a_module_of_its_own_imports_only_this_one() -> None:
     modules = imported("scenarios", "--json")
     assert {one for one in modules if one.startswith("cosim.cli.commands.")} == {
-        "cosim.cli.commands.scenarios_command"
+        "cosim.cli.commands.scenario_commands"
     }
+
+
+_LARGE = {
+    "asyncio", "cryptography", "matplotlib", "prometheus_client", "pyarrow", "rerun", "rich",
+    "scipy", "ssl",
+}  # fmt: skip
+_BEFORE_THE_START = """
+import json, os, sys
+from cosim.cli import main
+from cosim.live import launcher
+
+def show(*_):
+    print(json.dumps(sorted(sys.modules)), file=sys.stderr, flush=True)
+    sys.exit()
+
+launcher._Run.watch = show
+main()
+"""
+_PROCESSES = """
+import json, sys
+from cosim.live import fork_server
+fork_server._import(fork_server._IMPORTS)
+print(json.dumps(sorted(sys.modules)), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("program", [_BEFORE_THE_START, _PROCESSES])
+def test_a_run_begins_without_large_libraries(program: str, tmp_path: Path) -> None:
+    """Neither the launcher nor a process imports before the start what it needs only later."""
+    command = [sys.executable, "-c", program, "run", "lane_following", "--runs", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
+    modules = set(json.loads(done.stderr.splitlines()[-1]))
+    assert "numpy" in modules
+    assert not modules & _LARGE
+    if program is _PROCESSES:
+        theory = [one for one in modules if one.startswith(("noack.theory.", "typer"))]
+        assert theory == []
+    else:
+        assert "noack.theory.assumptions" not in modules
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")

@@ -11,14 +11,14 @@ import tomli_w
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.commands.set_command import parsed
+from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
-from noack.config.feature_kinds import POLICIES
 from noack.config.parameter_changes import changed
 from noack.config.resolution import resolve
 from noack.config.runtime_parameters import SHORT, trigger_parameters
 from noack.config.scenario_file import load, validate
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket

@@ -10,7 +10,7 @@ from cosim.interactive import ensemble, exploration, figure_curves, run_explorat
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.figure_curves import Shown
 from cosim.lab.chart_options import data_options
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.config.resolution import resolve
 from noack.core.errors import CallerError

@@ -10,8 +10,8 @@ from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.live.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.loops import phases_ns
 from noack.config.resolution import run_tables, tables_of
+from noack.config.scenario import phases_ns
 from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER

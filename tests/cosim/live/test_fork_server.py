@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -77,6 +78,45 @@ def test_the_server_has_one_thread_when_it_forks(server: ForkServer, tmp_path: P
     with started(server, tmp_path, "--help") as process:
         process.wait()
     assert psutil.Process(server._process.pid).num_threads() == 1
+
+
+_OF_ITSELF = """
+import os, signal, sys
+from contextlib import closing
+from cosim.live.fork_server import ForkServer
+signal.signal(signal.SIGTERM, lambda *_: print("no"))
+with closing(ForkServer(of_itself=True)) as server, open(sys.argv[1], "a") as log:
+    process = server.start("plant_server.__main__", [], log)
+    print(os.getsid(process.pid) == os.getsid(0), flush=True)
+    process.stdin.write("no ticket\\n")
+    process.stdin.close()
+    print(process.wait(), type(server._process).__name__, "NOACK_TICKET_ON_STDIN" in os.environ)
+"""
+
+
+def test_a_command_forks_the_server_of_itself(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _OF_ITSELF, str(tmp_path / "log")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=150)
+    assert done.stdout.splitlines() == ["False", f"{ExitStatus.CALLER} ForkedProcess False"]
+    assert "not a valid ticket" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("before", "environment"),
+    [("import threading, time; threading.Thread(target=time.sleep, args=(5,), daemon=True).start()",
+      {}), ("", {"LC_ALL": "de_DE.ISO-8859-1", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"})],
+)  # fmt: skip
+def test_a_command_with_threads_or_another_encoding_starts_the_server_as_a_program(
+    tmp_path: Path, before: str, environment: dict[str, str]
+) -> None:
+    command = [sys.executable, "-c", f"{before}\n{_OF_ITSELF}", str(tmp_path / "log")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, timeout=150,
+        env=os.environ | environment,
+    )  # fmt: skip
+    if environment and "ForkedProcess" in done.stdout:
+        pytest.skip("the system has no such locale")
+    assert f"{ExitStatus.CALLER} Popen" in done.stdout
 
 
 def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:

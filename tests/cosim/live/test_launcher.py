@@ -309,15 +309,3 @@ def test_a_refused_session_leaves_no_run_directory(
     with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
-
-
-def test_loops_of_different_sizes_leave_no_run_directory(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    n = len(content["plant"]["initial_state"])
-    other = {"A": [[-1.0]], "B": [[1.0]], "gain": [[0.0]]}
-    loops = [{"name": "a"}, {"name": "b", "model": other, "plant": {"initial_state": [1.0]}}]
-    assert n != 1
-    with pytest.raises(CallerError, match=r"loops\.1: its vectors have other sizes"):
-        launch(validate(content | {"loops": loops}, ""), tmp_path, spawn=())
-    assert list(tmp_path.iterdir()) == []

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from cosim.live.remote_access import ConnectionFloodWatch, listen_address, with_clocks
+from noack.config.run_sections import ClocksSection
 from noack.config.scenario_file import load
-from noack.config.sections.run_sections import ClocksSection
 from noack.core.errors import CallerError
 
 

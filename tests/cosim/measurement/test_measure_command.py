@@ -22,7 +22,7 @@ from cosim.measurement.network_measurement import (
     normal_scores,
 )
 from noack.config import toml_file
-from noack.config.sections.network_section import NetworkSection
+from noack.config.sections import NetworkSection
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of

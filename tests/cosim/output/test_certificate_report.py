@@ -23,11 +23,11 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
-from noack.theory.assumptions import AssumptionStatus
-from noack.theory.certificate_terms import Constants
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify_box, outside_box
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.assumptions import AssumptionStatus
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify_box, outside_box
 
 ROOT = Path(__file__).parents[3]
 
@@ -93,8 +93,8 @@ def test_the_documentation_quotes_computed_figures(
 
 def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Certificates) -> None:
     """The limits are tight: slightly less is certified, slightly more is not."""
-    from noack.theory.run_conditions import nominal_conditions
-    from noack.theory.scenario_certificates import own_plant
+    from noack.theory.certificates.conditions import nominal_conditions
+    from noack.theory.certificates.scenario_certificates import own_plant
 
     resolved = scenario("lane_following")
     scheduled, scope = nominal_conditions(resolved, 2), own_plant(resolved)

@@ -14,8 +14,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.impairments.loss_guarantee import LossHistory
-from noack.theory.run_conditions import most_events
-from noack.theory.unlimited_losses import UnlimitedLosses
+from noack.theory.certificates.conditions import most_events
+from noack.theory.random_losses.moments import UnlimitedLosses
 
 ROOT = Path(__file__).parents[3]
 P = 0.05

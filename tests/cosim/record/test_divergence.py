@@ -7,7 +7,7 @@ import pytest
 
 from cosim.analysis.run_summary import summarise
 from cosim.record.divergence import GROWTH, Divergence, divergence
-from cosim.simulation.continuous.continuous_report import run_continuous, summary
+from cosim.simulation.continuous import run_continuous, summary
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

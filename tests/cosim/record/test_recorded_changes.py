@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller_node.controller import controller_of
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
@@ -36,9 +35,9 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, Message
-from sensor_node.sensor import sensor_of
 from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
+from tests.machine_parts import controller_of, sensor_of
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

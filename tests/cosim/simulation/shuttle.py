@@ -10,22 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from controller_node.controller import controller_of
 from cosim.record.run_record import RunRecord
 from netem.channel import RUN_ID, Datagram, Network, channel_of
-from noack.config.loops import phases_ns
 from noack.config.parameter_changes import change_notice, scheduled
 from noack.config.resolution import tables_of
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, phases_ns
 from noack.protocol.datagram_seal import KEY_BYTES
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER, Fate
 from noack.protocol.topology import CHANGEABLE, ENDS, LOOP_ROLES, RECEIVES, RECORDER, receiver_of
 from noack.protocol.wire_format import Encoder, Flow, loop_number
 from noack.runtime.life_cycle import HORIZON
-from plant_server.plant import plant_of
-from sensor_node.sensor import sensor_of
 from tests.machine_interface import Machine
+from tests.machine_parts import controller_of, plant_of, sensor_of
 from tests.wire_decoder import Decoder
 
 KEY = bytes(KEY_BYTES)

@@ -16,7 +16,7 @@ from cosim.live.simulated_run import simulate_run
 from cosim.output.all_certificates import Certificates
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_run
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -39,7 +39,7 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, read_header
-from noack.theory.assumptions import AssumptionStatus, assumptions
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
 from tests.cosim.summaries import alone
 from tests.oracles.link import Datagram, Duplex, Link, network_of

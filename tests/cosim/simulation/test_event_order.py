@@ -8,8 +8,8 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
-from noack.config.loops import loops_of
 from noack.config.resolution import resolve, tables_of
+from noack.config.scenario import loops_of
 from noack.config.scenario_file import load, validate
 from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import OWNER
@@ -113,7 +113,7 @@ def test_numbers_of_no_simulation_are_refused() -> None:
     resolved = resolve(load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=1.0"]))
     run = VirtualRun(resolved, (resolved,))
     own = run.core
-    for name, value in (("loops", 2), ("groups", 0), ("sent_places", 3), ("sent_count", -1)):
+    for name, value in (("loops", 2), ("sent_places", 3), ("sent_count", -1)):
         before = getattr(own, name)
         setattr(own, name, value)
         assert core.noack_simulation_check(own) != ffi.NULL
@@ -121,5 +121,5 @@ def test_numbers_of_no_simulation_are_refused() -> None:
     own.directions[2] = 1
     assert core.noack_simulation_check(own) != ffi.NULL
     own.directions[2] = 0
-    own.of_loop[0].place = 1
+    own.processes[1] = own.processes[0]
     assert core.noack_simulation_check(own) != ffi.NULL

@@ -14,23 +14,22 @@ from cosim.analysis.step_schedule import live_run
 from cosim.record.align import align_tables
 from cosim.record.estimation_error import expected_rms, true_states
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch.batch_interface import setting_of
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.batch import setting_of
+from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.candidates import DesignLimits
 from cosim.studies.design.design_search import design
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, steady_state
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, validate
-from noack.config.state_estimation import steady_state
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.theory.assumptions import assumptions
-from sensor_node.sensor import sensor_of
+from noack.theory.certificates.assumptions import assumptions
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed
+from tests.machine_parts import sensor_of
 
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}

@@ -9,9 +9,9 @@ from cosim.analysis.replay import replay
 from cosim.record.loop_rows import NetworkRows
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.loops import loops_of, phases_ns
 from noack.config.parameter_changes import LATE
 from noack.config.resolution import resolve
+from noack.config.scenario import loops_of, phases_ns
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, Fate

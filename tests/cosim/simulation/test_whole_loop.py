@@ -10,9 +10,9 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config import feature_kinds
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load, validate
+from noack.config.sections import POLICIES as POLICY_KINDS
 from tests.oracles import whole_loop
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import POLICIES, random_scenario
@@ -33,7 +33,7 @@ def test_a_shipped_scenario(path: Path) -> None:
 
 
 def test_every_policy_is_among_the_random_scenarios() -> None:
-    assert {*POLICIES} == feature_kinds.POLICIES.keys() - {"python"}
+    assert {*POLICIES} == POLICY_KINDS.keys() - {"python"}
 
 
 @cache

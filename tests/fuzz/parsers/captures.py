@@ -7,7 +7,7 @@ from cosim.measurement.trace_sources import SourceOptions, read_source
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from tests.fuzz.choices import Choices
 from tests.fuzz.harness import refusal, workspace
-from tests.noack.traces.capture_files import ETHERNET, LINKS, Sent, pcap_of, pcapng_of
+from tests.oracles.capture_files import ETHERNET, LINKS, Sent, pcap_of, pcapng_of
 
 _PERIOD_NS = 20_000_000
 _SENT = [Sent(10**18 + k * _PERIOD_NS, struct.pack(">I", k)) for k in range(6)]

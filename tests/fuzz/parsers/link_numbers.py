@@ -12,8 +12,7 @@ from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.kinds import IMPAIRMENTS
-from noack.impairments.link_records import NEVER_NS, RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
 from tests.fuzz.choices import Choices
 
 SANITIZED = True

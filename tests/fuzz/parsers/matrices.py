@@ -5,7 +5,7 @@ import io
 import numpy as np
 
 from noack.config.matrix_files import read_matrices
-from noack.settings.named_file import NamedFile
+from noack.settings.user_files import NamedFile
 from tests.fuzz.harness import refusal, workspace
 
 

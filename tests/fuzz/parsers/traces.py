@@ -7,8 +7,9 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.replay import Replay
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import read_files
 from tests.fuzz.harness import refusal, workspace
 
 SEEDS = [

@@ -22,8 +22,7 @@ from netem.engine.relay_interface import (
 )
 from netem.words.words_to_settings import settings_of
 from noack.core.core_library import core
-from noack.impairments.link_records import Counters
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

@@ -5,7 +5,7 @@ import pytest
 from netem.control.command_queue import CommandQueue
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
-from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import FakeRelay
 
 

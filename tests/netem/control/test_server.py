@@ -15,8 +15,7 @@ from netem.control.emulator_session import EMULATORS, find, running
 from netem.engine.relay_interface import DIRECTIONS
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_records import Counters
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import Counters, LinkSettings
 from noack.runtime.private_folder import private_folder
 from noack.runtime.zenoh_session import open_session
 from tests.netem.control.relays import SETTINGS, FakeRelay

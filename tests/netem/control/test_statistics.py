@@ -12,7 +12,7 @@ from netem.control.emulator_statistics import (
 from netem.engine.relay_interface import FlowReport
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
-from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import FakeRelay, times
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000

@@ -12,7 +12,7 @@ from netem.control.statistics_view import History, plain_lines, render
 from netem.engine.relay_interface import LinkSpec
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
-from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 

@@ -21,7 +21,7 @@ from netem.engine.relay_interface import DirectionReport
 from netem.engine.relay_sockets import raise_file_limit
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_records import RecordedDecision
+from noack.impairments.link_settings import RecordedDecision
 from noack.protocol.record_tables import Fate
 from noack.runtime import peer_sockets
 from tests.netem.engine.relays import (

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_settings import read_files
+from noack.impairments.loss_prediction import read_files
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running

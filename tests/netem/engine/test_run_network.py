@@ -29,12 +29,14 @@ from tests.netem.engine.relays import drain, endpoints, name_of
 from tests.oracles.link import Datagram, network_of
 
 NEVER_NS = 2**61
+HEAD = bytes(32)
+"""The header of a datagram of loop 0."""
 Arrival = tuple[int, int, int]
 """Time since the arrival before, size, and flow."""
 arrivals = st.lists(
     st.tuples(
         st.sampled_from([0, 1, 10_000, 1_000_000, 30_000_000]) | st.integers(0, 10**8),
-        st.sampled_from([0, 1, 8, 31, 32, 72, 1472, 9000]),
+        st.sampled_from([32, 33, 72, 1472, 9000]),
         st.integers(0, 1),
     ),
     min_size=1, max_size=60,
@@ -68,6 +70,7 @@ class Both:
         # A clock that stays far behind the times that the test passes.
         clock = RunClock(time.monotonic_ns() + NEVER_NS)
         ends = name_of(self._controller), name_of(self._other)
+        sender.connect(ends[0])
         self.compiled.open(clock, sender, peers, ends)
         self._expected: dict[int, list[bytes]] = {0: [], 1: []}
         self.rows: list[Record] = []
@@ -149,7 +152,7 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
             now_ns += gap_ns
             if gap_ns % 3 == 1:
                 machines.let_out(now_ns - gap_ns // 2)
-            data = (number.to_bytes(4, "big") * (size // 4 + 1))[:size]
+            data = (HEAD + number.to_bytes(4, "big") * (size // 4))[:size]
             machines.arrive(data, flow if len(crossing) == 2 else 0, now_ns)
         machines.let_out(NEVER_NS)
         machines.received()
@@ -159,7 +162,7 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
 
 @settings(max_examples=100)
 @given(
-    any_settings.harsh, CROSSING, st.sampled_from([2, 3, 200]),
+    any_settings.harsh, CROSSING, st.sampled_from([1, 2, 3, 200]),
     st.lists(
         st.tuples(
             st.sampled_from([0, 1, 10_000, 1_000_000]), st.integers(32, 72), st.integers(0, 1),
@@ -168,7 +171,7 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
         max_size=60,
     ),
 )  # fmt: skip
-def test_the_flows_of_several_loops_are_told_apart_by_the_header(
+def test_the_flows_of_all_loops_are_told_apart_by_the_header(
     link: LinkSettings,
     crossing: tuple[Flow, ...],
     loops: int,
@@ -194,7 +197,7 @@ def test_at_equal_times_updates_leave_before_actuations() -> None:
     delay = settings_of("delay 1ms")
     with both(network(delay, delay, Flow.UPDATE, Flow.ACTUATION)) as machines:
         for flow in (1, 0, 1, 0):
-            machines.arrive(b"%d" % flow, flow, 5)
+            machines.arrive(HEAD, flow, 5)
         machines.let_out(NEVER_NS)
         assert [len(data) for data in machines.received()] == [2, 2]
         flows = [row[4] for table, row in machines.rows if table == NETEM_RELEASE]
@@ -255,9 +258,10 @@ def test_arrival_is_when_the_datagram_reached_the_socket(speed: float) -> None:
     with endpoints(*["127.0.0.1"] * 5) as (sender, sensor, controller, *receivers):
         peers = dict(zip((name_of(sensor), name_of(controller)), receivers, strict=True))
         with closing(RunNetwork(cast(Scenario, resolved), BEGINNING)) as one:
+            sender.connect(name_of(controller))
             one.open(clock, sender, peers, [name_of(controller)])
             before_ns = clock.now_ns()
-            sensor.sendto(b"x", name_of(receivers[0]))
+            sensor.sendto(HEAD, name_of(receivers[0]))
             after_ns = clock.now_ns()
             time.sleep(0.05)
             rows = _Rows()

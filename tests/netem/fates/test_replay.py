@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from netem.fates.fate_replay import read_fates
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_records import RecordedDecision
-from noack.impairments.link_settings import LinkSettings
+from noack.impairments.link_settings import LinkSettings, RecordedDecision
 from noack.protocol.record_tables import Fate
 from tests.netem.any_settings import harsh as settings
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record

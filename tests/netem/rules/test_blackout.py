@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.words.words_to_settings import settings_of
-from noack.impairments.link_settings import read_files
+from noack.impairments.loss_prediction import read_files
 from tests.oracles.link import Link
 
 NS = 10**9

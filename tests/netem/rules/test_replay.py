@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from netem.words.words_to_settings import settings_of
 from noack.impairments.kinds.replay import Replay
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_prediction import read_files
 from noack.traces.trace_formats import read_trace
 from tests.oracles.link import Link
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from netem.words.words_to_settings import parse, settings_of, text_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.quantities import (
+from noack.impairments.words import (
     OWN_TIME_S,
     PERCENT,
     RATE_BPS,

@@ -14,9 +14,10 @@ from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
-from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import read_files
 from noack.protocol.record_tables import Fate
 from tests.oracles.link import Link
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.loops import loops_of, phases_ns
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of, phases_ns
 from noack.config.scenario_file import completed, dumps, load, validate
 from noack.core.errors import CallerError
 
@@ -105,12 +104,14 @@ def test_the_file_of_a_loop_is_found_beside_the_scenario(
          "loops.1.count = 40000: a run has at most 65535 loops"),
         ([{"name": "a", "network": {"mansd": 1}}],
          'loops.0.network = {"mansd": 1}: all loops share it; set it at the top level'),
-        ([{"name": "a"}, {"name": "b", "plant": {"rate_hz": 250.0}}],
-         "loops.1.plant.rate_hz = 250.0: should be 500, as for loops.0: all loops "
-         "have the same periods"),
-        ([{"name": "a"}, {"name": "b", "controller": {"rate_hz": 250.0}}],
-         "loops.1.controller.rate_hz = 250.0: should be 500, as for loops.0: all loops "
-         "have the same periods"),
+        ([{"name": "a", "scenario": 3}],
+         "loops.0.scenario = 3: should be the name of a scenario file, in quotes"),
+        ([{"name": "a", "scenario": "other.toml"}],
+         'loops.0.scenario = "other.toml": it is read where a scenario file is loaded; give tables '
+         "here"),
+        ([{"name": "a", "scenario": {"plant": {"initial_state": [1.0]}}}],
+         "loops.0.scenario.model: missing (the model that sensor and controller use: Â, B̂, and "
+         "the gain K of u = K x_c)"),
         ([{"name": "a", "plant": {"initial_state": [1.0]}}],
          "loops.0.plant.initial_state = [1.0]: expected 2 entries (one per state), found 1"),
         ([{"name": "a", "trigger": {"bta": 1.0}}],

@@ -16,7 +16,7 @@ from noack.config.parameter_changes import (
 from noack.config.resolution import resolve
 from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.config.scenario import Scenario
-from noack.config.scenario_changes import content_with_settings
+from noack.config.scenario_checks import content_with_settings
 from noack.config.scenario_file import dumps, validate
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss

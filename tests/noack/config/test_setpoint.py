@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.config.resolution import loop_of, resolve
+from noack.config.scenario_checks import input_at
 from noack.config.scenario_file import dumps, validate
-from noack.config.setpoint import input_at
 from noack.core.errors import CallerError
 
 A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

@@ -9,8 +9,8 @@ import pytest
 from scipy import signal
 from scipy.io import loadmat
 
-from noack.config.sections.model_section import ModelSection
-from noack.config.state_space import model_of, save_model
+from noack.config.matrix_files import model_of, save_model
+from noack.config.sections import ModelSection
 from noack.core.errors import CallerError
 
 A = np.array([[0.0, 1.0], [4.0, 0.0]])

@@ -14,8 +14,8 @@ from netem.words.links_file import load_links
 from noack.config import toml_file
 from noack.config.scenario_file import load, put, validate
 from noack.core.errors import CallerError
-from noack.settings.named_file import NamedFile
 from noack.settings.section import ScenarioSection
+from noack.settings.user_files import NamedFile
 
 MOST = toml_file.MOST_LEVELS
 READERS = [load, load_campaign, load_links]

@@ -13,7 +13,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
-from noack.impairments.loss_process import LossProcess, loss_process
+from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
 
 P = 0.3

@@ -20,11 +20,11 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
 )
 from noack.machines.loop_machines import LoopMachines
-from noack.observers.estimation_model import EstimationModel
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
+from noack.observers.observer_settings import EstimationModel
 from noack.plants.linear import LinearSystem
-from noack.plants.systems.plant_system import SystemFailedError
+from noack.plants.plant_settings import SystemFailedError
 from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
@@ -38,14 +38,10 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.self_triggered import SelfTrigger
 from noack.trigger.send_on_area import SendOnAreaTrigger
-from noack.trigger.trigger_policy import CodedPolicy, Policy, TriggerDecision
-from noack.trigger.trigger_rule import Forecast
-from plant_server.disturbance_signal import Disturbance
-from plant_server.measurement import MeasurementModel
-from plant_server.plant import Plant
-from plant_server.watchdog import NEVER_NS, Watchdog
-from sensor_node.observer import Observer
-from sensor_node.sensor import Sensor
+from noack.trigger.trigger_rule import CodedPolicy, Forecast, Policy, TriggerDecision
+from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
+from sensor_node.sensor import Observer, Sensor
+from tests.machine_parts import OneLoop
 from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
@@ -303,10 +299,10 @@ def driven(
         sent = [one for one in outputs if isinstance(one, Message)]
         assert {one.loop for one in sent} <= {loop}
         inputs.sent[loop] += sent
-        yield loop, message, now_ns, plain(outputs, machines.numbered)
+        yield loop, message, now_ns, plain(outputs, numbered=not isinstance(machines, OneLoop))
 
 
-def plain(outputs: Sequence[Output], numbered: bool) -> list[Any]:
+def plain(outputs: Sequence[Output], *, numbered: bool) -> list[Any]:
     """Outputs to compare bit for bit, without the number of their loop."""
     return [_plain(output, numbered) for output in outputs]
 

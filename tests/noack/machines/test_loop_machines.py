@@ -1,6 +1,7 @@
 """The machines of a process: several loops, what interrupts a step, announcements, restarts."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 import noack.core.core_memory
 import sensor_node.sensor
-from controller_node.controller import Controller, controller_of
+from controller_node.controller import Controller
 from noack.config.parameter_changes import LATE, ParameterChange
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
@@ -19,23 +20,24 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.errors import CallerError
 from noack.core.linear_systems import discretise
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.machines.loop_machines import LoopMachines
+from noack.machines.loop_machines import LoopMachines, row_types
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import GENERATION, Notice, Record, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
+    LOOP,
     NO_SEQUENCE,
     SENSOR_MEASUREMENT,
     SENSOR_SETTING,
+    tables,
 )
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.trigger_policy import CodedPolicy
-from plant_server.disturbance_signal import BLOCK
-from plant_server.plant import Plant
-from sensor_node.sensor import Sensor, sensor_of, sensors_of
-from tests.machine_parts import machine
+from noack.trigger.trigger_rule import CodedPolicy
+from plant_server.plant import BLOCK, Plant
+from sensor_node.sensor import Sensor, sensors_of
+from tests.machine_parts import controller_of, machine, sensor_of
 from tests.noack.machines.any_machines import (
     MS,
     Inputs,
@@ -78,9 +80,7 @@ def test_several_loops_do_what_each_does_alone(
     of: Sizes, role: str, loops: list[tuple[int, int]], seed: int
 ) -> None:
     phases_ns = [phase_ms * MS for _, phase_ms in loops]
-    together = LoopMachines(
-        [part_of(role, number, of) for number, _ in loops], phases_ns, numbered=True
-    )
+    together = LoopMachines([part_of(role, number, of) for number, _ in loops], phases_ns)
     alone = [machine(part_of(role, number, of)) for number, _ in loops]
     # Only the numbers of the loops and their phases differ; ticks are in the order of their times.
     dues: list[tuple[int, int]] = []
@@ -236,7 +236,7 @@ def test_losses_of_many_loops_are_compared_with_the_guarantee_of_each(
                    LossGuarantee((LongestBurst(loop),)), np.ones(1))
         for loop in range(4)
     ]  # fmt: skip
-    together = LoopMachines(parts, [0, MS, 2 * MS, 3 * MS], numbered=True)
+    together = LoopMachines(parts, [0, MS, 2 * MS, 3 * MS])
     newest, expected, found = [-1] * 4, [], []
     for number, (loop, losses) in enumerate(received):
         sequence, t_ns = newest[loop] + losses + 1, number * MS
@@ -256,8 +256,55 @@ def test_a_message_that_a_machine_does_not_receive_is_refused() -> None:
             own.handle(Message(flow, 0, 0, np.zeros(entries)), 0)
     with pytest.raises(IndexError):
         own.handle(Message(Flow.MEASUREMENT, 0, 0, np.zeros(1), 1), 0)
-    with pytest.raises(ValueError, match="different columns"):
-        LoopMachines([Sensor(np.zeros((n, n)), AbsoluteTrigger(1.0)) for n in (1, 2)])
+
+
+@given(
+    st.lists(st.tuples(sizes(), st.integers(0, 1000)), min_size=2, max_size=4),
+    st.sampled_from(["plant", "sensor", "controller"]),
+    st.integers(0, 1000),
+)
+def test_rows_of_loops_of_different_sizes_are_those_of_each_alone(
+    loops: list[tuple[Sizes, int]], role: str, seed: int
+) -> None:
+    """A loop's vector is the beginning of the table's; the rest is NaN; other columns are 0."""
+    together = LoopMachines([part_of(role, number, of) for of, number in loops])
+    alone = [machine(part_of(role, number, of)) for of, number in loops]
+    inputs = Inputs(together, seed)
+    for _ in range(COUNT):
+        message, now_ns = inputs.next()
+        loop = int(together.core.heap[0]) if message is None else message.loop
+        if message is None:
+            outputs, expected = together.on_timer(now_ns), alone[loop].on_timer(now_ns)
+        else:
+            outputs = together.handle(message, now_ns)
+            expected = alone[loop].handle(message._replace(loop=0), now_ns)
+        inputs.sent[loop] += [output for output in outputs if isinstance(output, Message)]
+        for written, own in zip(outputs, expected, strict=True):
+            if not isinstance(own, Record):
+                continue
+            assert isinstance(written, Record)
+            assert written.row[0] == loop
+            types = row_types([part.shape for part in together.parts])[own.table]
+            names = tables(**asdict(together.parts[loop].shape))[own.table].names or ()
+            row = dict(zip(types.names or (), written.row, strict=True))
+            for name, value in zip(names, own.row, strict=True):
+                given_value = np.atleast_1d(row[name])
+                size = np.size(value)
+                assert given_value[:size].tobytes() == np.atleast_1d(value).tobytes()
+                assert np.isnan(given_value[size:]).all()
+            missing = [row[name] for name in row if name not in (LOOP, *names)]
+            assert not any(np.any(value) for value in missing)
+
+
+def test_a_change_that_a_later_loop_refuses_changes_no_loop(content: dict[str, Any]) -> None:
+    """The second loop's trigger has no β."""
+    first = scenario(content)
+    second = scenario(content | {"trigger": {"policy": "absolute", "delta": 0.5}})
+    together = sensors_of((first, second))
+    with pytest.raises(CallerError, match="beta"):
+        together.announce(ParameterChange(0, 50 * MS, {"trigger.beta": 0.5}), 0)
+    assert [structure.machine.inputs for structure in together.machines] == [0, 0]
+    assert not any(part.schedule.has_changes for part in together.parts if part.schedule)
 
 
 def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
@@ -290,7 +337,7 @@ def test_a_change_that_is_announced_late_applies_from_the_next_time_on(
     """The second loop begins 25 ms after the first; both are at 50 ms of their own time."""
     content["trigger"] = {"policy": "absolute", "delta": 0.5}
     one = scenario(content)
-    together = sensors_of((one, one), [0, 25 * MS], numbered=True)
+    together = sensors_of((one, one), [0, 25 * MS])
     names = tables_of(one)[SENSOR_MEASUREMENT].names
     assert names is not None
 

@@ -97,8 +97,7 @@ WRONG: dict[str, list[tuple[str, Any, str]]] = {
         *[(name, NULL, "a watchdog that predicts has no model") for name in ("K", "x_fallback")],
         ("fallback.transitions", NULL, MODEL),
         *[(f"tables[{k}].{name}", value, ROW)
-          for k in (0, 1) for name, value in (("row_bytes", 8), ("prefix_bytes", 1),
-                                              ("prefix_bytes", HUGE), ("prefix_bytes", 2))],
+          for k in (0, 1) for name, value in (("row_bytes", 8), ("row_bytes", HUGE))],
         *[(f"tables[{k}].{name}", value, TABLE)
           for k in (0, 1) for name, value in (("rows", NULL), ("places", 0), ("places", HUGE),
                                               ("count", -1), ("count", 1025))],
@@ -205,7 +204,7 @@ def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
 
 
 def test_the_last_of_several_loops_is_checked_too() -> None:
-    own = LoopMachines([controller(seed, Sizes(1, 1)) for seed in range(3)], numbered=True)
+    own = LoopMachines([controller(seed, Sizes(1, 1)) for seed in range(3)])
     assert text_of(own) is None
     own.machines[2].machine.m = 0
     assert text_of(own) == "a machine has not 1 to 64 states and inputs"
@@ -219,3 +218,11 @@ def test_python_is_told_what_is_wrong() -> None:
 def test_each_text_is_in_the_table() -> None:
     texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
     assert {text for *_, text in CASES} | {NOT_ACKNOWLEDGED} == {*texts}
+
+
+@pytest.mark.parametrize("word", [-3, 11])
+def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: int) -> None:
+    own = LoopMachines([controller(1, Sizes(1, 1)), controller(2, Sizes(3, 1))])
+    assert text_of(own) is None
+    own.core.tables[0].layouts[0][4] = word
+    assert text_of(own) == "the rows of a table have another size than the machines write"

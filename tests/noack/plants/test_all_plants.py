@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.feature_kinds import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
+from noack.config.sections import PLANTS
 from noack.plants.plant_settings import PlantSettings
 from plant_server.plant import system_of
 from tests.noack.plants.motion import motion

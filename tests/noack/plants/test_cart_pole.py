@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from noack.plants.cart_pole import CartPoleSettings
-from noack.plants.plant_settings import PlantEquations
-from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.plant_settings import OdeSystem, PlantEquations
 from noack.plants.systems.plant_linearisation import linearise
 from tests.noack.plants.motion import motion
 

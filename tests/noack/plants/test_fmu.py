@@ -13,14 +13,11 @@ import numpy as np
 import pytest
 
 from noack.core.errors import CallerError
-from noack.plants.fmu import FmuSettings
+from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import PlantEquations
-from noack.plants.systems.fmu_system import FmuSystem
-from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
 from noack.plants.systems.plant_linearisation import linearise
-from noack.plants.systems.plant_system import SystemFailedError
-from noack.settings.named_file import located
+from noack.settings.user_files import located
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 
@@ -239,7 +236,7 @@ def test_unpacked_files_are_removed_with_the_system_or_its_process(
     del system
     assert not folder.exists()
     program = (
-        "import sys, tempfile, numpy as np; from noack.plants.systems.fmu_system import FmuSystem; "
+        "import sys, tempfile, numpy as np; from noack.plants.fmu import FmuSystem; "
         "from noack.plants.fmu import FmuSettings; tempfile.tempdir = sys.argv[1]; "
         "kept = FmuSystem(FmuSettings.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
     )

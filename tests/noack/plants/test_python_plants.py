@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from noack.core.errors import CallerError
+from noack.plants.plant_settings import SystemFailedError
 from noack.plants.python_plant import PythonPlantSettings, PythonSystem
-from noack.plants.systems.plant_system import SystemFailedError
-from noack.settings.named_file import located
+from noack.settings.user_files import located
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.3, 0.0])

@@ -111,7 +111,7 @@ class Live:
     def new_machines(
         self, role: str, loops: Sequence[Scenario], phases_ns: Sequence[int] | None
     ) -> LoopMachines:
-        return MAKERS[role](loops, phases_ns, numbered=True)
+        return MAKERS[role](loops, phases_ns)
 
     def send(self, *messages: Message, by: socket.socket | None = None) -> None:
         """Send messages, by default from the peer."""

@@ -212,7 +212,7 @@ def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -
 
 def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
-        live.driver.core.sender = -1
+        live.driver.core.senders[0] = -1
         live.send(*measurements(1))
         live.drive_until_accepted(1)
         report = live.channel.report()

@@ -5,17 +5,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, Samples
-from cosim.simulation.continuous.continuous_run import (
+from cosim.simulation.continuous import (
+    ContinuousLoop,
     ContinuousRun,
+    Samples,
     TooManyEventsError,
     simulate_continuous,
 )
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_policy import Policy
-from tests.noack.theory.loops import System
+from noack.trigger.trigger_rule import Policy
+from tests.oracles.lossy_loops import System
 
 _MOST_EVENTS = 3000
 

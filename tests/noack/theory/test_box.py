@@ -12,14 +12,12 @@ from hypothesis import assume, find, given, settings
 from hypothesis import strategies as st
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.box import BoxGains
-from noack.theory.certificate import solve
-from noack.theory.certificate_terms import Constants, NetworkConditions, VoidError
-from noack.theory.error_gains import Output
-from noack.theory.error_growth import TriggerBound
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.plant_gains import Coefficients, PlantGains
-from tests.noack.theory.loops import (
+from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import Coefficients, Output, PlantGains
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
+from noack.theory.certificates.solution import solve
+from tests.oracles.lossy_loops import (
     RUNS,
     SEARCH,
     STEPS,
@@ -54,7 +52,7 @@ class Case(NamedTuple):
     def constants(self, box: type[BoxGains] = BoxGains) -> Constants | None:
         try:
             return self.certify(box=box)
-        except (VoidError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError):
             return None
 
     def simulate(self, seed: int) -> Trace:
@@ -113,7 +111,7 @@ def test_an_empty_box_has_the_bounds_of_the_model(system: System) -> None:
     plant, level = system.gains(), TriggerBound(system.beta, system.beta)
     try:
         own = solve(plant.error, plant, system.conditions, level, structured=False)
-    except VoidError:
+    except NoCertificateError:
         assume(False)
     box = Case(system, np.zeros_like(system.A), np.zeros_like(system.B)).certify()
     assert tuple(box) == pytest.approx(tuple(own), rel=1e-9, abs=1e-9)

@@ -8,19 +8,16 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
-from noack.theory.box import BoxGains
-from noack.theory.certificate_terms import Part, VoidError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.error_gains import ErrorGains
-from noack.theory.error_growth import TriggerBound
-from noack.theory.forcing import Forcing, NormalForcing
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.plant_gains import PlantGains
-from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import certify, certify_box
-from noack.theory.superposition import solve_divided
+from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains
+from noack.theory.bounds.terms import NoCertificateError, Part, TriggerBound
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.disturbed import solve_two_parts
+from noack.theory.certificates.scenario_certificates import certify, certify_box
 from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
-from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
+from tests.oracles.lossy_loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
 
 ROOT = Path(__file__).parents[3]
 
@@ -35,7 +32,7 @@ def box_certificate(system: System, columns: np.ndarray, half: float, floor: flo
     forcing = Forcing(columns, np.full(k, np.inf), np.zeros(m))
     first = plant(system.alpha, system.x0[:, None], None)
     rest = plant(0.0, np.zeros((len(system.A), 1)), forcing)
-    return Sum(system, *solve_divided(
+    return Sum(system, *solve_two_parts(
         Part(first.error, first, TriggerBound(system.beta, None)),
         Part(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
         system.conditions,
@@ -51,7 +48,7 @@ def test_no_plant_of_a_disturbed_box_exceeds_its_bounds(seed: int) -> None:
         half = 0.02
         try:
             found = box_certificate(loop.system, loop.columns, half, loop.floor)
-        except (VoidError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError):
             continue
         break
     system = loop.system

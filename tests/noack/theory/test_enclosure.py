@@ -15,9 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.contraction import decay_of, spectral_norms
-from noack.theory.enclosure import factors, norm_bounds, response, response_until
-from noack.theory.kernel_bounds import KernelBounds, NotDecayingError
+from noack.theory.bounds.contraction import find_decay, spectral_norms
+from noack.theory.bounds.enclosure import (
+    KernelBounds,
+    NotDecayingError,
+    factors,
+    norm_bounds,
+    response,
+    response_until,
+)
 
 Rng = np.random.Generator
 
@@ -66,7 +72,7 @@ def cases(draw: st.DrawFn, kind: str) -> tuple[Matrix, Matrix, Matrix]:
     n, rng = draw(st.integers(1, 6)), np.random.default_rng(draw(st.integers(0, 2**32)))
     rows, columns = (draw(st.integers(1, n)) for _ in range(2))
     G = KINDS[kind](rng, n)
-    assume(decay_of(G) is not None)
+    assume(find_decay(G) is not None)
     whole = draw(st.booleans())
     C = np.eye(n) if whole else rng.normal(size=(rows, n))
     D = np.eye(n) if whole else rng.normal(size=(n, columns))
@@ -234,8 +240,8 @@ def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
 @given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
 def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
     G = KINDS[kind](np.random.default_rng(seed), n)
-    assert decay_of(-G) is None
-    decay = decay_of(G)
+    assert find_decay(-G) is None
+    decay = find_decay(G)
     assume(decay is not None)
     assert decay is not None
     assert 0 < decay.rate_per_s <= -spectral_abscissa(G) * (1 + 1e-9)

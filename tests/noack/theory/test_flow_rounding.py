@@ -7,9 +7,9 @@ from hypothesis import given, settings
 
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
-from noack.theory.delivery_flow import ROUNDING, DeliveryFlow
-from noack.theory.fixed_point import exponential
-from tests.noack.theory.loops import SEARCH, System, systems
+from noack.theory.certificates.delivery_flow import ROUNDING, DeliveryFlow
+from noack.theory.margins.exact_matrices import exponential
+from tests.oracles.lossy_loops import SEARCH, System, systems
 
 
 def exactly_after(generator: Matrix, t_s: float) -> Matrix:

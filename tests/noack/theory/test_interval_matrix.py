@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.fixed_point import exponential, fixed, power
-from noack.theory.interval_matrix import IntervalMatrix, exactly, inverse
+from noack.theory.margins.exact_matrices import (
+    IntervalMatrix,
+    exactly,
+    exponential,
+    fixed,
+    inverse,
+    power,
+)
 
 
 def rational(matrix: Matrix) -> Any:

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.destabilising_cycle import spectral_radius_bounds
-from noack.theory.interval_matrix import IntervalMatrix, exactly
-from noack.theory.invariant_polytopes import InvariantPolytopes
-from noack.theory.joint_spectral_radius import joint_spectral_radius
-from noack.theory.quadratic_norms import norms_above, quadratic_norms, remembering
-from noack.theory.switched_system import Edge, strongly_connected
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.margins.invariant_polytopes import InvariantPolytopes
+from noack.theory.margins.joint_spectral_radius import (
+    joint_spectral_radius,
+    norms_above,
+    quadratic_norms,
+    remembering,
+)
+from noack.theory.margins.switched_system import Edge, spectral_radius_bounds, strongly_connected
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
 

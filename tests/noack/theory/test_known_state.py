@@ -7,12 +7,15 @@ import pytest
 from hypothesis import given, settings
 from scipy.linalg import expm
 
-from noack.theory.certificate_terms import Constants
-from noack.theory.enclosure import response
-from noack.theory.error_gains import ErrorGains
-from noack.theory.known_state import KnownStateBounds, KnownStatePart, integral_until
-from noack.theory.plant_gains import PlantGains
-from tests.noack.theory.loops import (
+from noack.theory.bounds.enclosure import response
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    KnownStatePart,
+    integral_until,
+)
+from tests.oracles.lossy_loops import (
     SEARCH,
     STEPS,
     System,

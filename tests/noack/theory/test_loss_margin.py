@@ -22,8 +22,7 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
-from noack.theory.delivery_graph import EventTimes, bursts_of
-from noack.theory.loss_margin import LossMargin, capped
+from noack.theory.margins.loss_margin import EventTimes, LossMargin, capped, list_bursts
 
 ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
@@ -214,7 +213,7 @@ def test_times_between_two_events() -> None:
 
 def test_edges_are_all_times_between_two_deliveries() -> None:
     times = EventTimes(2, 4)
-    bursts = bursts_of(LossGuarantee((LongestBurst(2),)), 1, times)
+    bursts = list_bursts(LossGuarantee((LongestBurst(2),)), 1, times)
     assert {one.steps for one in bursts} == {*range(2, 5), *range(4, 9), *range(6, 13)}
     for one in bursts:
         intervals = one.intervals(times)
@@ -226,7 +225,7 @@ def test_edges_are_all_times_between_two_deliveries() -> None:
 @pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
 @pytest.mark.parametrize("slots", [1, 3])
 def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int) -> None:
-    bursts = bursts_of(guarantee, slots)
+    bursts = list_bursts(guarantee, slots)
 
     def patterns(node: int, left: int) -> set[tuple[bool, ...]]:
         found: set[tuple[bool, ...]] = {()} if left == 0 else set()
@@ -247,10 +246,10 @@ def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int)
 
 def test_states_of_a_guarantee_with_the_same_future_are_one_node() -> None:
     """At most 6 in 7 is at most 6 in a row; of 2 in 5, the age of both losses matters."""
-    cap = bursts_of(LossGuarantee((LongestBurst(6),)))
-    assert bursts_of(LossGuarantee((LongestBurst(6), LossesInWindow(6, 7)))) == cap
+    cap = list_bursts(LossGuarantee((LongestBurst(6),)))
+    assert list_bursts(LossGuarantee((LongestBurst(6), LossesInWindow(6, 7)))) == cap
     assert len(cap) == 7
-    assert len({one.source for one in bursts_of(LossGuarantee((LossesInWindow(2, 5),)))}) > 1
+    assert len({one.source for one in list_bursts(LossGuarantee((LossesInWindow(2, 5),)))}) > 1
 
 
 @pytest.mark.parametrize(

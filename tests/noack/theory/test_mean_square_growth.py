@@ -8,10 +8,14 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
-from noack.impairments.loss_process import LossProcess
+from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
-from noack.theory.loss_margin import LossMargin
-from noack.theory.mean_square_growth import mean_square_growth, sure_growth
+from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.random_losses.mean_square_growth import (
+    mean_square_growth,
+    random_growth,
+    sure_growth,
+)
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_periodic.toml"
 
@@ -88,7 +92,7 @@ def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
 def test_a_long_run_of_the_lane_grows_no_faster_than_its_bound() -> None:
     margin = LossMargin(resolve(load(LANE, ())))
     p, rng = 0.7, np.random.default_rng(5)
-    found = margin.random_growth(independent(p))
+    found = random_growth(margin, independent(p))
     maps = margin.loop.period(0, True), margin.loop.period(0, False)
     z, total, periods = np.ones(len(maps[0])), 0.0, 5000
     for lost in (rng.uniform(size=periods) < p).tolist():

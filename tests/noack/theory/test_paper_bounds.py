@@ -9,10 +9,10 @@ from scipy.linalg import expm
 
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.paper_bounds import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     System,

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.error_gains import Output
-from noack.theory.error_growth import first_passage_s
-from tests.noack.theory.loops import SEARCH, System, certified_or_skipped, systems
+from noack.theory.bounds.gains import Output
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.bounds.trigger_bounds import first_passage_s
+from tests.oracles.lossy_loops import SEARCH, System, certified_or_skipped, systems
 
 SOME = settings(SEARCH, max_examples=6)
 ROUNDING = 1 - 1e-9

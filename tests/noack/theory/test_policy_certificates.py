@@ -1,6 +1,6 @@
-"""Certificates of every trigger policy: random loops exceed none, and each broken copy is caught.
+"""Certificates of every trigger policy: under disturbances, in continuous time, with a deadline.
 
-The policies are written again in ``event_rules``, and the loops are simulated in ``loops``.
+``certificate_kinds/policies.py`` has the loops without them, and the broken copies.
 """
 
 from pathlib import Path
@@ -12,30 +12,33 @@ from hypothesis import strategies as st
 
 from noack.config.resolution import policy_of, resolve
 from noack.config.scenario_file import load
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.known_state import known_state_bounds
-from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import certify
-from tests.noack.theory.broken_policies import BROKEN_POLICIES, INSTANT
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.certified_bounds import known_state_bounds
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from tests.noack.theory.certificate_kinds.policies import (
+    INSTANT,
+    POLICY_KINDS,
+    exceeded_by,
+    policy_case,
+)
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
 from tests.noack.theory.exact_loops import observe
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     STEPS,
     System,
     networks,
-    random_system,
     seeds,
     simulate,
     systems,
 )
-from tests.noack.theory.policy_loops import KINDS, exceeded_by, policy_case
 
 SCENARIO = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", POLICY_KINDS)
 @settings(SEARCH, max_examples=3)
 @given(systems(step_share=0.002), st.sampled_from([0.02, 0.3]), seeds)
 def test_no_bound_of_a_policy_is_exceeded_under_disturbances(
@@ -50,7 +53,7 @@ def test_no_bound_of_a_policy_is_exceeded_under_disturbances(
         assert exceeded_by(trace, certificate, system) == []
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS.keys() - {"lyapunov"}))
+@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov"}))
 @settings(SEARCH, max_examples=3)
 @given(systems(**INSTANT), seeds)
 def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
@@ -91,19 +94,3 @@ def test_a_short_deadline_adds_decay_to_a_constant_threshold(
     missing = np.zeros(len(t_s), np.int64)
     for bound in (known.state_deviation(t_s, t_s, missing), known.controller_error(t_s, missing)):
         assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0
-
-
-@pytest.mark.parametrize("mistake", BROKEN_POLICIES)
-def test_runs_exceed_a_broken_certificate_of_a_policy(mistake: str) -> None:
-    kind, broken, where = BROKEN_POLICIES[mistake]
-    for seed in range(60):
-        system = random_system(np.random.default_rng(seed), **where)
-        resolved, rule, system = policy_case(kind, system, seed)
-        wrong, right = (one(resolved, system.conditions) for one in (broken, certify))
-        if wrong.constants is None:
-            continue
-        trace = simulate(system, *networks(seed, system), rule=rule)
-        if exceeded_by(trace, wrong, system):
-            assert exceeded_by(trace, right, system) == []
-            return
-    pytest.fail("no run exceeds it")

@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from noack.impairments.loss_process import LossProcess
-from noack.theory.certificate_terms import NetworkConditions, VoidError
-from noack.theory.error_gains import ErrorGains
-from noack.theory.plant_gains import PlantGains
-from noack.theory.random_losses import moment_at_events, moments
+from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
+from noack.impairments.loss_prediction import LossProcess
+from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.random_losses.moments import moment_at_events, moments
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import loop_of
-from tests.noack.theory.loops import System, random_system
+from tests.oracles.lossy_loops import System, random_system
 
 EVENTS = 12
 
@@ -55,7 +53,7 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_solved_by_hand()
 
 def test_too_many_losses_have_no_moments() -> None:
     plant = scalar(1.0, 3.0, 0.5)
-    with pytest.raises(VoidError):
+    with pytest.raises(NoCertificateError):
         moments(plant.error, plant, NetworkConditions(0), 0.1, 0.9, 1)
 
 

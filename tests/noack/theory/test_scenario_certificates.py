@@ -19,14 +19,14 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import spectral_abscissa
-from noack.theory.assumptions import AssumptionStatus
-from noack.theory.certificate_terms import Constants, NetworkConditions
-from noack.theory.certified_bounds import OWN_PLANT, ScenarioCertificate
-from noack.theory.error_gains import ErrorGains
-from noack.theory.paper_bounds import theorem_2
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify, certify_box
-from tests.noack.theory.loops import (
+from noack.theory.bounds.gains import ErrorGains
+from noack.theory.bounds.terms import Constants, NetworkConditions
+from noack.theory.certificates.assumptions import AssumptionStatus
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import OWN_PLANT, ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.paper.theorems import theorem_2
+from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     STEPS,

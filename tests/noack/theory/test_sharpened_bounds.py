@@ -8,14 +8,12 @@ from hypothesis import given, settings
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate_terms import Constants, NetworkConditions
-from noack.theory.delivery_flow import Reach
-from noack.theory.error_gains import Output
-from noack.theory.lost_events import bend_of_error, errors_after_losses
-from noack.theory.sharpened_bounds import InvariantEllipsoids
-from tests.noack.theory.broken_flow import BROKEN_FLOWS
+from noack.theory.bounds.gains import Output
+from noack.theory.bounds.terms import Constants, NetworkConditions
+from noack.theory.certificates.delivery_flow import Reach, bend_of_error, errors_after_losses
+from noack.theory.certificates.solution import InvariantEllipsoids
 from tests.noack.theory.exact_loops import observe
-from tests.noack.theory.loops import (
+from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     System,
@@ -24,7 +22,7 @@ from tests.noack.theory.loops import (
     systems,
 )
 
-SHARP = ("x", "x_W", "E x", "p", "e_c", "inter-event time")
+SIGNALS = ("e_s", "x", "x_W", "E x", "p", "e_c", "inter-event time")
 
 
 def weighted(**changes: object) -> System:
@@ -39,15 +37,20 @@ def weighted(**changes: object) -> System:
     return System(**(values | changes))  # type: ignore[arg-type]
 
 
+def certified(system: System) -> Constants:
+    return certified_or_skipped(system, NetworkConditions(system.mansd))
+
+
 def shares(system: System, found: Constants, seed: int) -> dict[str, float]:
     """The largest share of each bound that runs use; above 1, the bound is exceeded."""
-    E, largest = system.A + system.B @ system.K - system.H, dict.fromkeys(SHARP, 0.0)
+    E, largest = system.A + system.B @ system.K - system.H, dict.fromkeys(SIGNALS, 0.0)
     W = system.weight
     for run, samples in observe(system, 12.0, seed):
         growth = np.exp(system.alpha * samples.t_s)
         if not system.known_start:  # before event 0 sensor and controller do not agree
             growth[len(growth) - len(run.before)] = 0.0
         for name, values, bound in (
+            ("e_s", samples.e_s @ W.T, found.overshoot * system.beta),
             ("x", samples.x, found.state),
             ("x_W", samples.x @ W.T, found.state_weighted),
             ("E x", samples.x @ (W @ E).T, found.mismatch),
@@ -62,14 +65,6 @@ def shares(system: System, found: Constants, seed: int) -> dict[str, float]:
     return largest
 
 
-@settings(SEARCH, max_examples=12)
-@given(systems(mismatch=0.1, hold_steps=0, delay_steps=0), seeds)
-def test_no_sharpened_bound_is_exceeded(system: System, seed: int) -> None:
-    found = certified_or_skipped(system, NetworkConditions(system.mansd))
-    used = shares(system, found, seed)
-    assert {name: share for name, share in used.items() if share > ROUNDING} == {}
-
-
 def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
     system = weighted()
     sharp = system.certify(NetworkConditions(3))
@@ -82,12 +77,21 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
     assert {name for name, share in used.items() if share < 0.6} == set()
 
 
-@pytest.mark.parametrize("mistake", BROKEN_FLOWS)
-def test_a_broken_copy_is_exceeded(mistake: str) -> None:
-    systems = [weighted(), weighted(x0=np.array([0.01, 0.02]))]
-    with BROKEN_FLOWS[mistake]():
-        used = [shares(one, one.certify(NetworkConditions(3)), 1) for one in systems]
-    assert max(max(one.values()) for one in used) > 1.05
+def test_all_bounds_are_nearly_reached_and_none_is_exceeded_where_there_are_many_events() -> None:
+    """The plant is far from its model. Bounds that were smaller by a fifth would be exceeded."""
+    largest: dict[str, float] = {}
+
+    @settings(SEARCH, max_examples=15)
+    @given(systems(n=2, mansd=4, mismatch=0.5, beta=0.01), seeds)
+    def look(system: System, seed: int) -> None:
+        for name, share in shares(system, certified(system), seed).items():
+            largest[name] = max(largest.get(name, 0.0), share)
+
+    look()
+    assert max(largest.values()) <= ROUNDING
+    assert largest["e_s"] == pytest.approx(1.0, abs=1e-9)
+    for name, least in (("e_c", 0.9), ("x", 0.95), ("p", 0.8), ("inter-event time", 0.85)):
+        assert largest[name] > least, name
 
 
 def followed(reach: Reach) -> Iterator[Matrix]:

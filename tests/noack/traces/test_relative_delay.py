@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from noack.traces.packet_trace import PacketTrace, packet_trace
-from noack.traces.relative_delay import envelope_slope, relative_delays
+from noack.traces.packet_trace import PacketTrace, envelope_slope, packet_trace, relative_delays
 
 PERIOD_NS = 20_000_000
 

@@ -5,8 +5,7 @@ import numpy as np
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Vector
-from noack.trigger.core_rule import fill_rule, rule_rows
-from noack.trigger.trigger_policy import Policy, TriggerDecision
+from noack.trigger.trigger_rule import Policy, TriggerDecision, fill_rule, rule_rows
 
 
 class CoreTrigger:

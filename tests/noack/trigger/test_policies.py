@@ -21,8 +21,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_policy import Policy
-from noack.trigger.trigger_rule import Forecast
+from noack.trigger.trigger_rule import Forecast, Policy
 from tests.noack.trigger.core_trigger import CoreTrigger
 
 Vector = NDArray[np.float64]

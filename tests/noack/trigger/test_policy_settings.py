@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import LoopMatrices, loop_of, policy_of, resolve
 from noack.config.scenario_file import validate
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cosim.simulation.batch.batch_interface import run_batch, run_events
-from cosim.simulation.batch.batch_status import OK
-from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.batch import run_batch, run_events
+from cosim.simulation.continuous import ContinuousRun
+from cosim.simulation.exact_simulation import OK
 from noack.trigger.dwell import DwellTrigger
 from noack.trigger.send_on_area import SendOnAreaTrigger
 from tests.cosim.simulation.batch.exact import one, random_population, random_setting, reference

@@ -8,7 +8,7 @@ from cosim.analysis.claims.claim_definition import (
     inter_event_envelope,
 )
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
-from noack.theory.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 
 def _bound(run: RunEvidence, samples: Samples, certificate: ScenarioCertificate) -> Bound | None:

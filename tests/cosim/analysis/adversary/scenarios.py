@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.search_nodes import Pattern
 from cosim.analysis.adversary.segments import SegmentFlow
-from cosim.simulation.continuous.continuous_loop import continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import ContinuousRun, continuous_loop_of, simulate_continuous
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from tests.noack.theory.loops import System, systems
+from tests.oracles.lossy_loops import System, systems
 
 ALL_LOST = (False,) * 1000
 

@@ -15,15 +15,15 @@ from cosim.analysis.adversary.sampled_run import run_of
 from cosim.analysis.adversary.search_nodes import Pattern
 from cosim.analysis.adversary.worst_disturbance import bounds_of
 from cosim.record.run_record import RunRecord
-from cosim.simulation.sampled.sampled_loop import SampledLoop, Scales
+from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
-from noack.config.feature_kinds import POLICIES
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.scenario_certificates import certify
 
 EXAMPLES = {
     name: example.model_dump(mode="json", exclude_none=True)

@@ -22,8 +22,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 
 LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"

@@ -16,7 +16,7 @@ from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.core.linear_systems import transition
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
-from noack.theory.run_conditions import nominal_conditions
+from noack.theory.certificates.conditions import nominal_conditions
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 WORST = 'loss={model="worst_case"}'

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller_node.controller import controller_of
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
@@ -31,12 +30,12 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.run_conditions import allowed_conditions
+from noack.theory.certificates.conditions import allowed_conditions
 from noack.trigger.absolute import AbsoluteSettings
-from sensor_node.sensor import sensor_of
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
 from tests.cosim.record.changed_records import changed
+from tests.machine_parts import controller_of, sensor_of
 
 Batches = Iterator[tuple[str, Rows] | None]
 """A table and some of its rows; None where the result so far is queried."""

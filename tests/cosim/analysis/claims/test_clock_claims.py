@@ -1,7 +1,5 @@
 """All claims of a run are void from the time on at which a clock's bound is too large or lost."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -12,10 +10,10 @@ from cosim.analysis.claims.condition_reader import ConditionReader, read_conditi
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.record.loop_rows import rows_by_loop
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
-from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.record.changed_records import changed
 
@@ -157,7 +155,10 @@ def test_the_replay_is_bit_exact_beside_clock_rows(clocked: RunRecord) -> None:
     assert all(one.whole for one in found.processes)
 
 
-def test_several_loops_have_no_such_table(make: Make) -> None:
-    loops: Any = [{"name": "one", "count": 2}]
-    with pytest.raises(CallerError, match=r"clocks.*: not in a run of several loops"):
-        make(clocks={}, loops=loops)
+def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
+    table, phases_ns = CLOCK_TABLES[0], (0, 7)
+    rows = np.zeros(2, tables(1, 1, clocks=True)[table])
+    rows["t_ns"] = 10, 20
+    found = dict(rows_by_loop(table, rows, phases_ns))
+    assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
+    assert rows["t_ns"].tolist() == [10, 20]

@@ -17,8 +17,8 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.certificate_terms import NetworkConditions
-from noack.theory.run_conditions import nominal_conditions
+from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.conditions import nominal_conditions
 from tests.cosim.analysis.claims.conftest import (
     Make,
     event_s,

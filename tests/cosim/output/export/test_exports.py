@@ -17,7 +17,7 @@ import noack
 from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
-from noack.config.loops import phases_ns
+from noack.config.scenario import phases_ns
 from noack.core.errors import CallerError
 
 SCENARIO: dict[str, Any] = {

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cosim.simulation.batch.batch_interface import (
+from cosim.simulation.batch import (
     Events,
     Population,
     Setting,
     run_batch,
 )
-from cosim.simulation.batch.batch_status import OK
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
+from cosim.simulation.exact_simulation import OK
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch.batch_interface import (
+from cosim.simulation.batch import (
     Population,
     Setting,
     run_batch,
     run_events,
     setting_of,
 )
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import Population, Setting, run_batch, run_events
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from cosim.simulation.batch import Population, Setting, run_batch, run_events
+from cosim.simulation.continuous import TooManyEventsError
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
@@ -26,8 +26,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_policy import Policy
-from noack.trigger.trigger_rule import Forecast
+from noack.trigger.trigger_rule import Forecast, Policy
 from tests.cosim.simulation.batch.exact import (
     check_events,
     check_independence,

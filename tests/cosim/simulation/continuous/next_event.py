@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, LoopState
+from cosim.simulation.continuous import ContinuousLoop, LoopState
 from cosim.simulation.exact_simulation import OK
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import (
+from cosim.simulation.continuous import (
+    ContinuousLoop,
     ContinuousRun,
     TooManyEventsError,
     simulate_continuous,
@@ -25,8 +25,7 @@ from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_policy import Policy
-from noack.trigger.trigger_rule import Forecast
+from noack.trigger.trigger_rule import Forecast, Policy
 
 Vector = NDArray[np.float64]
 A_MODEL = np.array([[0.0, 1.0], [-2.0, 3.0]])

@@ -13,8 +13,12 @@ from scipy.integrate import quad, solve_ivp
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.optimize import brentq
 
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
-from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous import (
+    ContinuousLoop,
+    ContinuousRun,
+    continuous_loop_of,
+    simulate_continuous,
+)
 from noack.config.resolution import LoopMatrices, resolve
 from noack.config.scenario_file import load
 from noack.trigger.absolute import AbsoluteTrigger
@@ -22,7 +26,7 @@ from noack.trigger.dynamic import DynamicTrigger
 from noack.trigger.lyapunov import LyapunovTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Policy
 
 Matrix = NDArray[np.float64]
 MS = 1_000_000

@@ -8,8 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from cosim.simulation.continuous.continuous_report import POINTS, document, run_continuous
-from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous import POINTS, document, network_fates, run_continuous
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

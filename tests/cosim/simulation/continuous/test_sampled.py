@@ -12,9 +12,8 @@ from scipy.linalg import expm
 
 from cosim.analysis.step_schedule import live_run
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.plant_grid_loop import SampledLoop, StepSchedule
+from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
+from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import LoopMatrices, policy_of, resolve
 from noack.config.scenario_file import validate
@@ -50,7 +49,7 @@ class Case(NamedTuple):
         )
 
     def sampled(self, *, delay: bool) -> tuple[Matrix, list[int]]:
-        loop = SampledLoop(
+        loop = PlantGridLoop(
             ContinuousLoop(self.loop, self.trigger), self.schedule(), known_start=self.known
         )
         run = loop.run(delay=delay, hold=False)
@@ -155,7 +154,7 @@ def test_fast_sampling_converges_to_the_continuous_loop() -> None:
             period_ns, np.ones(steps + 1, np.bool_), lambda _: True, lambda _: 0, lambda _: 0,
             np.zeros(steps + 1, np.int64),
         )  # fmt: skip
-        run = SampledLoop(system, schedule, known_start=False).run(delay=False, hold=False)
+        run = PlantGridLoop(system, schedule, known_start=False).run(delay=False, hold=False)
         assert len(run.event_steps) == len(ideal.event_s)
         late_s = run.event_steps * period_ns * 1e-9 - ideal.event_s
         assert late_s[1] >= 0  # the loops have diverged from each other by the later events
@@ -241,7 +240,7 @@ def test_with_all_effects_it_is_what_the_machines_do(record: RunRecord) -> None:
     live = live_run(record)
     system = ContinuousLoop(record.loop, policy_of(record.scenario))
     known = record.scenario.network.initial_sync == "known_state"
-    run = SampledLoop(system, live.schedule, known_start=known).run(delay=True, hold=True)
+    run = PlantGridLoop(system, live.schedule, known_start=known).run(delay=True, hold=True)
     expected = record[PLANT_STEP]["x"][: len(run.x)]
     np.testing.assert_allclose(run.x, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
     np.testing.assert_allclose(run.event_steps * (PERIOD_NS * 1e-9), live.event_s, rtol=1e-12)

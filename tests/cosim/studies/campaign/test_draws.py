@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import run_batch
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.batch import run_batch
+from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.output.report.figure_files import inline
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,
@@ -36,8 +36,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load as load_scenario
 from noack.config.scenario_file import validate
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import drawn_scenario
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time

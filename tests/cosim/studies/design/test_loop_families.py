@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import run_batch, setting_of
-from cosim.simulation.continuous.continuous_report import run_continuous
+from cosim.simulation.batch import run_batch, setting_of
+from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.candidates import DesignLimits, certificate_of
 from cosim.studies.design.design_search import design

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch.batch_interface import run_batch, setting_of
+from cosim.simulation.batch import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.candidates import (
     DesignLimits,
@@ -20,8 +20,8 @@ from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError
-from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import certify_box
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify_box
 from tests.cosim.studies.design.conftest import LIMITS, designed
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.simulation.continuous.continuous_report import run_continuous, summary
+from cosim.simulation.continuous import run_continuous, summary
 from cosim.studies.paper.paper_campaign import (
     BASE,
     EXACT_MODEL,

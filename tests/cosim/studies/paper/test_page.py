@@ -16,6 +16,7 @@ from cosim.studies.paper import paper_run
 from cosim.studies.paper.paper_campaign import BASE, COLUMNS, load_campaign, parts
 from cosim.studies.paper.paper_claims import PaperVerdict, claims, judge
 from cosim.studies.paper.paper_figures import ensemble_figure
+from cosim.studies.paper.paper_page import render
 from cosim.studies.paper.paper_results import (
     HORIZON_S,
     REPRESENTED,
@@ -26,7 +27,6 @@ from cosim.studies.paper.paper_results import (
     read_results,
     spread,
 )
-from cosim.studies.paper.paper_run import render
 from noack.config.scenario import Scenario
 
 ROOT = Path(__file__).parents[4]

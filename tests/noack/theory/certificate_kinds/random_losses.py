@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.certificate_terms import VoidError
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.plant_gains import PlantGains
-from noack.theory.random_losses import moments
-from tests.noack.theory.broken_certificates import NoForcedResponse, NoMismatch
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import PlantGains
+from noack.theory.bounds.terms import NoCertificateError
+from noack.theory.random_losses.moments import moments
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
-from tests.noack.theory.loops import STEPS, System, random_system, simulate, times_s
+from tests.noack.theory.certificate_kinds.decaying import NoForcedResponse, NoMismatch
+from tests.oracles.lossy_loops import STEPS, System, random_system, simulate, times_s
 
 _RUNS = 300
 _ERRORS = 5
@@ -50,7 +50,7 @@ def certify(
     p = share * loop.probability
     try:
         found = moments(gains.error, gains, conditions, system.beta, p, loop.order)
-    except (VoidError, NotDecayingError):
+    except (NoCertificateError, NotDecayingError):
         return None
     return {
         "e_s": found.sensor_error, "e_c": found.controller_error, "x": found.state,

@@ -3,27 +3,169 @@
 ``DISTURBED`` adds the bounds of what decays and of what persists; its disturbances switch at
 random, or have the sign for which a random output is largest at a random time. ``OBSERVED`` has
 Luenberger's observers, and Kalman filters from their start, with disturbances and noise; filter and
-loop are simulated without noack. ``KNOWN_STATE`` has the bounds from the newest event.
+loop are simulated without noack. ``KNOWN_STATE`` has the bounds from the newest event; what is
+known at it is read independently.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
-from noack.theory.certificate_terms import VoidError
-from noack.theory.certified_bounds import ScenarioCertificate
-from noack.theory.kernel_bounds import NotDecayingError
-from noack.theory.known_state import KnownStateBounds
-from tests.noack.theory import disturbed_loops, known_state_loops
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import Output
+from noack.theory.bounds.terms import Constants, NoCertificateError
+from noack.theory.certificates.certified_bounds import (
+    KnownStateBounds,
+    KnownStatePart,
+    ScenarioCertificate,
+)
+from tests.noack.theory import disturbed_loops
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
-from tests.noack.theory.disturbed_loops import DisturbedLoop, Sum, simulate_disturbed
-from tests.noack.theory.known_state_loops import Mistake
-from tests.noack.theory.loops import RUNS, simulate
-from tests.noack.theory.observed_loops import ObservedLoop, random_observed_loop, worst_shares
+from tests.noack.theory.disturbed_loops import (
+    DisturbedLoop,
+    ObservedLoop,
+    Sum,
+    random_disturbed_loop,
+    random_observed_loop,
+    simulate_disturbed,
+    worst_shares,
+)
+from tests.oracles.lossy_loops import RUNS, STEPS, System, Trace, random_system, simulate, times_s
+
+_NONE = 10**6
+"""More missing events than any certificate allows."""
+
+
+@dataclass(frozen=True)
+class KnownStateLoop:
+    """A loop with or without disturbances, and how its runs are read."""
+
+    loop: System | DisturbedLoop
+    lost_are_received: bool = False
+    """Mistake: every event counts as received by the controller."""
+    events_late: int = 0
+    """Mistake: the state is that of so many events before the newest one."""
+
+    @property
+    def system(self) -> System:
+        return self.loop.system if isinstance(self.loop, DisturbedLoop) else self.loop
+
+    def bounds(self) -> KnownStateBounds:
+        """The bounds; raises what the certificate raises."""
+        system, delay_s = self.system, self.system.conditions.delay_s
+        if not isinstance(self.loop, DisturbedLoop):
+            part = KnownStatePart(system.gains(), system.certify(), system.beta)
+            return KnownStateBounds((part,), delay_s, np.zeros((len(system.A), 0)))
+        found = self.loop.certify()
+        parts = (
+            KnownStatePart(system.gains(), found.first, system.beta),
+            KnownStatePart(self.loop.pushed(), found.rest, 1.0),
+        )
+        return KnownStateBounds(parts, delay_s, self.loop.columns)
+
+    def shares(self, trace: Trace, bounds: KnownStateBounds) -> dict[str, float]:
+        """The largest shares of the bounds that runs reach."""
+        system, step = self.system, np.arange(STEPS)
+        last = np.maximum.accumulate(np.where(trace.is_event, step, -1), axis=1)
+        run, at = np.nonzero(last >= 0)
+        age, number = at - last[run, at], np.cumsum(trace.is_event, axis=1)
+        missing = number - trace.received
+        if not system.known_start:
+            missing[trace.received == 0] = _NONE
+        if self.lost_are_received:
+            missing[:] = 0
+        known_at = last[run, at]
+        for _ in range(self.events_late):
+            known_at = np.where(known_at > 0, last[run, known_at - 1], known_at)
+            run, at, age, known_at = (v[known_at >= 0] for v in (run, at, age, known_at))
+        leap = expm((system.A + system.B @ system.K) * system.step_s)
+        powers = [np.eye(len(leap))]
+        for _ in range(STEPS):
+            powers.append(leap @ powers[-1])
+        predicted = np.einsum("kij,kj->ki", np.array(powers)[age], trace.known[run, known_at])
+        t_s, moved = times_s(system), np.linalg.norm(trace.x[run, at] - predicted, axis=1)
+        most = bounds.state_deviation(t_s[at], age * system.step_s, missing[run, at])
+        errors = bounds.controller_error(np.tile(t_s, len(trace.x)), missing.ravel())
+        rounding = 1e-12 * np.linalg.norm(predicted, axis=1) + 1e-300
+        return {
+            "x": float((moved / (most + rounding)).max(initial=0.0)),
+            "e_c": float((trace.controller_error.ravel() / errors).max()),
+        }
+
+
+def random_known_state_loop(rng: np.random.Generator, **fixed: Any) -> KnownStateLoop:
+    """A loop of any kind; ``fixed`` replaces some of the drawn values."""
+    disturbed = fixed.pop("disturbed", rng.uniform() < 0.5)
+    draw: Callable[..., Any] = random_disturbed_loop if disturbed else random_system
+    return KnownStateLoop(draw(rng, **fixed))
+
+
+class Mistake(NamedTuple):
+    """How a broken copy changes the bounds, or how the runs are read; by default not at all."""
+
+    bounds: Callable[[KnownStateBounds], KnownStateBounds] = lambda bounds: bounds
+    reading: Callable[[KnownStateLoop], KnownStateLoop] = lambda loop: loop
+
+
+def _misread(**changes: Any) -> Mistake:
+    return Mistake(reading=lambda loop: replace(loop, **changes))
+
+
+def _with_constants(**changes: float) -> Mistake:
+    return _with_parts(lambda part: part.constants._replace(**changes))
+
+
+def _with_parts(change: Callable[[KnownStatePart], Constants]) -> Mistake:
+    def changed(bounds: KnownStateBounds) -> KnownStateBounds:
+        parts = [replace(part, constants=change(part)) for part in bounds.parts]
+        return replace(bounds, parts=tuple(parts))
+
+    return Mistake(changed)
+
+
+def _without_age(part: KnownStatePart) -> Constants:
+    """u is K x_c: the input error is at most ‖KW^{−1}‖β̃."""
+    own = part.plant.error.now(Output.GAIN) * part.constants.overshoot * part.unit
+    return part.constants._replace(received_input_error=own)
+
+
+_INSTANT = {"disturbed": False, "beta": 0.01, "sample_steps": 1, "delay_steps": 0}
+_EVENTFUL = {"mismatch": 0.5, "step_share": 0.01, "hold_steps": 0, **_INSTANT}
+
+BROKEN: dict[str, tuple[Mistake, dict[str, Any]]] = {
+    "a lost event counts as received": (
+        _misread(lost_are_received=True), {"mansd": 6, **_EVENTFUL},
+    ),
+    "x of one event before": (_misread(events_late=1), {"mansd": 0, **_EVENTFUL}),
+    "no delay": (
+        Mistake(lambda bounds: replace(bounds, delay_s=0.0)),
+        {"disturbed": False, "n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "sample_steps": 1,
+         "hold_steps": 0, "step_share": 0.03},
+    ),
+    "no age of the input": (
+        _with_parts(_without_age),
+        {"n": 1, "m": 1, "mansd": 0, "hold_steps": 4, "lag_steps": 2, "step_share": 0.1,
+         **_INSTANT},
+    ),
+    "no start": (
+        _with_constants(start_error=0.0),
+        {"disturbed": False, "known_start": False, "delay_steps": 4, "beta": 0.01,
+         "step_share": 0.03},
+    ),
+    "no disturbance": (
+        Mistake(lambda bounds: replace(bounds, disturbances=0 * bounds.disturbances)),
+        {"disturbed": True, "push": 1.0, "beta": 0.01},
+    ),
+    "no noise": (
+        _with_constants(estimation_error=0.0),
+        {"disturbed": True, "noise": 0.1, "push": 0.02, "beta": 0.01},
+    ),
+}  # fmt: skip
 
 
 @dataclass
@@ -48,7 +190,7 @@ def shares_of(
     def bounds(case: Case) -> Bounds | None:
         try:
             case.found = certify(case)
-        except (VoidError, NotDecayingError):
+        except (NoCertificateError, NotDecayingError):
             return None
         return None if case.found is None else dict.fromkeys(names, 1.0)
 
@@ -132,12 +274,12 @@ def _known_state_bounds(mistake: Mistake) -> Callable[[Case], Bounds | None]:
 
 
 KNOWN_STATE = Kind(
-    "known state", drawn(known_state_loops.random_known_state_loop, {}),
+    "known state", drawn(random_known_state_loop, {}),
     _known_state_bounds(Mistake()), _simulate_known_state,
     {
         name: Broken(
-            _known_state_bounds(mistake), drawn(known_state_loops.random_known_state_loop, where)
+            _known_state_bounds(mistake), drawn(random_known_state_loop, where)
         )
-        for name, (mistake, where) in known_state_loops.BROKEN.items()
+        for name, (mistake, where) in BROKEN.items()
     },
 )  # fmt: skip

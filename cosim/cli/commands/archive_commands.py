@@ -1,0 +1,188 @@
+"""``noack archive``, ``reproduce``, ``collect``, ``compare``: runs as files, and several runs."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cosim.cli import command as cli
+from cosim.cli import completion
+from cosim.record.run_directory import chosen_run
+from noack.core.errors import ExitStatus
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+@cli.command(cli.RUNS, 92, [
+    ("noack archive", "the last run, as NAME.noack.zip in this folder"),
+    ("noack archive runs/latest --out result.noack.zip --json", "to another file"),
+])  # fmt: skip
+def archive(
+    run_dir: cli.RunArgument = None,
+    *,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", help="File of the archive; NAME.noack.zip in this folder by default."
+        ),
+    ] = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Archive a run: one file with everything that its repetition needs.
+
+    `noack reproduce` repeats it.
+    """
+    from cosim.live.progress import PatientConsole
+    from cosim.studies.run_archive import SUFFIX, write_archive
+
+    chosen = chosen_run(run_dir, runs)
+    path = out or Path(f"{chosen.resolve().name}{SUFFIX}")
+    with PatientConsole(stderr=True).status("archiving"):
+        manifest = write_archive(chosen, path)
+    if json:
+        cli.print_json({"archive": str(path)} | manifest.model_dump(mode="json"))
+    else:
+        print(path)
+    return ExitStatus.OK
+
+
+@cli.command(cli.RUNS, 94, [
+    ("noack reproduce result.noack.zip", "exit status 1 if a bit differs"),
+    ("noack reproduce result.noack.zip --into again --json", "keep both runs; print JSON"),
+])  # fmt: skip
+def reproduce(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Archive of a run.")],
+    *,
+    run_code: Annotated[
+        bool,
+        typer.Option(
+            "--run-code",
+            help="Run the code that the archive contains, if its plant, trigger or controller is "
+            "a Python class or an FMU.",
+        ),
+    ] = False,
+    long: Annotated[
+        bool,
+        typer.Option("--long", help="Repeat a run of more than a million steps, too."),
+    ] = False,
+    into: Annotated[
+        Path | None,
+        typer.Option("--into", help="Keep the archived run and its repetition in this new folder."),
+    ] = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Repeat an archived run: simulate it again, or replay its record, bit for bit.
+
+    Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
+    """
+    from cosim.live.progress import PatientConsole
+    from cosim.studies.run_repetition import print_repetition, repeat_archive
+
+    with PatientConsole(stderr=True).status("repeating"):
+        found = repeat_archive(file, run_code=run_code, long=long, into=into)
+    if json:
+        cli.print_json(found.to_json())
+    else:
+        print_repetition(cli.console(), found)
+    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+
+
+@cli.command(cli.RUNS, 55, [
+    ("noack collect runs/latest robot:noack/runs/RUN", "by scp from the host robot"),
+    ("noack collect runs/latest copy", "from a folder that was copied here"),
+])  # fmt: skip
+def collect(
+    run_dir: Annotated[Path, typer.Argument(help="Run directory.")],
+    sources: Annotated[
+        list[str],
+        typer.Argument(help="Folders named by the processes: FOLDER, or HOST:FOLDER for scp."),
+    ],
+    *,
+    json: cli.JsonOption = False,
+) -> int:
+    """Add what processes on other hosts kept of a run, and finalise it again.
+
+    A process that was invited keeps its rows on its host when the recorder is out of reach at the
+    end. It then prints their folder.
+    """
+    from cosim.live.finalize import reopen
+    from cosim.output.run_verdict import print_outcome
+    from cosim.record import collection
+    from cosim.record.run_directory import chosen_run
+    from noack.runtime.command_line import print_to_stderr
+
+    run_dir = chosen_run(run_dir, cli.DEFAULT_RUNS)
+    outcome = reopen(run_dir)  # refuses a run that is under way
+    for source in sources:
+        merged, roles = collection.collect(run_dir, source, reopen)
+        outcome = replace(merged, run_dir=run_dir)
+        print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
+    if json:
+        cli.print_json(outcome.summary.to_json())
+    else:
+        print_outcome(cli.console(), outcome)
+    return ExitStatus.OK
+
+
+@cli.command(cli.RUNS, 80, [
+    ("noack compare runs/A runs/B", "key numbers, and a page with the curves overlaid"),
+    ("noack compare runs/A runs/B runs/C --out overlay.png", "the overlay as a picture"),
+    ("noack compare runs/A:left runs/A:right", "two loops of a run"),
+    ("noack compare runs/A runs/B --json", "as JSON"),
+])  # fmt: skip
+def compare(
+    directories: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="Two to seven run directories, live or simulated; RUN:NAME is a loop.",
+            autocompletion=completion.run_directories,
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf, .pgf).",
+        ),
+    ] = cli.DEFAULT_RUNS / "comparison.html",
+    width: cli.WidthOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Compare runs: key numbers, settings that differ, curves overlaid."""
+    from cosim.live.progress import PatientConsole
+    from cosim.studies.run_comparison import compare_runs
+
+    with PatientConsole(stderr=True).status("comparing"):
+        found = compare_runs(directories)
+        found.save(out, width)
+    if json:
+        cli.print_json(found.to_json() | {"overlay": str(out)})
+        return ExitStatus.OK
+    console = cli.console()
+    for run in found.runs:
+        console.print(f"{run.label}  {run.title}  {run.directory}",
+                      markup=False, highlight=False, soft_wrap=True)  # fmt: skip
+    labels = [run.label for run in found.runs]
+    console.print(_table("key numbers (in brackets: difference to A)", labels, found.rows))
+    if found.settings:
+        console.print(_table("settings that differ", labels, found.setting_rows))
+    console.print(f"overlay: {out}", markup=False, highlight=False, soft_wrap=True)
+    return ExitStatus.OK
+
+
+def _table(title: str, labels: list[str], rows: list[tuple[str, ...]]) -> "Table":
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("")
+    for label in labels:
+        table.add_column(label, justify="right")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table

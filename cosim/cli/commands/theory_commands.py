@@ -1,0 +1,205 @@
+"""``noack certify``, ``margin``, ``adversary``: bounds for all patterns of losses; bad patterns."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli import command as cli
+from noack.core.errors import CallerError, ExitStatus
+
+
+@cli.command(cli.THEORY, 10, [
+    ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
+    ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
+    ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
+])  # fmt: skip
+def certify(
+    scenario: cli.ScenarioArgument,
+    *,
+    settings: cli.SetOption = None,
+    weight: Annotated[
+        str,
+        typer.Option(
+            help="Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack."
+        ),
+    ] = "given",
+    late: Annotated[
+        int | None,
+        typer.Option(
+            help="Allowed lateness in steps of the plant; certificate.late_periods by default.",
+            min=0,
+            max=1000,
+        ),
+    ] = None,
+    tables: cli.TablesOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Write the certificates for MATLAB and Octave (.mat)."),
+    ] = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Compute the bounds that are guaranteed for a scenario, and their conditions.
+
+    Exit status 1: nothing can be certified.
+    """
+    from cosim.output.all_certificates import certificates_of
+    from cosim.output.certificate_report import certificate_tables, print_certificates
+
+    loaded = cli.load_scenario(scenario, settings)
+    if weight == "chosen":
+        from cosim.live.progress import work_bar
+
+        with work_bar("choosing the weight") as progress:
+            found = certificates_of(loaded, weight, late, progress)
+    else:
+        found = certificates_of(loaded, weight, late)
+    if json:
+        cli.print_json(found.to_json())
+    else:
+        print_certificates(cli.console(), found)
+    cli.write_tables(certificate_tables(found), tables, json=json)
+    if out is not None:
+        from cosim.output.export.mat_export import save_mat
+
+        save_mat(found.to_json(), out)
+    certified = any(certificate.constants for _, certificate in found)
+    return ExitStatus.OK if certified else ExitStatus.FAILED
+
+
+@cli.command(cli.THEORY, 30, [
+    ("noack margin lane_periodic", "the largest M and the longest period"),
+    ("noack margin lane_periodic --play", "play the destabilising pattern live"),
+    ("noack margin lane_periodic --set mode=zoh --no-period --json", "hold the input; as JSON"),
+])  # fmt: skip
+def margin(
+    context: typer.Context,
+    scenario: cli.ScenarioArgument,
+    *,
+    settings: cli.SetOption = None,
+    most: Annotated[int, typer.Option(help="Largest M to examine.", min=1, max=1000)] = 16,
+    accuracy: Annotated[
+        float,
+        typer.Option(help="Wanted ratio of the bounds, minus 1; finer where they include 1."),
+    ] = 2e-4,
+    period: Annotated[
+        bool, typer.Option(help="Search for the longest period with the scenario's own M, too.")
+    ] = True,
+    play: Annotated[
+        bool, typer.Option("--play", help="Play the destabilising pattern in a live run.")
+    ] = False,
+    runs: cli.RunsOption = cli.DEFAULT_RUNS,
+    tables: cli.TablesOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Find the largest M for which a loop is stable under every loss pattern.
+
+    The trigger policy must have a longest time between two events, as periodic and deadline have.
+    The verdict holds for all times of events that the policy
+    allows. Exit status 1: the loop is not proven stable for
+    any M.
+    """
+    from cosim.analysis.margin_search import find_margin
+    from cosim.live.progress import PatientConsole
+    from cosim.output.margin_report import margin_tables, print_margin
+    from noack.config.resolution import resolve
+
+    if play and json:
+        raise CallerError("--play: has an output of its own; leave out --json")
+    resolved = resolve(cli.load_scenario(scenario, settings))
+    with PatientConsole(stderr=True).status("examining") as status:
+        found = find_margin(
+            resolved, most_m=most, accuracy=accuracy, with_period=period,
+            progress=lambda text: status.update(f"examining {text}"),
+        )  # fmt: skip
+    if json:
+        cli.print_json(found.to_json())
+    else:
+        print_margin(cli.console(), found)
+    cli.write_tables(margin_tables(found), tables, json=json)
+    if not play:
+        return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
+    if found.destabilised is None:
+        raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
+
+    from cosim.cli.execute_run import RunOutput, run_processes
+
+    played = [*(settings or ()), *found.destabilised.settings]
+    output = RunOutput(report=True, verbose=False, json=False)
+    return run_processes(
+        lambda: cli.load_scenario(scenario, played), runs, output, server=context.obj
+    )
+
+
+class AdversaryAim(StrEnum):
+    """What ``noack adversary`` may maximise."""
+
+    ERROR = "error"
+    STATE = "state"
+    COST = "cost"
+    INTER_EVENT = "inter-event"
+    ALL = "all"
+
+
+@cli.command(cli.THEORY, 20, [
+    ("noack adversary lane_following", "all objectives"),
+    ("noack adversary lane_following --objective error --json", "the controller's error only"),
+    ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
+    ("noack adversary lane_following --trigger continuous", "the paper's loop, in exact time"),
+])  # fmt: skip
+def adversary(
+    scenario: cli.ScenarioArgument,
+    *,
+    objective: Annotated[
+        AdversaryAim,
+        typer.Option(
+            help="Maximise the controller's error ‖e_c‖, the state ‖x‖ or the cost ∫‖x‖² dt, or "
+            "minimise the inter-event time."
+        ),
+    ] = AdversaryAim.ALL,
+    horizon: Annotated[
+        float | None, typer.Option(help="Seconds to search; the scenario's horizon by default.")
+    ] = None,
+    nodes: Annotated[
+        int,
+        typer.Option(
+            help="Limit of the exhaustive search, in segments between events; at the limit, the "
+            "result of the beam search may be better.",
+            min=0,
+        ),
+    ] = 500_000,
+    beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
+    trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
+    settings: cli.SetOption = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Search for the worst losses that the network may cause; compare them with the bounds.
+
+    The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
+    Exit status 1: a certified bound was exceeded.
+    """
+    from cosim.analysis.adversary import Objective, conditions_of, find_worst
+    from cosim.analysis.adversary.worst_run import document, print_worst
+    from cosim.live.progress import search_status
+    from noack.config.resolution import resolve
+    from noack.theory.certificates.scenario_certificates import certify
+
+    given = [] if horizon is None else [f"horizon_s={horizon}"]
+    resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))
+    continuous = trigger is cli.TriggerMode.CONTINUOUS
+    certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
+    aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
+    with search_status() as report:
+        found = [
+            find_worst(
+                resolved, aim, continuous=continuous, most_nodes=nodes, beam=beam,
+                certificate=certificate, report=report(aim.value),
+            )
+            for aim in aims
+        ]  # fmt: skip
+    if json:
+        cli.print_json(document(found, resolved, certificate, trigger.value))
+    else:
+        print_worst(cli.console(), found, resolved, certificate, trigger.value)
+    return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

@@ -1,1 +1,0 @@
-"""Many exact runs of the paper's loop, each with its own plant, start and losses."""

@@ -1,0 +1,445 @@
+"""The paper's loop in exact continuous time, under any policy.
+
+In the coordinates z = (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, the loop between events
+is linear and autonomous:
+
+    ẋ   = (A+BK) x + BK e_c
+    ė_s = H e_s − E x − BK e_c          E = A + BK − H  (eq:miet_errdyn)
+    ė_c = (H−BK) e_c − E x
+
+with H = Â+B̂K in model mode and H = 0 under zero-order hold. An event is the first t > t_i at which
+‖W e_s(t)‖ exceeds max(βe^{−αt}, ε) (eq:thre), or at which another policy's comparison holds. There
+e_s ← 0, and e_c ← 0 if the update arrives. The core follows the loop (native/exact/).
+
+In this order: the loop, a run of it for given packet fates, the fates that a scenario's network
+decides, and the run of ``noack simulate --trigger continuous`` with its summary and JSON document.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record.divergence import Divergence, divergence
+from cosim.simulation.exact_simulation import (
+    DIVERGED,
+    OK,
+    TOO_MANY_EVENTS,
+    EventLog,
+    ExactSimulation,
+)
+from netem.channel import UPDATE_LINK
+from netem.link_state import LinkState
+from noack.config.resolution import LoopMatrices, loop_of, policy_of
+from noack.config.scenario import Scenario
+from noack.core.core_library import core
+from noack.core.errors import CallerError, ExitStatus
+from noack.core.linear_systems import Matrix, Vector
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.protocol.record_tables import Fate
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import Policy
+
+_SMALLEST_THRESHOLD = 1e-140
+"""Below it, the threshold's square or its significant bits would underflow."""
+
+
+class LoopState(NamedTuple):
+    """The loop at a time: plant state and both models' errors, each of shape (n,)."""
+
+    t_s: float
+    x: Vector
+    e_s: Vector
+    e_c: Vector
+
+
+class Samples(NamedTuple):
+    """The loop at k times; states of shape (k, n)."""
+
+    t_s: Vector
+    x: Matrix
+    e_s: Matrix
+    e_c: Matrix
+
+    @property
+    def x_s(self) -> Matrix:
+        """The sensor's model."""
+        return self.x + self.e_s
+
+    @property
+    def x_c(self) -> Matrix:
+        """The controller's model."""
+        return self.x + self.e_c
+
+
+class ContinuousLoop:
+    """The loop in continuous time, under any policy."""
+
+    def __init__(self, loop: LoopMatrices, trigger: Policy) -> None:
+        self.loop = loop
+        self.trigger = trigger
+        self._between = self.simulation(0.0, known_start=True)
+
+    def simulation(self, horizon_s: float, *, known_start: bool, **more: Any) -> ExactSimulation:
+        """Return the core's simulation of the loop; further arguments are those of its class."""
+        return ExactSimulation(
+            self.loop.H, self.loop.K, self.trigger,
+            horizon_s=horizon_s, known_start=known_start, **more,
+        )  # fmt: skip
+
+    @property
+    def generator(self) -> Matrix:
+        """G of dz/dt = G z, per second, shape (3n, 3n)."""
+        loop, none = self.loop, np.zeros_like(self.loop.H)
+        BK = loop.B @ loop.K
+        E = loop.A + BK - loop.H
+        return np.block([[loop.A + BK, none, BK], [-E, loop.H, -BK], [-E, none, loop.H - BK]])
+
+    @property
+    def decaying(self) -> DecayingTrigger:
+        """The trigger, which must be the paper's.
+
+        Raises:
+            CallerError: the policy is another one.
+        """
+        if not isinstance(self.trigger, DecayingTrigger):
+            raise CallerError(
+                "trigger.policy: with a continuous trigger (--trigger continuous) only "
+                '"decaying" is searched'
+            )
+        return self.trigger
+
+    def threshold(self, t_s: float) -> float:
+        """Return max(βe^{−αt}, ε) of the paper's trigger."""
+        return self.decaying.threshold(t_s * 1e9)
+
+    def norms(self, errors: Matrix) -> Vector:
+        """‖W e‖ of k errors, shape (k, n) → (k,)."""
+        W = self.trigger.weight
+        norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
+        return norms
+
+    def sample(self, state: LoopState, t_s: Vector) -> Samples:
+        """Return the states at ascending times ≥ ``state.t_s``, without events in between."""
+        return self.follow(np.array([state.t_s]), np.array(state[1:])[None], t_s)
+
+    def follow(self, start_s: Vector, starts: NDArray[np.float64], t_s: Vector) -> Samples:
+        """Return the states at ascending times, of parts that begin just after events.
+
+        Args:
+            start_s: ascending, (k,).
+            starts: (k, 3, n); the last one up to a time applies.
+            t_s: the times, from the first start on.
+        """
+        t_s = np.asarray(t_s, dtype=np.float64)
+        states = self._between.sample(self.loop.A, self.loop.B, start_s, starts, t_s)
+        return Samples(t_s, *np.moveaxis(states, 1, 0))
+
+
+def reset(state: LoopState, delivered: bool) -> LoopState:
+    """Return the state after an event: e_s = 0, and e_c = 0 if the update arrives."""
+    nothing = np.zeros_like(state.e_s)
+    return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
+
+
+def vanishes_s(trigger: Policy, n: int) -> float:
+    """Return the time from which a threshold is too small to compute with; infinity for never."""
+    rule = trigger.trigger_rule(n)
+    if rule.from_event or rule.rate_per_s == 0 or rule.floor >= _SMALLEST_THRESHOLD:
+        return math.inf
+    return math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
+
+
+def vanished(from_s: float) -> CallerError:
+    """Return the error of a threshold that decays too far."""
+    return CallerError(
+        f"trigger: from {from_s:g} s on the threshold is below {_SMALLEST_THRESHOLD:g}, where "
+        "errors are within rounding; give trigger.floor or a shorter horizon"
+    )
+
+
+def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
+    """Return the exact loop of a resolved scenario.
+
+    Raises:
+        CallerError: exact simulation does not support the scenario.
+    """
+    try:
+        resolved.coverage.require_unchanging()
+        resolved.coverage.require_exact()
+    except CallerError as error:
+        raise CallerError(f"with a continuous trigger (--trigger continuous): {error}") from None
+    return ContinuousLoop(loop_of(resolved), policy_of(resolved))
+
+
+MAX_EVENTS = 100_000
+_PLACES = 512
+"""Room for events in the first attempt; each further one has four times as much."""
+
+
+class TooManyEventsError(CallerError):
+    """The events accumulate: inter-event times tend to 0."""
+
+    run: "ContinuousRun | None" = None
+    """The run up to its last event; None if the events are not those of one run."""
+
+
+@dataclass(frozen=True)
+class ContinuousRun:
+    """An exact run: k events, n states; event i is update number i."""
+
+    system: ContinuousLoop
+    horizon_s: float
+    start: LoopState
+    """At t = 0, before any event."""
+    before: tuple[LoopState, ...]
+    """At each event, just before the reset."""
+    after: tuple[LoopState, ...]
+    """At each event, just after the reset."""
+    delivered: NDArray[np.bool_]
+    """Whether the update of each event arrived, (k,)."""
+    diverged_at_s: float | None
+    """Time at which the state exceeded 1e100, or None; the run is computed up to this time."""
+
+    @cached_property
+    def event_s(self) -> Vector:
+        """Times of the events, (k,)."""
+        return np.array([state.t_s for state in self.before])
+
+    @cached_property
+    def starts(self) -> NDArray[np.float64]:
+        """(x, e_s, e_c) at the start and just after each event, (k + 1, 3, n)."""
+        return np.array([state[1:] for state in (self.start, *self.after)])
+
+    @property
+    def reached_s(self) -> float:
+        """The run is computed up to this time."""
+        return self.horizon_s if self.diverged_at_s is None else self.diverged_at_s
+
+    def at(self, t_s: Vector | Sequence[float]) -> Samples:
+        """Return the loop at many times, right-continuous: at an event, the state after the reset.
+
+        Raises:
+            ValueError: a time is out of range, or the times are not in ascending order.
+        """
+        t_s = np.asarray(t_s, dtype=np.float64)
+        if len(t_s) and not (t_s[0] >= 0 and t_s[-1] <= self.reached_s):
+            raise ValueError(f"times must lie in [0, {self.reached_s}] s")
+        if (np.diff(t_s) < 0).any():
+            raise ValueError("times must be in ascending order")
+        return self.system.follow(np.array([0.0, *self.event_s]), self.starts, t_s)
+
+    def e_s_norm(self, samples: Samples) -> Vector:
+        """‖W e_s‖ of samples, (k,)."""
+        return self.system.norms(samples.e_s)
+
+    def e_c_norm(self, samples: Samples) -> Vector:
+        """‖W e_c‖ of samples, (k,)."""
+        return self.system.norms(samples.e_c)
+
+
+def simulate_continuous(
+    system: ContinuousLoop,
+    *,
+    horizon_s: float,
+    delivered: Callable[[int], bool] | Sequence[bool],
+    known_start: bool,
+    x0: Vector | None = None,
+    max_events: int = MAX_EVENTS,
+) -> ContinuousRun:
+    """Run the loop from t = 0; every event time is exact up to rounding.
+
+    Args:
+        system: the loop.
+        horizon_s: end of the run.
+        delivered: whether the update of event i arrives, asked in the order of the events. If a
+            sequence is shorter than the number of events, all updates after its end arrive.
+        known_start: sensor and controller start from x(0). Otherwise x_c = 0 and event 0 happens at
+            t = 0, the paper's t_0; the paper assumes that it is delivered.
+        x0: x(0), shape (n,); by default the loop's own.
+        max_events: largest number of events.
+
+    Raises:
+        TooManyEventsError: more than ``max_events`` events, or two at the same time.
+        CallerError: the threshold decays below the smallest supported value before the horizon, or
+            the run cannot be decided.
+    """
+    loop, fates = system.loop, [] if callable(delivered) else list(delivered)
+    until_s = min(horizon_s, vanishes_s(system.trigger, loop.n))
+    x0, places = np.array(loop.x0 if x0 is None else x0, np.float64), min(_PLACES, max_events)
+    while True:
+        if callable(delivered):
+            fates += [bool(delivered(event)) for event in range(len(fates), places)]
+        simulation = system.simulation(
+            until_s, known_start=known_start, most_events=places, delivered=np.array(fates, bool),
+            measure=core.NOACK_EXACT_TIMES,
+        )  # fmt: skip
+        rows, log = simulation.runs(
+            loop.A[None], loop.B[None], x0[None], places=places, states=True
+        )
+        row = rows[0]
+        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
+        if not full or places == max_events:
+            break
+        places = min(4 * places, max_events)
+    if row["status"] == OK and until_s < horizon_s:
+        raise vanished(until_s)
+    if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
+        raise CallerError(
+            f"trigger: a million steps do not decide event {row['transmissions']}: an error stays "
+            "too close to its threshold, or the plant is too fast"
+        )
+    diverged_at_s = float(row["diverged_at_s"]) if row["status"] == DIVERGED else None
+    run = _read_run(
+        system, horizon_s, x0, log, int(row["transmissions"]), diverged_at_s, known_start
+    )
+    if row["status"] == TOO_MANY_EVENTS:
+        last_s = run.event_s[-1] if len(run.event_s) else 0.0
+        too_many = TooManyEventsError(
+            f"trigger: event {len(run.event_s)}, after {last_s:.9g} s, is one too many: the events "
+            "accumulate; a stable loop, a larger threshold or a floor would keep them apart"
+        )
+        too_many.run = replace(run, horizon_s=float(last_s))
+        raise too_many
+    return run
+
+
+def _read_run(
+    system: ContinuousLoop, horizon_s: float, x0: Vector, log: EventLog, events: int,
+    diverged_at_s: float | None, known_start: bool,
+) -> ContinuousRun:  # fmt: skip
+    """Read a run from its events."""
+    assert log.states is not None
+    delivered, zero = log.delivered[0, :events], np.zeros_like(x0)
+    times_s, states = log.event_s[0, :events].tolist(), log.states[0, :events]
+    start = LoopState(0.0, x0, zero, zero if known_start else -x0)
+    before = tuple(map(LoopState, times_s, *np.moveaxis(states, 1, 0)))
+    after = tuple(map(reset, before, delivered.tolist()))
+    return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)
+
+
+def timeless(settings: LinkSettings) -> LinkSettings:
+    """Return the settings of a link that apply in the paper's loop: losses and corruption."""
+    kept = tuple(one for one in settings.impairments if isinstance(one, LossOf | Corrupt))
+    return settings.model_copy(update={"impairments": kept})
+
+
+def network_fates(resolved: Scenario) -> Callable[[int], bool]:
+    """Return whether the scenario's network delivers update i, for i = 0, 1, …, as in a live run.
+
+    The emulator's losses and corruption depend only on its seed and on the order of arrival, so
+    they can be computed without sending. Delays, rate limits and blackouts do not exist in the
+    paper's loop and are ignored. For ``initial_sync = "first_packet"`` update 0 is delivered.
+    """
+    link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link.start_flow(0, 0)
+    known: list[bool] = []
+
+    def delivered(event: int) -> bool:
+        while len(known) <= event:
+            known.append(Fate(link.decide(0, 1, 0).fate).effective)
+        return known[event]
+
+    return delivered
+
+
+POINTS = 501
+"""Number of evenly spaced times at which the document lists the states."""
+
+
+def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> ContinuousRun:
+    """Run a resolved scenario in exact continuous time, with the losses of its own network.
+
+    Raises:
+        TooManyEventsError: more than ``max_events`` events, or two at the same time.
+        CallerError: the threshold becomes too small to compute with.
+    """
+    return simulate_continuous(
+        continuous_loop_of(resolved),
+        horizon_s=resolved.horizon_s,
+        delivered=network_fates(resolved),
+        known_start=resolved.network.initial_sync == "known_state",
+        max_events=max_events,
+    )
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+    """Return the run as JSON: its summary, every event, and the states at 501 times."""
+    samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    before = run.before
+    return {
+        "summary": summary(run, resolved),
+        "events": [
+            {
+                "t_s": state.t_s,
+                "delivered": bool(delivered),
+                "x": state.x.tolist(),
+                "e_s": state.e_s.tolist(),
+                "e_c": state.e_c.tolist(),
+            }
+            for state, delivered in zip(before, run.delivered, strict=True)
+        ],
+        "state_names": list(run.system.loop.state_names),
+        "samples": {
+            "t_s": samples.t_s.tolist(),
+            "x": samples.x.tolist(),
+            "x_s": samples.x_s.tolist(),
+            "x_c": samples.x_c.tolist(),
+            "e_s_norm": run.e_s_norm(samples).tolist(),
+            "e_c_norm": run.e_c_norm(samples).tolist(),
+            "threshold": _thresholds(run, samples),
+        },
+    }
+
+
+def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
+    if not isinstance(run.system.trigger, DecayingTrigger):
+        return None
+    return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
+
+
+def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+    """Return the run's numbers, with the keys of ``summary.json``."""
+    samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    diverged = _divergence(run, samples, resolved)
+    arrived = np.flatnonzero(run.delivered)
+    drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
+    return {
+        "kind": "continuous",
+        "scenario": resolved.name,
+        "mode": resolved.mode,
+        "mansd": resolved.network.mansd,
+        "horizon_s": resolved.horizon_s,
+        "reached_s": run.reached_s,
+        "events": len(run.delivered),
+        "deliveries": int(run.delivered.sum()),
+        "drops": int((~run.delivered).sum()),
+        "longest_loss_burst": int(drop_runs.max()),
+        "inter_event_min_s": _or_none(np.min, np.diff(run.event_s)),
+        "inter_event_median_s": _or_none(np.median, np.diff(run.event_s)),
+        "inter_delivery_median_s": _or_none(np.median, np.diff(run.event_s[run.delivered])),
+        "initial_state_norm": float(np.linalg.norm(samples.x[0])),
+        "final_state_norm": float(np.linalg.norm(samples.x[-1])),
+        "diverged_at_s": None if diverged is None else diverged.at_s,
+        "exit": {
+            "status": int(ExitStatus.OK if diverged is None else ExitStatus.FAILED),
+            "reason": "horizon" if diverged is None else diverged.text,
+        },
+    }
+
+
+def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
+    if run.diverged_at_s is not None:
+        return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
+    return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
+
+
+def _or_none(statistic: Any, values: Vector) -> float | None:
+    return float(statistic(values)) if len(values) else None

@@ -1,1 +1,0 @@
-"""The loop in exact continuous time: matrix exponentials and root isolation, no integrator."""

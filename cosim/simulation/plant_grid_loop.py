@@ -1,0 +1,207 @@
+"""The loop on the plant's time grid, exact between grid points, with three implementation effects.
+
+A real loop differs from the paper's loop by these effects:
+
+* sampling, always on here: the trigger is tested at the measured steps only, and an update is sent
+  at that step;
+* delay, optional: an update acts on the controller's model x_c(t) some time after its event, as
+  x_c ← e^{H(t−t_i)} x(t_i); only the newest update acts;
+* held actuation, optional: the plant's input is constant over a step, u_k = K x_c(t'_k), with the
+  model time t'_k of the actuation applied at step k. An update acts from the first step that
+  applies an actuation computed from it.
+
+Without held actuation the plant follows u = K x_c(t) continuously, as in
+:mod:`cosim.simulation.continuous`; with it, by the exact zero-order hold that the live plant uses.
+The trigger is that of the core, which the sensor has, too.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.simulation.continuous import ContinuousLoop
+from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_memory import CoreMemory
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.trigger.trigger_rule import Policy, fill_rule, rule_rows
+
+NO_ACTUATION = -1
+"""Model time of a step without any actuation yet."""
+_BLOCK = 64
+
+
+@dataclass(frozen=True)
+class StepSchedule:
+    """Times of the run's occurrences, in steps of the plant; K steps follow step 0."""
+
+    period_ns: int
+    """The plant's period."""
+    measured: NDArray[np.bool_]
+    """Whether the sensor tested the trigger at each step, (K + 1,); the last step is measured."""
+    delivered: Callable[[int], bool]
+    """Whether the update of each event arrives."""
+    delay_ns: Callable[[int], int]
+    """Model time from each delivered event to the update's effect on the controller's model."""
+    delay_steps: Callable[[int], int]
+    """Steps from each delivered event to the first one with an input computed from it."""
+    model_ns: NDArray[np.int64]
+    """Model time of the actuation held from each step on, (K + 1,); −1 if there is none yet."""
+
+
+@dataclass(frozen=True)
+class PlantGridRun:
+    """A run on the plant's grid."""
+
+    x: Matrix
+    """State at each step, (K + 1, n)."""
+    event_steps: NDArray[np.int64]
+    """Step of each event."""
+
+
+class PlantGridLoop:
+    """The loop under a schedule."""
+
+    def __init__(
+        self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool
+    ) -> None:
+        self._system = system
+        self._schedule = schedule
+        self._known_start = known_start
+        self._steps_s = np.arange(len(schedule.measured), dtype=np.float64)
+        self._steps_s *= schedule.period_ns * 1e-9
+        self._one_step = discretise(system.loop.A, system.loop.B, schedule.period_ns)
+
+    @np.errstate(all="ignore")
+    def run(self, *, delay: bool, hold: bool) -> PlantGridRun:
+        """Simulate; once the state is not finite, it stays non-finite."""
+        schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
+        last = len(schedule.measured) - 1
+        states = np.empty((last + 1, len(x0)))
+        states[0] = x_s = x0
+        trigger, in_common = _CoreTrigger(self._system.trigger, len(x0)), self._known_start
+        if in_common:
+            trigger.start(0, x0)
+        newest = _Update(-1, 0, 0, x0 if in_common else np.zeros_like(x0))
+        in_flight: list[_Update] = []
+        events: list[int] = []
+        step, event = 0, bool(schedule.measured[0])
+        if event and in_common:
+            event = trigger.test(0, x0[None], np.zeros_like(x0)[None]) is not None
+        while True:
+            x, now_ns = states[step], step * period_ns
+            if event:
+                x_s, in_common, number = x, True, len(events)
+                trigger.start(now_ns, x)
+                events.append(step)
+                if schedule.delivered(number):
+                    wait_ns = self._wait_ns(number, hold=hold) if delay else 0
+                    in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
+                    in_flight.sort(key=lambda update: update.acts_ns)
+            while in_flight and in_flight[0].acts_ns <= now_ns:
+                newest = max(newest, in_flight.pop(0), key=lambda update: update.number)
+            if step == last:
+                return PlantGridRun(states, np.array(events, dtype=np.int64))
+            until = min(step + _BLOCK, last)
+            if in_flight:
+                until = min(until, max(in_flight[0].acts_ns // period_ns, step + 1))
+            within = [update for update in in_flight if update.acts_ns < until * period_ns]
+            following = slice(step + 1, until + 1)
+            if hold:
+                states[following] = self._held(x, newest, step, until)
+            else:
+                states[following] = self._continuous(x, [newest, *within], step, until)
+            x_s_block = self._modelled(x_s, self._steps_s[1 : until - step + 1])
+            measured = np.flatnonzero(schedule.measured[following])
+            if in_common:
+                block = states[following][measured]
+                found = trigger.test(
+                    (step + 1 + measured) * period_ns, block, x_s_block[measured] - block
+                )
+            else:
+                found = 0 if len(measured) else None
+            event = found is not None
+            taken = until - step - 1 if found is None else int(measured[found])
+            x_s = x_s_block[taken]
+            step += 1 + taken
+
+    def _wait_ns(self, event: int, *, hold: bool) -> int:
+        if hold:
+            return self._schedule.delay_steps(event) * self._schedule.period_ns
+        return self._schedule.delay_ns(event)
+
+    def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
+        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t)."""
+        now_ns, newest = step * self._schedule.period_ns, updates[0]
+        for update in updates[1:]:
+            x = self._followed(x, newest, now_ns, np.array([(update.acts_ns - now_ns) * 1e-9]))[0]
+            newest, now_ns = max(newest, update, key=lambda one: one.number), update.acts_ns
+        if len(updates) == 1:
+            return self._followed(x, newest, now_ns, self._steps_s[1 : until - step + 1])
+        end_ns = until * self._schedule.period_ns
+        return self._followed(x, newest, now_ns, np.array([(end_ns - now_ns) * 1e-9]))
+
+    def _followed(self, x: Vector, newest: "_Update", now_ns: int, after_s: Vector) -> Matrix:
+        """Return x at ascending times after now, (k, n), while no other update acts."""
+        x_c = self._modelled(newest.x, np.array([(now_ns - newest.event_ns) * 1e-9]))[0]
+        start = np.array([x, np.zeros_like(x), x_c - x])  # e_s does not act on the plant
+        return self._system.follow(np.zeros(1), start[None], after_s).x
+
+    def _modelled(self, x: Vector, age_s: Vector) -> Matrix:
+        """Return e^{H age} x for ascending ages, (k, n)."""
+        start = np.array([x, np.zeros_like(x), np.zeros_like(x)])
+        return self._system.follow(np.zeros(1), start[None], age_s).x_c
+
+    def _held(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
+        """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
+        model_ns = self._schedule.model_ns[step:until]
+        age_ns = np.maximum(model_ns - newest.event_ns, 0)
+        inputs = self._modelled(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
+        inputs[model_ns == NO_ACTUATION] = 0.0
+        Ad, Bd = self._one_step
+        states = np.empty((until - step, len(x)))
+        for i, forced in enumerate(inputs @ Bd.T):
+            states[i] = x = Ad @ x + forced
+        return states
+
+
+class _Update(NamedTuple):
+    """An update of the controller's model; number −1 is the controller's initial state."""
+
+    number: int
+    event_ns: int
+    acts_ns: int
+    x: Vector
+
+
+class _CoreTrigger:
+    """Tests measurements as the sensor does: the core's trigger."""
+
+    def __init__(self, policy: Policy, n: int) -> None:
+        self._n, self._memory, rule = n, CoreMemory(), policy.trigger_rule(n)
+        start = policy.initial_dynamic_variable
+        self._rule, self._sides = ffi.new("noack_trigger_rule *"), ffi.new("double[2]")
+        fill_rule(self._rule, rule, policy.weight, start, self._memory)
+        self._state = ffi.new("noack_trigger_state *", {"auxiliary": start, "event_ns": -1})
+        self._scratch = self._memory.zeros(4 * n + rule_rows(rule))
+
+    def start(self, t_ns: int, x: Vector) -> None:
+        """Begin, or begin again after an event, at a state of shape (n,)."""
+        x = np.ascontiguousarray(x)
+        core.noack_trigger_start(
+            self._rule, self._state, self._n, t_ns, pointer_to(x, "double *"), self._scratch
+        )
+
+    def test(self, t_ns: NDArray[np.int64] | int, x: Matrix, e_s: Matrix) -> int | None:
+        """Test k successive measurements, (k, n), up to the first event; return its index."""
+        x, e_s = np.ascontiguousarray(x), np.ascontiguousarray(e_s)
+        states, errors = pointer_to(x, "double *"), pointer_to(e_s, "double *")
+        for i, at_ns in enumerate(np.atleast_1d(t_ns).tolist()):
+            if core.noack_trigger_test(
+                self._rule, self._state, self._n, at_ns, states + i * self._n,
+                errors + i * self._n, self._sides, self._scratch,
+            ):  # fmt: skip
+                return i
+        return None

@@ -1,0 +1,263 @@
+"""Many runs of a scenario's loop as its processes run it, from event to event.
+
+The machines of the loop make the steps of all runs (native/driver/segments.c): at step k of the
+plant, in this order, x advances under the input held since step k − 1, and the newest actuation is
+latched. At every ``every``-th step y is measured (with an observer y = x̂), and the trigger tests
+it. After an event x_s = y. Then updates arrive, and the controller ticks, until step k + 1. Nothing
+is late.
+"""
+
+from copy import copy
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller_node.controller import controllers_of
+from noack.config.resolution import assumed_model, loop_of, policy_of
+from noack.config.scenario import Scenario
+from noack.core.core_library import core, ffi, pointer_to
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.theory.certificates.conditions import network_delay_ns
+from plant_server.plant import disturbance_of, measurement_model_of, plants_of
+from sensor_node.sensor import sensors_of
+
+Stack = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+_POINTERS = {"i": "int64_t *", "f": "double *", "b": "uint8_t *"}
+
+
+class Scales(NamedTuple):
+    """What the values of a run are multiplied with, by the step, (K + 1,)."""
+
+    weight: Matrix
+    """W, (n, n)."""
+    error: Vector
+    state: Vector
+
+
+class Runs(NamedTuple):
+    """N runs, changed in place; r is the number of updates that may be in flight."""
+
+    step: Numbers
+    """The step of the event before, which is decided; −1 at a start that is no event, (N,)."""
+    x: Matrix
+    """(N, n), and the same for the next ones."""
+    y: Matrix
+    x_s: Matrix
+    x_c: Matrix
+    u: Matrix
+    """The held input, (N, m)."""
+    u_next: Matrix
+    """The newest actuation, (N, m)."""
+    sent: Matrix
+    """The step of each update in flight, the oldest first; −1 for none, (N, r)."""
+    updates: Stack
+    """Their states, (N, r, n)."""
+    auxiliary: Vector
+    """η, or the integral, (N,)."""
+    is_event: NDArray[np.bool_]
+    """Whether the run reached an event, not the last step, (N,)."""
+    error: Vector
+    """The largest scaled ‖W e_c‖ since the event before; infinite if the run diverged, (N,)."""
+    state: Vector
+    """The largest scaled ‖x‖, (N,)."""
+    cost: Vector
+    """∫‖x‖² dt, as a sum over the steps, (N,)."""
+    error_at: Numbers
+    """Step of the largest ‖W e_c‖, (N,)."""
+    state_at: Numbers
+
+
+class SampledLoop:
+    """The loop of a resolved scenario; every delivered update takes the longest certified delay.
+
+    Raises:
+        CallerError: the loop is not linear between events, or the policy is not a rule.
+    """
+
+    def __init__(self, resolved: Scenario) -> None:
+        coverage, timing = resolved.coverage, resolved.timing
+        coverage.require_unchanging()
+        coverage.require_certifiable()
+        coverage.require_direct_inputs()
+        if timing.actuation_timeout_ns <= timing.controller_period_ns + timing.plant_period_ns:
+            raise CallerError(
+                "plant.watchdog.timeout_s: shorter than the time between two inputs; "
+                "give a time after which the watchdog acts on a failure only"
+            )
+        self.matrices, n = loop_of(resolved), resolved.model.dimensions[0]
+        self.resolved = resolved
+        self.last = timing.horizon_ns // timing.plant_period_ns
+        self.step_s = timing.plant_period_ns * 1e-9
+        self.every = resolved.plant.measure_every
+        """Steps from one measurement to the next."""
+        self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
+        self.delay_ns = network_delay_ns(resolved, 0)
+        self._first_auxiliary = policy_of(resolved).initial_dynamic_variable
+        self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
+        assumed, measurements = assumed_model(resolved), self.last // self.every + 1
+        self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))
+        if resolved.observer is not None:
+            self._gains = _dense(
+                np.array([*islice(resolved.observer.gains(assumed), measurements)])
+            )
+        loops = (resolved,)
+        self._machines = (plants_of(loops), sensors_of(loops), controllers_of(loops))
+        self._set_causes(pushes_of(resolved), noise_of(resolved))
+
+    def _set_causes(self, push: Matrix, noise: Matrix) -> None:
+        """Make a plant with these disturbances and noise; it shares the state of the first one."""
+        matrices, (n, m) = self.matrices, self.resolved.model.dimensions
+        self._push, self._noise = push, noise
+        plant = ffi.new("noack_plant *", self._machines[0].machines[0])
+        B = discretise(matrices.A, matrices.B, self.resolved.timing.plant_period_ns)[1]
+        sources, pushes = B, np.zeros((self.last + 1, n))
+        if len(push):
+            sources, pushes[: len(push)] = np.hstack([B, np.eye(n)]), push
+        arrays = {"Bd": _dense(sources), "applied": np.zeros(m + n)}
+        for name, array in arrays.items():
+            setattr(plant, name, pointer_to(array, "double *"))
+        plant.sources, plant.at_input.width = sources.shape[1], 0
+        noises = _dense(noise)
+        for signal, values, given in (
+            (plant.at_state, pushes, len(push)), (plant.noise, noises, len(noise)),
+        ):  # fmt: skip
+            signal.width = values.shape[1] if given else 0
+            signal.first, signal.rows = 0, len(values)
+            signal.values = pointer_to(values, "double *")
+        self._plant, self._kept = plant, (arrays, pushes, noises)
+
+    @property
+    def known_start(self) -> bool:
+        """Whether sensor and controller start from x(0), without a packet."""
+        return self.resolved.network.initial_sync == "known_state"
+
+    def start(self) -> Runs:
+        """Return one run at its start: after the delivered first packet, if there is one."""
+        n, known = self.matrices.n, self.known_start
+        runs = self.empty(1)
+        x0 = self.matrices.x0
+        runs.x[0], runs.auxiliary[0], runs.step[0] = x0, self._first_auxiliary, -1
+        if known:
+            runs.x_s[0] = runs.x_c[0] = x0
+        observer = self.resolved.observer
+        if observer is not None:
+            given = observer.initial_estimate
+            runs.y[0] = (x0 if known else np.zeros(n)) if given is None else np.array(given)
+        if not known:
+            runs.step[0] = 0
+            self.measure_at(runs)
+            self.update(runs, np.array([True]))
+        return runs
+
+    @property
+    def causes(self) -> tuple[Matrix, Matrix]:
+        """The changes of x by the disturbance of each step, and the noise of each measurement."""
+        return self._push, self._noise
+
+    def with_causes(self, push: Matrix, noise: Matrix) -> "SampledLoop":
+        """Return this loop with other disturbances and noise."""
+        changed = copy(self)
+        changed._set_causes(push, noise)
+        return changed
+
+    def correction(self, numbers: Numbers) -> Stack:
+        """Return the change of y by noise at each of k measurements, (k, n, p)."""
+        if len(self._gains):
+            return self._gains[numbers]
+        return np.broadcast_to(np.eye(self.matrices.n), (len(numbers), *[self.matrices.n] * 2))
+
+    def measure_at(self, runs: Runs) -> None:
+        """Measure, where the step of a run is one of a measurement; y is 0 or estimated before."""
+        for i in np.flatnonzero(runs.step % self.every == 0).tolist():
+            number = int(runs.step[i]) // self.every
+            noise = self._noise[number] if len(self._noise) else 0.0
+            if len(self._gains):
+                innovation = self._C @ (runs.x[i] - runs.y[i]) + noise
+                runs.y[i] += self._gains[number] @ innovation
+            else:
+                runs.y[i] = runs.x[i] + noise
+
+    def empty(self, count: int) -> Runs:
+        """Return runs at 0."""
+        n, m, r = self.matrices.n, self.matrices.m, self._most_in_flight
+        return Runs(
+            np.zeros(count, np.int64), np.zeros((count, n)), np.zeros((count, n)),
+            np.zeros((count, n)), np.zeros((count, n)), np.zeros((count, m)),
+            np.zeros((count, m)), np.full((count, r), -1.0), np.zeros((count, r, n)),
+            np.zeros(count), np.zeros(count, np.bool_), np.zeros(count), np.zeros(count),
+            np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
+        )  # fmt: skip
+
+    def update(self, runs: Runs, delivered: Any) -> None:
+        """Make the events of runs: x_s = y, and send the update of the delivered ones, (N,)."""
+        runs.x_s[:] = runs.y
+        rows = np.flatnonzero(delivered)
+        place = (runs.sent[rows] >= 0).sum(axis=1)
+        runs.sent[rows, place] = runs.step[rows]
+        runs.updates[rows, place] = runs.y[rows]
+
+    def follow(self, runs: Runs, scales: Scales, last: Numbers, *, tests: bool = True) -> None:
+        """Advance runs in place to their next events, at most to their steps ``last``, (N,).
+
+        Without ``tests`` there are no events.
+        """
+        _, sensor, controller = (one.machines[0] for one in self._machines)
+        if len(self._gains):
+            sensor.observer.kind = core.NOACK_LUENBERGER
+        weight = _dense(scales.weight)
+        levels = [_dense(one) for one in (scales.error, scales.state)]
+        scratch = np.zeros(3 * self.matrices.n)
+        segments = ffi.new("noack_segments *", {
+            "plant": self._plant, "sensor": ffi.addressof(sensor),
+            "controller": ffi.addressof(controller), "last": self.last, "delay_ns": self.delay_ns,
+            "known_start": self.known_start, "runs": len(runs.step),
+            "places": runs.sent.shape[1], "weight": pointer_to(weight, "double *"),
+            "gains": pointer_to(self._gains, "double *") if len(self._gains) else ffi.NULL,
+            "error_scale": pointer_to(levels[0], "double *"),
+            "state_scale": pointer_to(levels[1], "double *"),
+            "scratch": pointer_to(scratch, "double *"),
+        })  # fmt: skip
+        for name, array in runs._asdict().items():
+            setattr(segments, name, pointer_to(array, _POINTERS[array.dtype.kind]))
+        if (wrong := core.noack_segments_check(segments)) != ffi.NULL:
+            raise ValueError(f"segments: {ffi.string(wrong).decode()}")
+        last = np.ascontiguousarray(last, np.int64)
+        core.noack_follow(segments, pointer_to(last, "int64_t *"), tests)
+
+
+def through_of(resolved: Scenario) -> Matrix:
+    """Return the effect of disturbances of u and of ẋ, held over a step, on x, (n, m + n)."""
+    matrices, period_ns = loop_of(resolved), resolved.timing.plant_period_ns
+    sources = np.hstack([matrices.B, np.eye(matrices.n)])
+    return discretise(matrices.A, sources, period_ns)[1]
+
+
+def pushes_of(resolved: Scenario) -> Matrix:
+    """Return the changes of x by the disturbance of each step, (steps, n); (0, n) for none."""
+    disturbance, (n, m) = disturbance_of(resolved), resolved.model.dimensions
+    if disturbance is None:
+        return np.zeros((0, n))
+    through = through_of(resolved)
+    found = np.zeros((resolved.timing.horizon_ns // resolved.timing.plant_period_ns, n))
+    d, w = disturbance.values(range(len(found)))
+    for part, at in ((d, through[:, :m]), (w, through[:, m:])):
+        if part.shape[1]:
+            found += part @ at.T
+    return found
+
+
+def noise_of(resolved: Scenario) -> Matrix:
+    """Return the noise of each measurement, (measurements, p); (0, p) for none."""
+    model = measurement_model_of(resolved)
+    if model is None or not model.is_noisy:
+        return np.zeros((0, resolved.message_sizes.outputs))
+    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns
+    return model.noise(0, steps // resolved.plant.measure_every + 1)
+
+
+def _dense(matrix: Matrix | Numbers) -> Matrix:
+    return np.ascontiguousarray(matrix, dtype=np.float64)

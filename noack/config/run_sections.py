@@ -1,0 +1,213 @@
+"""The tables of a scenario that describe the run: all but those of a loop, and ``[[loops]]``."""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, FiniteFloat, field_validator, model_validator
+
+from noack.config.runtime_parameters import full_key
+from noack.core.clock import NS_PER_S
+from noack.settings.section import ScenarioSection, Seed
+
+Port = Annotated[int, Field(ge=0, le=65535)]
+
+
+class CertificateSection(ScenarioSection):
+    """Additional tolerance of the certificates, beyond the run's own schedule."""
+
+    late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
+    """Updates and inputs may be late by this number of plant steps."""
+    network_delay_s: Annotated[FiniteFloat, Field(ge=0, le=3600)] | None = None
+    """The network may delay updates by this time; a longer delay voids the certificates. By default
+    the longest delay of the network's impairments."""
+    exceedance_probability: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 1e-6
+    """Normally distributed disturbances and noise have no bound. The certificates assume one that a
+    run exceeds with at most this probability."""
+
+
+class ClocksSection(ScenarioSection):
+    """The clocks of a run on several hosts: each process compares its own with the coordinator's.
+
+    The bounds of their errors are recorded. Claims need them.
+    """
+
+    largest_error_us: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = 1000.0
+    """Claims are void from the time on at which the bound of a clock's error is larger, or lost."""
+    relative_rate_ppm: Annotated[FiniteFloat, Field(gt=0, le=100_000)] = 1201.0
+    """The largest rate at which two clocks move apart. 1201: crystals of ±100 ppm, slewed by at
+    most 500 ppm; 201: clocks that are not slewed."""
+
+
+class RecoverySection(ScenarioSection):
+    """What happens to a run when one of its processes dies."""
+
+    rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
+    """Wall time for which the run continues without its sensor, controller, network or recorder.
+    Within this time a new process may replace it; the launcher starts one by itself. 0: the run
+    ends. By default 0 for processes that the launcher started, and 60 for processes started by
+    hand. Without its plant the run ends."""
+
+
+class ScheduledChange(ScenarioSection):
+    """Settings that change at a time during the run."""
+
+    at_s: Annotated[FiniteFloat, Field(ge=0, le=1e7)]
+    """Simulated time at which the new values take effect."""
+    set: Annotated[dict[str, Any], Field(min_length=1)]
+    """The new values by their keys, e.g. "network.loss.probability" = 0.9: the keys of
+    network.loss, network.mansd, controller.setpoint, and the numbers of the trigger."""
+
+    @field_validator("set")
+    @classmethod
+    def _with_full_keys(cls, given: dict[str, Any]) -> dict[str, Any]:
+        settings = {full_key(name): value for name, value in given.items()}
+        if len(settings) < len(given):
+            raise ValueError("a key is given twice, by its short name, too")
+        return settings
+
+    @property
+    def at_ns(self) -> int:
+        """That time in nanoseconds."""
+        return round(self.at_s * NS_PER_S)
+
+
+class SeedsSection(ScenarioSection):
+    """Seeds of the named random streams; they are independent of each other."""
+
+    plant: Seed = 0
+    """Draw of the true plant from its uncertainty box."""
+    initial_state: Seed = 0
+    """Draw of x(0)."""
+    loss: Seed = 0
+    """The network's losses."""
+    disturbance: Seed = 0
+    """The plant's random disturbances."""
+    noise: Seed = 0
+    """The measurements' noise."""
+
+
+class PortsSection(ScenarioSection):
+    """UDP ports on the loopback interface; 0 takes a free one."""
+
+    plant: Port = 0
+    """Where the plant receives actuation."""
+    sensor: Port = 0
+    """Where the sensor receives measurements."""
+    netem: Port = 0
+    """Where the network receives the sensor's updates."""
+    controller: Port = 0
+    """Where the controller receives the delivered updates."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        taken: dict[int, str] = {}
+        for key in type(self).model_fields:
+            port = getattr(self, key)
+            if port and port in taken:
+                raise ValueError(
+                    f"{key}: port {port} is already given to {taken[port]}; "
+                    "take another, or 0 for any"
+                )
+            taken[port] = key
+        return self
+
+
+class RealtimeSection(ScenarioSection):
+    """Real-time settings of the loop's processes; each is applied if the system permits it."""
+
+    enabled: bool = True
+    """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
+    fifo_priority: Annotated[int, Field(ge=1, le=98)] = 50
+    """SCHED_FIFO priority of the controller; with ``pin_cores`` the emulator, the sensor and the
+    plant have 1, 2 and 3 less, at least 1."""
+    pin_cores: bool = True
+    """With SCHED_FIFO: the plant runs on the first core, sensor, emulator and controller on the
+    second; a receiver interrupts its sender."""
+    spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
+    """Busy-wait this long before each deadline; this takes time from other processes on the
+    core."""
+
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+MOST_LOOPS = 65_535
+"""Largest number of loops in a run: datagrams carry the loop's number in 16 bits."""
+SHARED = (
+    "horizon_s", "speed", "start_within_s", "network", "certificate", "clocks", "recovery",
+    "changes", "ports", "realtime", "loops",
+)  # fmt: skip
+"""Keys of a scenario that all its loops share."""
+
+Table = dict[str, Any]
+
+
+class LoopSeeds(ScenarioSection):
+    """Seeds that an entry of ``[[loops]]`` sets itself; all loops of the entry use them."""
+
+    plant: Seed | None = None
+    """Draw of the true plant from its uncertainty box."""
+    initial_state: Seed | None = None
+    """Draw of x(0), and of the phase."""
+    disturbance: Seed | None = None
+    """The plant's random disturbances; with one seed, all loops have the same disturbance."""
+    noise: Seed | None = None
+    """The measurements' noise."""
+
+
+class LoopSection(ScenarioSection):
+    """A loop, or ``count`` loops, on the run's network.
+
+    A loop is the scenario's top level, or that of the entry's scenario file, with the keys of this
+    entry in place of its own. A table that names its kind (``trigger.policy``, ``observer.kind``,
+    ``controller.kind``; ``model.name``, ``model.A`` or ``model.file``) replaces the whole table.
+    """
+
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
+    """Names the loop; with count = N > 1 the loops are NAME-1 to NAME-N."""
+    count: Annotated[int, Field(ge=1, le=MOST_LOOPS)] = 1
+    """Number of loops; each draws its plant, initial state, disturbances, noise and phase."""
+    phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] | None = None
+    """Start of the loop after that of the run, as a share of the time between two transmissions of
+    a periodic trigger, or else between two measurements. By default drawn by seed, and 0 for the
+    first loop of the run."""
+    scenario: str | Table | None = None
+    """Another scenario file: the loop has its mode, model, plant, trigger, observer and controller
+    in place of those of the top level. A path relative to this file, or the name of a shipped
+    scenario. A network, certificate or changes in it must be those of this run; its other keys have
+    no effect. Loading the scenario replaces the name by the tables."""
+    mode: Literal["model", "zoh"] | None = None
+    """The loop's mode."""
+    model: Table | None = None
+    """Keys of the loop's model."""
+    plant: Table | None = None
+    """Keys of the loop's plant."""
+    trigger: Table | None = None
+    """Keys of the loop's trigger."""
+    observer: Table | None = None
+    """Keys of the loop's observer."""
+    controller: Table | None = None
+    """Keys of the loop's controller."""
+    seeds: LoopSeeds = LoopSeeds.model_construct()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check(cls, content: Any) -> Any:
+        for key in SHARED:
+            if isinstance(content, dict) and key in content:
+                raise ValueError(f"{key}: all loops share it; set it at the top level")
+        named = content.get("scenario") if isinstance(content, dict) else None
+        if named is not None and not isinstance(named, str | dict):
+            raise ValueError("scenario: should be the name of a scenario file, in quotes")
+        return content
+
+    @model_validator(mode="after")
+    def _check_name(self) -> Self:
+        if len(self.names[-1]) > 64:
+            raise ValueError(f"name: too long; with count = {self.count} it gets a number")
+        return self
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the loops."""
+        if self.count == 1:
+            return [self.name]
+        width = len(str(self.count))
+        return [f"{self.name}-{number:0{width}}" for number in range(1, self.count + 1)]

@@ -1,0 +1,409 @@
+"""The keys of a scenario, and what follows from them: times, sizes of messages, covering theory.
+
+:mod:`noack.config.scenario_checks` checks tables that depend on each other.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, FiniteFloat
+
+from noack.config.run_sections import (
+    NAME_PATTERN,
+    CertificateSection,
+    ClocksSection,
+    LoopSection,
+    PortsSection,
+    RealtimeSection,
+    RecoverySection,
+    ScheduledChange,
+    SeedsSection,
+)
+from noack.config.sections import (
+    AnyController,
+    AnyObserver,
+    AnyTrigger,
+    ModelSection,
+    NetworkSection,
+    PlantSection,
+)
+from noack.controllers.linear_feedback import LinearFeedbackSettings
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.row_display import as_html, as_text
+from noack.plants.linear import LinearSettings
+from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
+from noack.protocol.wire_format import Flow
+from noack.settings.section import ScenarioSection, period_ns
+from noack.trigger.decaying import DecayingSettings
+
+MOST_CHANGES = 256  # largest number of scheduled changes in a run
+
+
+class ScenarioTables(ScenarioSection):
+    """The keys of a scenario; :class:`noack.config.scenario.Scenario` checks them together."""
+
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
+    """Names the run's directory: letters, digits, _ and -."""
+    description: str = ""
+    """What the scenario shows."""
+    mode: Literal["model", "zoh"] = "model"
+    """model: x_s and x_c follow Â + B̂K between updates; zoh: they hold the last update."""
+    horizon_s: Annotated[FiniteFloat, Field(gt=0, le=1e7)]
+    """Simulated length of the run."""
+    speed: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 1.0
+    """Simulated time per wall time."""
+    start_within_s: Annotated[FiniteFloat, Field(gt=0, le=86_400)] | None = None
+    """The run ends if its processes are not ready within this wall time, which grows with the
+    system's load, up to 20 times. By default 30, and unlimited if people start processes."""
+    model: ModelSection
+    plant: PlantSection
+    trigger: AnyTrigger
+    """When the sensor transmits."""
+    observer: AnyObserver | None = None
+    """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
+    the measurement must be the state."""
+    network: NetworkSection
+    controller: AnyController = LinearFeedbackSettings.model_construct()
+    certificate: CertificateSection = CertificateSection.model_construct()
+    clocks: ClocksSection | None = None
+    """The clocks of a run on several hosts. Without it, claims assume one clock."""
+    recovery: RecoverySection = RecoverySection.model_construct()
+    changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
+    """Changes of settings during the run, in the order of time."""
+    loops: Annotated[tuple[LoopSection, ...], Field(min_length=1)] | None = None
+    """The loops on the network, if there are several."""
+    seeds: SeedsSection = SeedsSection.model_construct()
+    ports: PortsSection = PortsSection.model_construct()
+    realtime: RealtimeSection = RealtimeSection.model_construct()
+
+    def _rows(self) -> list[tuple[str, str]]:
+        n, m = self.model.dimensions
+        rows = [
+            ("scenario", self.name + (f": {self.description}" if self.description else "")),
+            ("mode", "model-based" if self.mode == "model" else "zero-order hold"),
+            ("plant", f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz"),
+            ("trigger", _said(self.trigger, "policy")),
+            ("network", f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}"),
+            ("horizon", f"{self.horizon_s:g} s"),
+        ]
+        if self.loops:
+            loops = (
+                one.name if one.count == 1 else f"{one.count} x {one.name}" for one in self.loops
+            )
+            rows.append(("loops", ", ".join(loops)))
+        return rows
+
+    def __str__(self) -> str:
+        """The most important settings, in a few lines."""
+        return as_text(self._rows())
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """Show the same text in IPython."""
+        printer.text(str(self))
+
+    def _repr_html_(self) -> str:
+        """Show the same as a table in notebooks."""
+        return as_html(self._rows())
+
+    @property
+    def timing(self) -> "Timing":
+        """Periods, phases and timeouts."""
+        return Timing(self)
+
+    @property
+    def message_sizes(self) -> "MessageSizes":
+        """The number of vector entries in its messages."""
+        return MessageSizes(self)
+
+    @property
+    def coverage(self) -> "TheoryCoverage":
+        """The parts of the theory that apply to it."""
+        return TheoryCoverage(self)
+
+    @property
+    def decaying(self) -> DecayingSettings:
+        """Return the trigger, if it is the paper's; raise CallerError for another policy."""
+        if not isinstance(self.trigger, DecayingSettings):
+            raise CallerError(
+                f'trigger.policy: needs the paper\'s trigger, "decaying"; '
+                f'this scenario has "{self.trigger.policy}"'
+            )
+        return self.trigger
+
+    @property
+    def protocol(self) -> LoopProtocol:
+        """The settings that depend on whether updates are acknowledged."""
+        return PROTOCOLS[self.network.protocol]
+
+
+def _said(section: ScenarioSection, kind: str) -> str:
+    """Describe a section by its kind, and its values that differ from the defaults."""
+    given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
+    values = (
+        f"{key} = {'…' if isinstance(value, dict | list) else value}"
+        for key, value in given.items()
+    )
+    return ", ".join((getattr(section, kind), *values))
+
+
+_TIMEOUT_PERIODS = 5
+_WATCHDOG_PERIODS = 50
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Periods, phases and timeouts of a scenario, in nanoseconds of simulated time."""
+
+    scenario: ScenarioTables
+
+    @property
+    def horizon_ns(self) -> int:
+        """Length of the run."""
+        return round(self.scenario.horizon_s * NS_PER_S)
+
+    @property
+    def plant_period_ns(self) -> int:
+        """Period of the plant's steps."""
+        return period_ns(self.scenario.plant.rate_hz)
+
+    @property
+    def measurement_period_ns(self) -> int:
+        """Time between measurements."""
+        return self.plant_period_ns * self.scenario.plant.measure_every
+
+    @property
+    def controller_period_ns(self) -> int:
+        """Period of the controller's ticks."""
+        return period_ns(self.scenario.controller.rate_hz)
+
+    @property
+    def controller_phase_ns(self) -> int:
+        """Time of the controller's first tick."""
+        return round(self.scenario.controller.phase * self.controller_period_ns)
+
+    @property
+    def actuation_timeout_ns(self) -> int:
+        """Age of the newest actuation at which the plant's watchdog acts."""
+        timeout_s = self.scenario.plant.watchdog.timeout_s
+        if timeout_s is not None:
+            return round(timeout_s * NS_PER_S)
+        usual_ns = _WATCHDOG_PERIODS * self.controller_period_ns
+        actuation = self.scenario.network.actuation
+        if actuation is None:
+            return max(usual_ns, self.predicted_ns)
+        last_ns = self.predicted_ns + round(actuation.link.longest_delay_s * NS_PER_S)
+        return max(usual_ns, last_ns) if self.scenario.plant.watchdog.policy == "hold" else last_ns
+
+    @property
+    def actuation_gap_ns(self) -> int | None:
+        """Time by which losses and delays may hold up the newest actuation; None: no bound."""
+        if (actuation := self.scenario.network.actuation) is None:
+            return 0
+        if (burst := actuation.link.longest_burst) is None:
+            return None
+        delay_ns = math.ceil(actuation.link.longest_delay_s * NS_PER_S)
+        return burst * self.controller_period_ns + delay_ns
+
+    @property
+    def predicted_ns(self) -> int:
+        """Time for which an actuation has inputs."""
+        return self.scenario.controller.predictions * self.controller_period_ns
+
+    @property
+    def missing_actuation_ns(self) -> int:
+        """Age of the newest actuation from which the plant reports that actuations are missing.
+
+        The loss of a few is expected where they cross the network.
+        """
+        if self.scenario.network.actuation is None:
+            return self.actuation_timeout_ns
+        return max(self.actuation_timeout_ns, _WATCHDOG_PERIODS * self.controller_period_ns)
+
+    @property
+    def acknowledgement_timeout_ns(self) -> int:
+        """How long the sensor waits for an acknowledgement before it transmits again."""
+        network = self.scenario.network
+        if network.reverse.timeout_s is not None:
+            return round(network.reverse.timeout_s * NS_PER_S)
+        round_trip_s = network.link.longest_delay_s + network.reverse.link.longest_delay_s
+        return _TIMEOUT_PERIODS * self.measurement_period_ns + round(round_trip_s * NS_PER_S)
+
+
+@dataclass(frozen=True)
+class MessageSizes:
+    """Number of vector entries per message of a scenario, by flow."""
+
+    scenario: ScenarioTables
+
+    @property
+    def outputs(self) -> int:
+        """The number p of measured outputs."""
+        return self.scenario.plant.measurement.outputs(self.scenario.model.dimensions[0])
+
+    @property
+    def inputs_reported(self) -> int:
+        """Number of applied inputs in a measurement: m per plant step since the last measurement.
+
+        Only an observer needs them; without an observer it is 0.
+        """
+        if self.scenario.observer is None:
+            return 0
+        return self.scenario.plant.measure_every * self.scenario.model.dimensions[1]
+
+    @property
+    def measurement_entries(self) -> int:
+        """Number of entries of a measurement: y, or y and the applied inputs since the last one."""
+        return self.outputs + self.inputs_reported
+
+    @property
+    def is_predictive(self) -> bool:
+        """Whether actuations carry the controller's model state."""
+        return self.scenario.plant.watchdog.policy == "model"
+
+    @property
+    def actuation_entries(self) -> int:
+        """Number of entries of an actuation: its inputs, with x_c if it is predictive."""
+        n, m = self.scenario.model.dimensions
+        return m * self.scenario.controller.predictions + n * self.is_predictive
+
+    def entries(self, flow: Flow) -> int:
+        """Number of entries of a message of a flow."""
+        return {
+            Flow.MEASUREMENT: self.measurement_entries,
+            Flow.UPDATE: self.scenario.model.dimensions[0],
+            Flow.ACTUATION: self.actuation_entries,
+            Flow.ACKNOWLEDGEMENT: 0,
+        }[flow]
+
+
+UNCERTIFIED_ACKNOWLEDGEMENTS = (
+    "x_s is reset only when an acknowledgement returns, so ‖e_s‖ exceeds the threshold while the "
+    "sensor waits, and (I1), on which every bound rests, does not hold"
+)
+"""Why the baseline with acknowledgements has no certificate."""
+
+
+@dataclass(frozen=True)
+class TheoryCoverage:
+    """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
+
+    scenario: ScenarioTables
+
+    @property
+    def is_decaying(self) -> bool:
+        """Whether the trigger is the paper's."""
+        return isinstance(self.scenario.trigger, DecayingSettings)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the plant is a linear system."""
+        return isinstance(self.scenario.plant.system, LinearSettings)
+
+    @property
+    def knows_state(self) -> bool:
+        """Whether the sensor measures the state itself, without noise."""
+        return self.scenario.observer is None and not self.scenario.plant.measurement.is_noisy
+
+    @property
+    def is_certifiable(self) -> bool:
+        """Whether certificates apply; the paper's theorems need its trigger as well."""
+        return self.beyond_theory is None
+
+    @property
+    def is_undisturbed(self) -> bool:
+        """Whether nothing disturbs the plant, and the sensor measures x."""
+        return self.knows_state and not self.scenario.plant.disturbances
+
+    @property
+    def beyond_theory(self) -> str | None:
+        """The first setting that certificates do not cover; None if all are."""
+        return self._beyond_certificates or self.scenario.trigger.beyond_exact
+
+    @property
+    def _beyond_certificates(self) -> str | None:
+        """The first setting besides the trigger that certificates do not cover."""
+        scenario = self.scenario
+        if scenario.protocol.acknowledges:
+            return f'network.protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}'
+        if not self.is_linear:
+            return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
+        if not scenario.controller.is_linear:
+            return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
+        return self._beyond_actuation
+
+    @property
+    def _beyond_actuation(self) -> str | None:
+        """Why the age of the applied input has no bound, or the watchdog replaces the input."""
+        timing, policy = self.scenario.timing, self.scenario.plant.watchdog.policy
+        if (gap_ns := timing.actuation_gap_ns) is None:
+            return (
+                "network.actuation: without mansd or constraints, the age of the applied input has "
+                "no bound"
+            )
+        oldest_ns = timing.controller_period_ns + gap_ns
+        if gap_ns and policy != "hold" and timing.actuation_timeout_ns < oldest_ns:
+            return (
+                f'plant.watchdog.policy = "{policy}": it replaces the input after '
+                f"{timing.actuation_timeout_ns / NS_PER_S:g} s, and an actuation may be "
+                f"{oldest_ns / NS_PER_S:g} s old; use more controller.predictions, or a longer "
+                "plant.watchdog.timeout_s"
+            )
+        return None
+
+    @property
+    def _beyond_linear(self) -> str | None:
+        """The first setting besides the trigger with which the loop is not ẋ = A x + B K x_c."""
+        scenario = self.scenario
+        if (why := self._beyond_certificates) is not None:
+            return why
+        if scenario.network.actuation is not None:
+            return "network.actuation: actuations may be lost or late"
+        if scenario.plant.disturbances:
+            kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
+            return f"plant.disturbances ({kinds}): the plant is disturbed"
+        if scenario.observer is not None:
+            return f'observer.kind = "{scenario.observer.kind}": the state is estimated'
+        if scenario.plant.measurement.is_noisy:
+            return "plant.measurement: the state is measured with noise"
+        return None
+
+    def require_constant(self) -> None:
+        """Raise CallerError if the settings change."""
+        if self.scenario.changes:
+            raise CallerError(
+                "changes: needs settings that stay the same during the run; "
+                "leave changes out, or use --set changes=[]"
+            )
+
+    def require_unchanging(self) -> None:
+        """Raise CallerError if the settings change, or the set point is not 0."""
+        self.require_constant()
+        if any(self.scenario.controller.setpoint or ()):
+            raise CallerError("controller.setpoint: this needs the set point 0")
+
+    def require_direct_inputs(self) -> None:
+        """Raise CallerError unless every actuation reaches the plant and carries one input."""
+        direct = self.scenario.network.actuation is None
+        if direct and self.scenario.controller.predictions == 1:
+            return
+        key = "controller.predictions" if direct else "network.actuation"
+        raise CallerError(
+            f"{key}: needs actuations that reach the plant at once and carry one input"
+        )
+
+    def require_certifiable(self) -> None:
+        """Raise CallerError if no certificate covers the scenario."""
+        if (why := self.beyond_theory) is not None:
+            raise CallerError(f"{why}; no certificate covers this")
+
+    def require_exact(self) -> None:
+        """Raise CallerError if exact simulation does not cover the scenario."""
+        if (why := self._beyond_linear) is not None:
+            raise CallerError(
+                f"{why}; this needs a linear plant with u = K x_c, without acknowledgements, "
+                "lost actuations, disturbances, noise and observer"
+            )
+        if (why := self.scenario.trigger.beyond_exact) is not None:
+            raise CallerError(why)

@@ -1,0 +1,451 @@
+"""The tables of a scenario that describe one loop: model, plant and network.
+
+The kinds of controllers, disturbances, observers, plants and triggers are those that their folders
+have (:func:`noack.settings.section.kinds_in`).
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
+from noack.controllers.controller_settings import ControllerSettings
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
+from noack.impairments.constraints import join_guarantee, require_consistent
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import Constraints, LinkSettings, Mansd, require_scores
+from noack.impairments.loss_guarantee import LossGuarantee
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.lossless import NoLoss
+from noack.observers.observer_settings import NoiseVariances, ObserverSettings
+from noack.plants.linear import LinearSettings
+from noack.plants.plant_settings import PlantSettings
+from noack.protocol.wire_format import Flow
+from noack.settings.section import (
+    RateHz,
+    Row,
+    Rows,
+    ScenarioSection,
+    kinds_in,
+    require_length,
+    require_non_negative,
+    require_shape,
+    require_squares,
+    require_whole_period,
+    shape,
+    union_of,
+)
+from noack.trigger.policy_settings import PolicySettings
+
+# Settings classes by kind: a module in the folder adds its kind.
+CONTROLLERS = kinds_in("noack.controllers", ControllerSettings)
+DISTURBANCES = kinds_in("noack.disturbances", DisturbanceSettings)
+OBSERVERS = kinds_in("noack.observers", ObserverSettings)
+PLANTS = kinds_in("noack.plants", PlantSettings)
+POLICIES = kinds_in("noack.trigger", PolicySettings, "policy")
+
+if TYPE_CHECKING:
+    AnyController = ControllerSettings
+    AnyDisturbance = DisturbanceSettings
+    AnyObserver = ObserverSettings
+    AnyPlant = PlantSettings
+    AnyTrigger = PolicySettings
+else:
+    AnyController = union_of(CONTROLLERS, default="linear")
+    AnyDisturbance = union_of(DISTURBANCES)
+    AnyObserver = union_of(OBSERVERS)
+    AnyPlant = union_of(PLANTS, default="linear")
+    AnyTrigger = union_of(POLICIES, "policy", default="decaying")
+    for _settings in POLICIES.values():
+        if not _settings.__pydantic_fields_complete__:  # a policy that combines others
+            _settings.model_rebuild(_types_namespace={"AnyTrigger": AnyTrigger})
+
+
+class ModelSection(ScenarioSection):
+    """The model that sensor and controller use: Â, B̂, and the gain K of u = K x_c.
+
+    It is given by ``name`` (with optional ``parameters``), by the matrices ``A``, ``B`` and
+    ``gain``, or by a ``file`` with these matrices.
+    """
+
+    name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
+    """A named model; see noack/config/named_models.py."""
+    parameters: dict[str, FiniteFloat] = Field({})
+    """Parameters of the named model that differ from its defaults."""
+    A: Rows | None = None
+    """Â by rows, n x n, per second."""
+    B: Rows | None = None
+    """B̂ by rows, n x m."""
+    gain: Rows | None = None
+    """K by rows, m x n; a named model has its own gain, and a file may have one."""
+    file: str | None = None
+    """An .npz or .mat file with A, B and, unless it is given here, the gain, named gain or K. A
+    relative name is relative to the scenario file. Loading the scenario replaces the name by the
+    matrices."""
+    names: dict[Literal["A", "B", "gain"], str] | None = None
+    """Names of the arrays in the file, if they differ from A, B and gain."""
+    state_names: tuple[str, ...] | None = None
+    """Names of the n states, for plots."""
+    input_names: tuple[str, ...] | None = None
+    """Names of the m inputs, for plots."""
+    allow_unstable: bool = False
+    """Accept a gain with which the model's closed loop Â + B̂K is unstable."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_read(self.file, self.names)
+        if self.name is not None:
+            self._check_named(self.name)
+        else:
+            self._check_explicit()
+        n, m = self.dimensions
+        require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
+        require_length(self.state_names, "state_names", n, "one name per state")
+        require_length(self.input_names, "input_names", m, "one name per input")
+        self._require_stable()
+        return self
+
+    def _require_stable(self) -> None:
+        (A, B), own = self.matrices, self.gain is None  # a named model's own gain
+        K = NAMED_MODELS[self.name or ""](self.parameters).K if own else np.array(self.gain)
+        key = "parameters" if own else "gain"
+        if not np.isfinite(_closed_loop(A, B, K)).all():
+            raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
+        if not self.allow_unstable and (why := instability(A, B, K)) is not None:
+            raise ValueError(
+                f"{key}: {why}; to run the unstable loop anyway, set model.allow_unstable = true"
+            )
+
+    def _check_named(self, name: str) -> None:
+        if self.A is not None or self.B is not None:
+            raise ValueError("name: a named model has its own A and B; give one or the other")
+        known = MODEL_PARAMETERS[name]
+        for key in self.parameters:
+            if key not in known:
+                raise ValueError(
+                    f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}"
+                )
+        named = NAMED_MODELS[name](self.parameters)
+        if not all(np.isfinite(matrix).all() for matrix in (named.A, named.B, named.K)):
+            raise ValueError("parameters: these give matrices with infinite entries")
+
+    def _check_explicit(self) -> None:
+        if self.parameters:
+            raise ValueError("parameters: only a named model has parameters")
+        if self.A is None or self.B is None or self.gain is None:
+            missing = [k for k in ("A", "B", "gain") if getattr(self, k) is None]
+            raise ValueError(
+                f"{missing[0]}: give a model by name, or by the matrices A, B and gain, or by a "
+                f"file of them (missing: {', '.join(missing)})"
+            )
+        n = len(self.A)
+        require_shape(self.A, "A", (n, n), "the system matrix is square")
+        height, width = shape(self.B, "B")
+        m = height if width == n != height else width  # it may be transposed
+        require_shape(self.B, "B", (n, m), "one row per state")
+
+    @property
+    def dimensions(self) -> tuple[int, int]:
+        """Number of states n and of inputs m."""
+        if self.name is not None:
+            n, m = NAMED_MODELS[self.name](self.parameters).B.shape
+            return n, m
+        return (len(self.B), len(self.B[0])) if self.B else (0, 0)
+
+    @property
+    def matrices(self) -> tuple[Matrix, Matrix]:
+        """Â, (n, n), and B̂, (n, m)."""
+        if self.name is not None:
+            named = NAMED_MODELS[self.name](self.parameters)
+            return named.A, named.B
+        return np.array(self.A), np.array(self.B)
+
+
+def require_read(file: str | None, names: Mapping[Any, str] | None) -> None:
+    """Raise ValueError if a section still names a file: loading a scenario replaces the name."""
+    if file is not None:
+        raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
+    if names is not None:
+        raise ValueError("names: they are of arrays in a file; give file, too")
+
+
+def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
+    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does."""
+    loops = (_closed_loop(A, B, K), _closed_loop(A, B, -K))
+    growth_per_s, opposite_per_s = (
+        spectral_abscissa(loop) if np.isfinite(loop).all() else np.inf for loop in loops
+    )
+    if growth_per_s < 0:
+        return None
+    remedy = (
+        "u = -K x does: give -K (python-control and Matlab return the K of u = -K x)"
+        if opposite_per_s < 0
+        else "give a gain for which all eigenvalues of A + BK have negative real parts"
+    )
+    return (
+        "u = K x does not stabilise the model: A + BK has an eigenvalue with real part "
+        f"{growth_per_s:.3g} /s; {remedy}"
+    )
+
+
+def _closed_loop(A: Matrix, B: Matrix, K: Matrix) -> Matrix:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(A + B @ K)
+
+
+class MeasurementSection(ScenarioSection):
+    """The measurement of the plant: y = C x + v."""
+
+    C: Rows | None = None
+    """C by rows, p x n; by default the identity: every state is measured."""
+    noise_std: Row | None = None
+    """Standard deviation of the normally distributed part of v, p entries; by default 0."""
+    noise_bound: Row | None = None
+    """Bound of the uniformly distributed part of v, p entries; by default 0."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_squares(self.noise_std or (), "noise_std", "standard deviations")
+        require_squares(self.noise_bound or (), "noise_bound", "bounds")
+        return self
+
+    def outputs(self, n: int) -> int:
+        """Number of measured outputs p of a plant of n states."""
+        return n if self.C is None else len(self.C)
+
+    def selects_all(self, n: int) -> bool:
+        """Whether C is the identity."""
+        return self.C is None or (
+            np.shape(self.C) == (n, n) and bool((np.array(self.C) == np.eye(n)).all())
+        )
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether there is any noise."""
+        return any(self.noise_std or ()) or any(self.noise_bound or ())
+
+    def variance(self, n: int) -> Vector:
+        """Variance of v, shape (p,)."""
+        variance = np.zeros(self.outputs(n))
+        if self.noise_std is not None:
+            variance = variance + np.square(self.noise_std)
+        return variance if self.noise_bound is None else variance + np.square(self.noise_bound) / 3
+
+    def check(self, n: int, why: str) -> None:
+        """Raise ValueError, with the key, unless the shapes fit a model of n states."""
+        place, p = "plant.measurement", self.outputs(n)
+        require_shape(self.C, f"{place}.C", (p, n), f"{why}; one row per output")
+        for key in ("noise_std", "noise_bound"):
+            require_length(getattr(self, key), f"{place}.{key}", p, "one per measured output")
+
+
+class WatchdogSection(ScenarioSection):
+    """The input of the plant when no actuation has arrived for too long."""
+
+    timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
+    """The newest actuation is too old when its model state is older than this, in simulated time;
+    by default 50 periods of the controller. If actuations cross the network, zero and model act by
+    default as soon as an actuation is missing: after the time for which its inputs last, plus the
+    longest delay."""
+    policy: Literal["hold", "zero", "model"] = "hold"
+    """hold: the plant keeps the last input of the newest actuation; zero: the input is 0; model:
+    the input of the controller's model, propagated from the newest actuation, which then carries
+    x_c."""
+
+
+class PlantSection(ScenarioSection):
+    """The true plant, unknown to sensor and controller, and how it is drawn."""
+
+    system: AnyPlant = LinearSettings.model_construct()
+    """The kind of plant: a table with ``kind``; by default a linear system."""
+    draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
+    """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
+    one end of its half-width; given: the matrices A and B below."""
+    uncertainty_A: Rows | None = None
+    """Half-widths of the uncertainty box around Â, n x n."""
+    uncertainty_B: Rows | None = None
+    """Half-widths of the uncertainty box around B̂, n x m."""
+    A: Rows | None = None
+    """The true A, n x n, for draw = "given"."""
+    B: Rows | None = None
+    """The true B, n x m, for draw = "given"."""
+    file: str | None = None
+    """An .npz or .mat file with the true A and B, as for model.file."""
+    names: dict[Literal["A", "B"], str] | None = None
+    """Names of the arrays in the file, if they differ from A and B."""
+    initial_state: Row
+    """x(0), n entries."""
+    initial_state_halfwidth: Row | None = None
+    """x(0) is drawn uniformly within these distances of initial_state; n entries."""
+    rate_hz: RateHz = 500.0
+    """Steps per second of simulated time."""
+    measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """Number of plant steps per measurement."""
+    measurement: MeasurementSection = MeasurementSection.model_construct()
+    disturbances: tuple[AnyDisturbance, ...] = ()
+    """Disturbances of the plant; they add up."""
+    watchdog: WatchdogSection = WatchdogSection.model_construct()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_whole_period(self.rate_hz, "rate_hz")
+        require_read(self.file, self.names)
+        for key in ("A", "B"):
+            matrix = getattr(self, key)
+            if self.draw == "given" and matrix is None:
+                raise ValueError(f'{key}: draw = "given" needs both matrices A and B')
+            if self.draw != "given" and matrix is not None:
+                raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
+        if self.draw != "nominal" and not isinstance(self.system, LinearSettings):
+            raise ValueError(
+                f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is'
+            )
+        box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
+        if self.draw in ("uniform", "vertex") and not box:
+            raise ValueError(
+                f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
+            )
+        for key in ("uncertainty_A", "uncertainty_B"):
+            for row in getattr(self, key) or ():
+                require_non_negative(row, key)
+        require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
+        return self
+
+    def noise_variances(self, n: int, m: int) -> NoiseVariances:
+        """Variances of the random disturbances and of the measurement noise."""
+
+        def at(place: Place, size: int) -> Vector:
+            variances = [one.variance for one in self.disturbances if one.at == place]
+            return np.asarray(np.sum([np.zeros(size), *variances], axis=0))
+
+        return NoiseVariances(at("state", n), at("input", m), self.measurement.variance(n))
+
+
+class DirectionSection(ScenarioSection):
+    """A direction of the network: what happens to its packets, and the guarantee."""
+
+    loss: Loss = NoLoss.model_construct()
+    """Loss of packets, before the guarantee is applied."""
+    mansd: Mansd | None = None
+    """Largest number of consecutive lost packets; unlimited if not given."""
+    constraints: Constraints = ()
+    """Further constraints on the losses, e.g. at most 3 in any 10; with mansd they are the
+    guarantee."""
+    impairments: tuple[AnyImpairment, ...] = ()
+    """Further impairments, applied in this order, after the loss."""
+    limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
+    """Largest number of delayed packets at a time; further packets are dropped."""
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> Self:
+        require_consistent(self.mansd, self.constraints)
+        require_scores(self.impairments, self.loss)
+        return self
+
+    @property
+    def link(self) -> LinkSettings:
+        """The link of this direction."""
+        return LinkSettings(
+            impairments=(LossOf(loss=self.loss), *self.impairments),
+            mansd=self.mansd,
+            constraints=self.constraints,
+            limit=self.limit,
+        )
+
+
+class AcknowledgementSection(DirectionSection):
+    """The direction from controller to sensor, for the acknowledgement baseline."""
+
+    timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
+    """After a transmission, the sensor waits for the acknowledgement for this time before it may
+    transmit again. By default five measurement periods, plus the longest delay in both
+    directions."""
+
+
+class ActuationSection(DirectionSection):
+    """The direction from controller to plant, if actuations cross the network too."""
+
+
+class NetworkSection(DirectionSection):
+    """The lossy network between sensor and controller."""
+
+    mansd: Mansd
+    """M − 1, the maximum allowable number of successive dropouts; for the paper's M = 5 it is 4."""
+    loss: Loss
+    """Loss of updates, before the guarantee is applied."""
+    enforce_mansd: bool = True
+    """false: the network ignores mansd and the constraints, to show the effect of a violated
+    assumption."""
+    initial_sync: Literal["first_packet", "known_state"] = "first_packet"
+    """How the paper's assumption of a delivered t_0 is met. first_packet: the network passes the
+    first packet of a flow. known_state: sensor and controller start from x(0)."""
+    protocol: Literal["none", "ack"] = "none"
+    """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
+    controller acknowledges each update, and x_s is reset only by an acknowledgement."""
+    encrypted: bool = False
+    """Live, the processes encrypt the vectors of their datagrams (ChaCha20-Poly1305)."""
+    acknowledgements: AcknowledgementSection | None = None
+    """The direction from controller to sensor, for protocol = "ack"; by default without loss.
+    It has no effect if protocol = "none"."""
+    actuation: ActuationSection | None = None
+    """The direction from controller to plant; by default the controller sends its actuations to
+    the plant directly, without loss or delay."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.acknowledgements is not None and "protocol" not in self.model_fields_set:
+            raise ValueError(
+                'acknowledgements: there are none unless protocol = "ack"; '
+                'say protocol = "none" to go without'
+            )
+        if self.actuation is not None and self.protocol == "ack":
+            raise ValueError('actuation: not with protocol = "ack"')
+        return self
+
+    @property
+    def flows(self) -> tuple[Flow, ...]:
+        """What crosses the network; the place of a flow here is the number of its direction."""
+        if self.protocol == "ack":
+            return Flow.UPDATE, Flow.ACKNOWLEDGEMENT
+        return (Flow.UPDATE,) if self.actuation is None else (Flow.UPDATE, Flow.ACTUATION)
+
+    def link_of(self, flow: Flow) -> LinkSettings:
+        """The link of a flow that crosses the network."""
+        if flow is Flow.UPDATE:
+            return self.link
+        return (self.actuation or self.reverse).link
+
+    @property
+    def longest_burst(self) -> int:
+        """Maximum number of consecutive losses that mansd and the constraints allow together."""
+        longest = self.guarantee.longest_burst
+        assert longest is not None  # at most mansd
+        return longest
+
+    @property
+    def directions(self) -> Mapping[str, DirectionSection]:
+        """The tables of the directions that are given, by their keys in the scenario."""
+        given = {"": self, ".acknowledgements": self.acknowledgements, ".actuation": self.actuation}
+        return {f"network{key}": one for key, one in given.items() if one is not None}
+
+    @property
+    def reverse(self) -> AcknowledgementSection:
+        """The direction of the acknowledgements, as given or by default."""
+        return self.acknowledgements or AcknowledgementSection()
+
+    @property
+    def link(self) -> LinkSettings:
+        """The link from sensor to controller."""
+        update: dict[str, Any] = {"first_delivered": self.initial_sync == "first_packet"}
+        if not self.enforce_mansd:
+            update |= {"mansd": None, "constraints": ()}
+        return super().link.model_copy(update=update)
+
+    @property
+    def guarantee(self) -> LossGuarantee:
+        """What mansd and the constraints say, also if the network does not enforce it."""
+        return join_guarantee(self.mansd, self.constraints)

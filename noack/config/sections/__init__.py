@@ -1,1 +1,0 @@
-"""The sections of a scenario file, one part of the system each."""

@@ -1,0 +1,258 @@
+"""Files that a scenario names; relative names are relative to the scenario file.
+
+The content of data files is read into the scenario. Files that a run executes (an FMU, a Python
+source file) are not: a loaded scenario holds their absolute paths and their SHA-256, and a run
+refuses a file with another SHA-256.
+
+A user's class is in a Python source file or in an installed package. Its code runs in the process
+that needs it. Plants, triggers and controllers share this module.
+"""
+
+import hashlib
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, ClassVar, NoReturn, Self, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
+
+from noack.core.errors import CallerError, NoackError, one_line
+from noack.core.file_access import read_regular
+from noack.core.linear_systems import Vector
+from noack.settings.section import Row, Rows, ScenarioSection
+
+MOST_BYTES = 64 * 2**20
+"""Largest size of a file that is read completely."""
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+Settings = TypeVar("Settings", bound="FileSettings")
+Table = TypeVar("Table", bound=BaseModel)
+
+PLACES = ("plant.system", "trigger", "controller")
+"""The tables of a scenario that may name such a file."""
+
+
+class NamedFile:
+    """A file, and the setting that names it; relative names are relative to ``folder``.
+
+    Messages begin with ``place``, the table with the key ``file``, e.g. ``run.toml: network.loss``.
+    """
+
+    def __init__(self, name: str, folder: Path, place: str = "") -> None:
+        self.path = folder / name
+        self.named = f'{place}.file = "{name}"' if place else name
+
+    def wrong(self, message: str) -> NoReturn:
+        """Refuse the file's content by a CallerError."""
+        raise CallerError(f"{self.named}: {message}")
+
+    def content(self) -> bytes:
+        """Return the file's bytes; raise CallerError if it cannot be read."""
+        try:
+            return read_regular(self.path, MOST_BYTES)
+        except (OSError, ValueError) as error:
+            self._unreadable(error)
+
+    def lines(self) -> Iterator[tuple[int, str]]:
+        """Yield the lines that are neither empty nor comments (#), with their numbers from 1."""
+        text = self.content().decode("utf-8", errors="replace")
+        for number, line in enumerate(text.splitlines(), 1):
+            if line.strip() and not line.startswith("#"):
+                yield number, line.strip()
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file in hexadecimal; raise CallerError if it cannot be read."""
+        try:
+            if self.path.exists() and not self.path.is_file():
+                self.wrong("cannot be read: not a regular file")
+            with self.path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except (OSError, ValueError) as error:
+            self._unreadable(error)
+
+    def _unreadable(self, error: OSError | ValueError) -> NoReturn:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise CallerError(f"{self.named}: cannot be read: {reason}") from None
+
+
+class FileSettings(ScenarioSection):
+    """Settings that may name a file that a run executes."""
+
+    file: str | None = None
+    """The file; a relative name is relative to the scenario file."""
+    sha256: Sha256 | None = None
+    """The file's SHA-256; filled in when the scenario is loaded."""
+
+
+def file_tables(scenario: BaseModel) -> Iterator[tuple[str, FileSettings]]:
+    """Return the tables of a scenario that name a file, each with its place."""
+    for place in PLACES:
+        table: Any = scenario
+        for part in place.split("."):
+            table = getattr(table, part)
+        if isinstance(table, FileSettings) and table.file is not None:
+            yield place, table
+
+
+def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
+    """Return a scenario or section with other tables at the given places."""
+    update: dict[str, BaseModel] = {}
+    for place, table in tables.items():
+        part, _, rest = place.partition(".")
+        inner: BaseModel = update.get(part, getattr(section, part))
+        update[part] = with_tables(inner, {rest: table}) if rest else table
+    return section.model_copy(update=update)
+
+
+def located(settings: Settings, folder: Path, place: str) -> Settings:
+    """Return settings with the absolute path of their file (relative to a folder), and its SHA-256.
+
+    If a SHA-256 is already given, it is used and the file is not read: so the record of a run can
+    be read without the file. Settings that name no file are returned unchanged. Raise CallerError
+    if the file cannot be read; ``place`` names the table.
+    """
+    if settings.file is None:
+        return settings
+    file = NamedFile(settings.file, folder, place)
+    sha256 = settings.sha256 or file.sha256()
+    return settings.model_copy(update={"file": str(file.path.absolute()), "sha256": sha256})
+
+
+def unchanged(settings: FileSettings, place: str) -> Path:
+    """Return the path of a loaded setting's file; raise CallerError if missing or changed."""
+    file = NamedFile(settings.file or "", Path(), place)
+    if (found := file.sha256()) != settings.sha256:
+        file.wrong(
+            f"has changed: its SHA-256 is {found[:16]}..., "
+            f"that of the run is {(settings.sha256 or 'not given')[:16]}..."
+        )
+    return file.path
+
+
+_PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
+_ROOT = Path(__file__).parents[2]
+
+
+class ClassSettings(FileSettings):
+    """Settings that name a user's class."""
+
+    group: ClassVar[str]
+    """The group of entry points in which packages name such classes."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z_][\w.:-]*$")]
+    """The class: package.module:Class or an entry point of the group noack.plants, noack.triggers
+    or noack.controllers; or, with file, the class in it."""
+    file: str | None = None
+    """A Python source file with the class; a relative name is relative to the scenario file."""
+    parameters: dict[str, bool | int | FiniteFloat | str | Row | Rows] = Field({})
+    """Passed to the class as keyword arguments, arrays as lists."""
+
+    @model_validator(mode="after")
+    def _check_file(self) -> Self:
+        if self.file is None and self.sha256 is not None:
+            raise ValueError("sha256: it is of a file; give file, too")
+        return self
+
+
+def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
+    """Return an instance of the class that loaded settings name, and a description of the class.
+
+    Raises:
+        CallerError: the file has changed, or is missing; ``place`` names the table.
+        Exception: anything that the user's code raises; :func:`user_code` describes it.
+    """
+    made, description = _class(settings, place)
+    parameters = {key: _as_list(value) for key, value in settings.parameters.items()}
+    return made(**parameters), description
+
+
+@contextmanager
+def user_code(settings: ClassSettings, place: str, failure: type[NoackError]) -> Iterator[None]:
+    """Turn an error of the user's code in this context into a failure; failures pass."""
+    try:
+        yield
+    except failure:
+        raise
+    except (Exception, SystemExit) as error:
+        raise failure(_failure_text(settings, place, error)) from None
+
+
+def _failure_text(settings: ClassSettings, place: str, error: BaseException) -> str:
+    """Return one line about an error in the user's code: the class, the error, the source line."""
+    frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f'{place}.name = "{settings.name}": {type(error).__name__}: {one_line(error)}{where}'
+
+
+def read_only(values: Vector) -> Vector:
+    """Return a copy that the user's code cannot write to."""
+    copy = values.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+def real_vector(what: str, value: Any, size: int) -> Vector:
+    """Return a copy of a return value of the user's code, shape (size,).
+
+    Raises:
+        TypeError: its entries are not real numbers.
+        ValueError: it has another shape.
+    """
+    given = np.array(value)
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{what} is not of real numbers")
+    found = given.astype(np.float64)
+    if found.shape != (size,):
+        raise ValueError(f"{what} has shape {found.shape}, expected ({size},)")
+    return found
+
+
+def _class(settings: ClassSettings, place: str) -> tuple[Any, str]:
+    if settings.file is not None:
+        path = unchanged(settings, place)
+        return _attribute(_executed(path), settings.name), f"class {settings.name} of {path.name}"
+    module, colon, name = settings.name.partition(":")
+    if colon:
+        return _attribute(import_module(module), name), f"class {settings.name}"
+    from importlib import metadata  # slow to import
+
+    known = metadata.entry_points(group=settings.group)
+    if settings.name not in known.names:
+        there = ", ".join(sorted(known.names)) or "none"
+        raise LookupError(
+            f"no installed package has an entry point of this name in the group {settings.group} "
+            f"(there are: {there}); write package.module:Class, or name a file, too"
+        )
+    entry = known[settings.name]
+    version = f", {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+    return entry.load(), f"class {entry.value}{version}"
+
+
+def _attribute(module: ModuleType, name: str) -> Any:
+    if not hasattr(module, name):
+        raise LookupError(f"{Path(module.__file__ or module.__name__).name} has no {name}")
+    return getattr(module, name)
+
+
+def _executed(path: Path) -> ModuleType:
+    """Execute a source file as a module; it cannot import other files of its folder."""
+    module = ModuleType(f"noack_user_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses needs this entry
+    exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
+    return module
+
+
+def _is_ours(frame: traceback.FrameSummary) -> bool:
+    file = Path(frame.filename)
+    return "importlib" in frame.filename or any(
+        file.is_relative_to(_ROOT / package) for package in _PACKAGES
+    )
+
+
+def _as_list(value: Any) -> Any:
+    return [_as_list(one) for one in value] if isinstance(value, tuple) else value

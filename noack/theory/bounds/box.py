@@ -1,0 +1,188 @@
+"""Robust certificates: bounds that hold for every plant of an uncertainty box around the model.
+
+Let A = Â + Ã and B = B̂ + B̃, with each entry of |Ã| and |B̃| at most the box's half-width. With
+u = K x + p, the plant is the model with the model error w = Ã x + B̃ u as an additional input:
+
+    x' = (Â + B̂K) x + B̂ p + w
+
+Each |w_i| is bounded by the half-widths and the suprema of the coordinates. Each coordinate is
+bounded by the peak gains (∫ of impulse responses) of the model's closed loop. The result is a
+linear inequality between non-negative numbers. If the spectral radius of its matrix is below 1, its
+solution holds for all plants of the box, including time-varying ones.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from noack.core.cached_method import cached_method
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.contraction import logarithmic_norm
+from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
+from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
+
+
+@dataclass(frozen=True)
+class BoxGains(PlantGains):
+    """Gains that hold for all plants of a box around A and B; half-widths (n, n) and (n, m)."""
+
+    halfwidth_A: Matrix
+    halfwidth_B: Matrix
+
+    is_one_plant: ClassVar = False
+    of_start: ClassVar = {
+        "states",
+        "results of BoxGains.start_up",
+        "_from_start",
+        "_free_model_error",
+    }
+
+    @cached_property
+    def states(self) -> Mapping[str, Coefficients]:
+        """sup‖C x‖ from x(0), disturbances and input error; w is added to ``MISMATCH``.
+
+        Raises:
+            NotDecayingError: the model decays too slowly, or the box is too large.
+        """
+        free, gain = self._free_model_error, self._forced_model_error
+        states = {
+            output: Coefficients(
+                self._from_start[output] + float(peaks.from_w @ free),
+                peaks.forced + float(peaks.from_w @ gain),
+            )
+            for output, peaks in self._peaks.items()
+        }
+        nominal = states[Output.MISMATCH]
+        # sup‖(R_E x, S w)‖ ≤ sup‖R_E x‖ + sup‖S w‖
+        states[Output.MISMATCH] = Coefficients(
+            nominal.free + float(np.linalg.norm(self._scales * free)),
+            nominal.gain + float(np.linalg.norm(self._scales * gain)),
+        )
+        return states
+
+    @cached_method
+    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
+        """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
+
+        With zero input w = Ã x, which the bound of w covers.
+        """
+        if start_s == 0:
+            return 0.0, dict.fromkeys(self.outputs, 0.0)
+        R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
+        # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
+        mu = max(logarithmic_norm(self.A) + box, 0.0) + self.alpha_per_s
+        pushes = self._forcing.limited
+        size = float(np.linalg.norm(self.start, 2) + start_s * np.linalg.norm(pushes, axis=0).sum())
+        size *= math.exp(mu * start_s)
+        rate = float(np.linalg.norm(R @ self.A, 2)) + float(np.linalg.norm(R, 2)) * box
+        first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
+        error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
+        impulse = error * start_s
+        w = self._bound_of_w(impulse * np.array([peaks.impulse for peaks in self._coordinates]))
+        states = {
+            output: impulse * peaks.impulse + float(peaks.from_w @ w)
+            for output, peaks in self._peaks.items()
+        }
+        states[Output.MISMATCH] += float(np.linalg.norm(self._scales * w))
+        return error, states
+
+    @property
+    def columns(self) -> Columns:
+        """The columns through which e_s is driven; the model error is added to the mismatch."""
+        nominal, R = self.split_mismatch
+        # If H is the closed loop of the box's centre, there is no nominal mismatch.
+        differs = R.any() or not self._rows
+        pushed = self._directions / self._scales
+        forced = np.concatenate([nominal, pushed], axis=1) if differs else pushed
+        return super().columns._replace(mismatch=forced)
+
+    @cached_property
+    def _rows(self) -> list[int]:
+        """Rows of A and B that are uncertain."""
+        uncertain = np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1).any(axis=1)
+        return [int(i) for i in np.flatnonzero(uncertain)]
+
+    @cached_property
+    def _directions(self) -> Matrix:
+        """The unit vectors of the entries of w that are not 0."""
+        return np.eye(len(self.A))[:, self._rows]
+
+    @cached_property
+    def _scales(self) -> Vector:
+        """S: ‖·‖_W of these unit vectors, by which w is scaled where it drives e_s."""
+        return np.asarray(np.linalg.norm(self.error.weight @ self._directions, axis=0))
+
+    @cached_property
+    def _from_start(self) -> Mapping[str, float]:
+        """sup‖C x‖ from x(0) and the disturbances, of every output and every coordinate."""
+        started = response(self.closed_loop, self.start).through_each(self._stacked_signals)
+        return {name: started[name].sup() + self.disturbed(C) for name, C in self._signals.items()}
+
+    @cached_property
+    def _signals(self) -> Mapping[str, Matrix]:
+        """The outputs, and the coordinates of x and of K x."""
+        rows = np.concatenate([np.eye(len(self.A)), self.error.K])
+        names = (f"coordinate {place}" for place in range(len(rows)))
+        return {**self.outputs, **dict(zip(names, rows[:, None], strict=True))}
+
+    @cached_property
+    def _stacked_signals(self) -> Outputs[str]:
+        return Outputs(self._signals)
+
+    @cached_property
+    def _pushed(self) -> list[ResponseBounds]:
+        """Responses of the model's closed loop to each w_i."""
+        return [response(self.closed_loop, column[:, None]) for column in self._directions.T]
+
+    def _peaks_at(self, C: Matrix) -> "_PeakGains":
+        forced, from_w = self._forced.through(C), [w.through(C).integral() for w in self._pushed]
+        return _PeakGains(forced.integral(), forced.sup(), np.array(from_w))
+
+    @cached_property
+    def _peaks(self) -> Mapping[str, "_PeakGains"]:
+        return {output: self._peaks_at(C) for output, C in self.outputs.items()}
+
+    @cached_property
+    def _coordinates(self) -> list["_PeakGains"]:
+        """Peak gains of each coordinate of x and of K x."""
+        return [self._peaks_at(C) for name, C in self._signals.items() if name not in self.outputs]
+
+    @cached_property
+    def _halfwidths(self) -> Matrix:
+        """Half-widths Δ with |w| ≤ Δ |(x, u)|."""
+        return np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1)[self._rows]
+
+    def _bound_of_w(self, coordinates: Vector) -> Vector:
+        """Return sup|w| from bounds of |(x, K x)| that were computed without w."""
+        from_w = np.array([peaks.from_w for peaks in self._coordinates])
+        loop = self._halfwidths @ from_w
+        if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
+            raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+        solved: Vector = np.linalg.solve(np.eye(len(loop)) - loop, self._halfwidths @ coordinates)
+        return solved
+
+    @cached_property
+    def _free_model_error(self) -> Vector:
+        """sup|w_i| without an input error; with one, sup‖p‖ times the forced error is added."""
+        from_start = self._from_start.items()
+        start = np.array([bound for name, bound in from_start if name not in self.outputs])
+        start[len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
+        return self._bound_of_w(start)
+
+    @cached_property
+    def _forced_model_error(self) -> Vector:
+        forced = np.array([peaks.forced for peaks in self._coordinates])
+        forced[len(self.A) :] += np.linalg.norm(self.error.split_K[0], axis=1)  # u = K x + p
+        return self._bound_of_w(forced)
+
+
+class _PeakGains(NamedTuple):
+    """sup‖C x‖ ≤ forced · sup‖p‖ + impulse · ∫‖p‖ + from_w · |w| + what x(0) gives."""
+
+    forced: float
+    impulse: float
+    from_w: Vector

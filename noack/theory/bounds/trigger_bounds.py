@@ -1,0 +1,324 @@
+"""What a certificate uses of a trigger rule: bounds of e_s after tests, its growth, event times.
+
+Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
+
+* a comparison promises ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.error_promise`);
+* one of the integral, ∫‖e_s‖_W ≤ δ, promises ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
+* until a dwell time has passed, and up to a deadline, e_s has grown from 0.
+
+:class:`TriggerBounds` states these bounds. :class:`ErrorGrowth` is how e_s grows from them until
+the next test, and :func:`first_passage_s` how long it takes from an event until it can reach a
+level.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix
+from noack.core.number_format import number
+from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
+from noack.trigger.error_promise import ErrorPromise, error_promise
+from noack.trigger.trigger_rule import TriggerRule
+
+_AVERAGED = 2.0 ** np.arange(-6, 5)
+"""Times over which an integral is averaged, in time constants of the model."""
+_NONE = (
+    "where the rule does not transmit, e_s may still have any size; "
+    'combine it with policy = "deadline"'
+)
+_ACCUMULATE = (
+    "events may accumulate, since no threshold keeps them apart; "
+    'test the rule at sampling times, or combine it with policy = "dwell"'
+)
+COARSE_CELLS = 64
+_FINE_CELLS = 256
+_SHORTEST_S, LONGEST_S = 1e-9, 1e6
+_PICARD_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class TriggerBounds:
+    """The bounds of a rule in the norm ‖W e_s‖; W is ``weight``, (n, n)."""
+
+    rule: TriggerRule
+    weight: Matrix
+    fastest_per_s: float
+    """Rate of the model's fastest mode."""
+
+    @cached_property
+    def promise(self) -> ErrorPromise | None:
+        """What the comparison promises; None if nothing."""
+        return error_promise(self.rule, self.weight)
+
+    @property
+    def beta(self) -> float:
+        """β of a threshold βe^{−αt}; 0 without one."""
+        return 0.0 if self.promise is None else self.promise.size * self.rule.level
+
+    @property
+    def alpha_per_s(self) -> float:
+        """α."""
+        return self.rule.fading_per_s if self.beta else 0.0
+
+    @property
+    def floor(self) -> float:
+        """ε: the constant, or the floor, of the threshold; 0 without one."""
+        if self.promise is None or self.rule.integrates:
+            return 0.0
+        return self.promise.size * self.rule.floor
+
+    @property
+    def area(self) -> float:
+        """δ of ∫‖e_s‖_W ≤ δ; 0 if the rule does not integrate."""
+        if self.promise is None or not self.rule.integrates:
+            return 0.0
+        return self.promise.size * self.rule.floor
+
+    @property
+    def is_homogeneous(self) -> bool:
+        """Whether all bounds of e_s are multiples of bounds of x: a certificate may decay."""
+        return not (self.beta or self.floor or self.area)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the threshold has a constant, and no part that decays."""
+        return not self.beta and not self.is_homogeneous
+
+    @property
+    def outputs(self) -> Mapping[str, Matrix]:
+        """S of each share sup‖S x‖ of the threshold, by name."""
+        shares = () if self.promise is None else self.promise.shares
+        return {f"share {number}": S for number, S in enumerate(shares)}
+
+    @property
+    def has_due_time(self) -> bool:
+        """Whether events are at most some time apart."""
+        return math.isfinite(self.rule.longest_ns)
+
+    def tested(self, conditions: NetworkConditions) -> NetworkConditions:
+        """Return the conditions with the times of the rule's comparisons.
+
+        Raises:
+            NoCertificateError: comparisons may be missed.
+        """
+        if not self.rule.grid_ns:
+            return conditions
+        grid_s, step_s = self.rule.grid_ns / NS_PER_S, conditions.spacing_s
+        if conditions.sampling_s != step_s:
+            raise NoCertificateError(
+                "the rule compares on a grid, and measurements there may be missing"
+            )
+        grid_s = spacing_s = _rounded_up(grid_s, step_s)
+        due_ns = self.rule.longest_ns
+        if self.has_due_time and due_ns % self.rule.grid_ns:  # due between two points of the grid
+            spacing_s = step_s or math.gcd(round(self.rule.grid_ns), round(due_ns)) / NS_PER_S
+        return conditions._replace(sampling_s=grid_s, spacing_s=spacing_s)
+
+    def bound(
+        self, conditions: NetworkConditions, level: float, reached: float | None
+    ) -> TriggerBound:
+        """Return all bounds; their unit is the level, or 1 without one.
+
+        Args:
+            conditions: as :meth:`tested` returns them.
+            level: the largest threshold, scaled.
+            reached: the smallest threshold; None if it may be arbitrarily small.
+
+        Raises:
+            NoCertificateError: nothing bounds e_s, or nothing separates events.
+        """
+        due_s, apart_s = self._between_events(conditions)
+        h_s = conditions.sampling_s
+        idle_s = self._after(self.rule.idle_ns, conditions)
+        untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
+        bounds: list[TriggerBound] = []
+        if self.promise is not None:
+            if reached is not None:
+                reached = reached * self.promise.least / self.promise.size or None
+            shares = dict.fromkeys(self.outputs, 1.0)
+            for ago_s, beta, least in self._levels(conditions, level, reached):
+                bounds.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
+        if math.isfinite(due_s):
+            bounds.append(TriggerBound(0.0, None, {}, due_s - h_s, is_tested=False))
+        if not bounds:
+            raise NoCertificateError(_NONE)
+        is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
+        grows_first = level > 0 and self.promise is not None and self.promise.least > 0
+        if not is_separated and not grows_first:
+            raise NoCertificateError(_ACCUMULATE)
+        if self.is_homogeneous:
+            apart_s = max(apart_s, conditions.spacing_s)
+        return bounds[0]._replace(
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(bounds[1:])
+        )
+
+    def divided(
+        self, conditions: NetworkConditions, apart_s: float
+    ) -> list[tuple[TriggerBound, TriggerBound]]:
+        """Return each bound without its constant, and with it, both in units of 1.
+
+        Parts of the signals may be added only if they use the same bound. ``apart_s`` is a known
+        lower bound of the inter-event time.
+
+        Raises: as :meth:`bound`.
+        """
+        whole = self.bound(conditions, self.floor, self.floor or None)
+        alone = [
+            bound._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
+            for bound in whole.every
+        ]
+        return [(bound._replace(beta=0.0), bound) for bound in alone]
+
+    def text(self) -> str:
+        """Return in words what the rule promises about e_s."""
+        promises = []
+        if (promise := self.promise) is not None:
+            shares = " + ".join(
+                f"{number(float(np.linalg.norm(S @ np.linalg.inv(self.weight), 2)))} ‖x‖"
+                for S in promise.shares
+            )
+            level = "" if self.is_homogeneous else "the threshold"
+            bounded = "∫‖e_s‖ dt" if self.rule.integrates else "‖e_s‖"
+            total = " + ".join(filter(None, [level, shares]))
+            promises.append(f"after each test {bounded} ≤ {total or '0'}")
+        if self.has_due_time:
+            longest_s = self.rule.longest_ns / NS_PER_S
+            promises.append(f"the next event at the latest {longest_s:g} s after the last one")
+        return "; ".join(promises)
+
+    def _levels(
+        self, conditions: NetworkConditions, level: float, reached: float | None
+    ) -> list[tuple[float, float, float | None]]:
+        """Return (T, β, least ‖e_s‖_W at an event): ‖e_s‖_W ≤ β at some time of the last T."""
+        if not self.area:
+            return [(0.0, level, reached)]
+        assert self.promise is not None
+        least = self.promise.least * self.rule.floor
+        test_s, longest_s = conditions.spacing_s, conditions.sampling_s
+        times_s = _AVERAGED / self.fastest_per_s
+        if test_s:  # the trapezoidal sum of the last k tests
+            tests = sorted({math.ceil(t_s / test_s) for t_s in times_s})
+            return [
+                (k * longest_s, self.area / (k * test_s), least / (k * longest_s)) for k in tests
+            ]
+        return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
+
+    def _between_events(self, conditions: NetworkConditions) -> tuple[float, float]:
+        """Return the longest and the shortest time between two events, whatever e_s does."""
+        rule = self.rule
+        due_s = self._after(rule.longest_ns, conditions)
+        earliest_ns = max(rule.idle_ns, 0.0)
+        if not len(rule.form.up):  # nothing is compared
+            earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
+        step_s = conditions.spacing_s
+        apart_s = _rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s)
+        return due_s, apart_s
+
+    def _after(self, time_ns: float, conditions: NetworkConditions) -> float:
+        """Return the longest time from an event to the first test a time after it."""
+        time_s, step_s = time_ns / NS_PER_S, conditions.spacing_s
+        if not math.isfinite(time_s):
+            return time_s
+        exact = conditions.sampling_s == step_s
+        return _rounded_up(time_s, step_s) if exact else time_s + conditions.sampling_s
+
+
+def _rounded_up(time_s: float, step_s: float) -> float:
+    return step_s * math.ceil(time_s / step_s - 1e-9) if step_s else time_s
+
+
+class ErrorGrowth:
+    """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
+
+    sup‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
+    """
+
+    def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
+        stretch, outputs = plant.error.stretch(longest_s), plant.outputs
+        self.fixed, self.input_error = stretch * after.beta, 0.0
+        # The trigger tests x_s − x̂, and may compare it with x̂.
+        self.estimation = stretch * (1 + sum(
+            share * float(np.linalg.norm(outputs[C] @ plant.error.inverse_weight, 2))
+            for C, share in after.shares.items()
+        ))  # fmt: skip
+        shares = {C: stretch * share for C, share in after.shares.items()}
+        if longest_s > 0:
+            growth = plant.growth(longest_s, COARSE_CELLS)
+            mismatch = growth.mismatch.integral_on_grid()
+            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
+            self.input_error = growth.input_error.integral_on_grid()
+            self.fixed += float(growth.forced.sum())
+        self.shares: Mapping[str, float] = shares
+
+
+def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
+    """Return the growth from the bound after a test, and from 0 after an event."""
+    growths = []
+    if bound.is_tested:
+        growths.append(ErrorGrowth(plant, sampling_s + bound.ago_s, bound))
+    if bound.untested_s > 0 or not bound.is_tested:
+        growths.append(ErrorGrowth(plant, sampling_s + bound.untested_s, TriggerBound(0.0, None)))
+    return growths
+
+
+def first_passage_s(
+    plant: PlantGains,
+    level: float,
+    mismatch: float,
+    input_error: float,
+    own: float,
+    start: float = 0.0,
+) -> float:
+    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
+
+    Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
+
+        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
+
+    and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
+    every iterate is a bound until the level is reached.
+
+    ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
+    ``input_error`` π', the input error without the effect of the present e_s.
+    """
+    if level <= start:
+        return 0.0
+    window_s = _first_window_s(plant, level, mismatch, input_error + own * level)
+    cells = COARSE_CELLS
+    known_s = 0.0
+    while True:
+        growth = plant.growth(window_s, cells)
+        areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error
+        fixed = np.cumsum(areas + growth.forced)
+        if start:
+            fixed += start * plant.error.stretch(window_s)
+        rho = np.full(cells, level)
+        for _ in range(_PICARD_ROUNDS):
+            echo = np.convolve(growth.input_error.area, rho)[:cells]
+            rho = np.minimum(level, fixed + own * echo)
+        crossed = np.flatnonzero(rho >= level)
+        if len(crossed):
+            known_s = max(known_s, float(growth.mismatch.edges_s[crossed[0]]))
+            if cells == _FINE_CELLS:
+                return known_s
+            window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE_CELLS
+        elif window_s >= LONGEST_S:
+            return window_s
+        else:  # not reached, also after a coarse grid's overestimate: extend the window
+            known_s, window_s = window_s, 2 * window_s
+
+
+def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_error: float) -> float:
+    """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
+    start = plant.growth(_SHORTEST_S, 1)
+    speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
+    speed += float(start.forced.sum()) / _SHORTEST_S
+    if not speed > 0:
+        return LONGEST_S
+    return min(max(2 * level / speed, _SHORTEST_S), LONGEST_S)

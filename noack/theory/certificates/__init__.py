@@ -1,0 +1,30 @@
+"""Certificates: what is guaranteed of a loop before it runs, under which conditions, and why.
+
+From (I1) to a certificate (docs/theory.md, "Certificates"; docs/derivations.md, "Closing the
+loop"):
+
+1. ``inequalities.py``. (I1) bounds ‖C e_c‖ by D_C β̃: the present e_s, and at most N missing
+   events, each with what e^{(H+αI)τ} has made of it. N is the longest burst of losses, and ⌈d/δ⌉ in
+   flight. The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
+   input is of age ≤ σ. All these inequalities are linear in non-negative numbers. If the loop gain
+   is below 1, their solution bounds the run at all times, by induction over time: Δ (of the size of
+   eq:Normec, but without Proposition 1), X (eq:normXt) and β̃.
+2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
+   threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
+   the largest δ that confirms itself is used. Under the paper's conditions the bounds are sharpened
+   by the flow between two deliveries, which ``delivery_flow.py`` computes: an ellipsoid that x
+   never leaves.
+3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, what
+   decays and what persists are two parts. All inequalities are linear in functions of time, so the
+   bounds of the parts are added.
+4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
+   and the largest sampling period, delay and age of inputs that are still certified.
+5. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest
+   event on, at which the sensor knows x (docs/theory.md, "From the newest event").
+
+What a certificate assumes: ``conditions.py`` derives h, d, σ and the losses from a scenario, and
+moves a set-point to 0; ``assumptions.py`` lists every assumption of the paper and of the
+certificate, with a verdict. A run that violates a condition voids the claims from that time on.
+
+``weight.py`` chooses W of the trigger's norm such that a certificate is tight.
+"""

@@ -1,0 +1,338 @@
+"""Assumptions of the paper and of a certificate, checked for one scenario before it runs.
+
+A claim holds only under its assumptions. Each assumption has a status, with the reason.
+Assumptions about the run itself (delays, the longest loss burst) are checked against its record.
+"""
+
+import math
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.config.resolution import LoopMatrices, SteadyState, loop_of, steady_state
+from noack.config.scenario import Scenario
+from noack.config.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.theory.bounds.disturbances import normal_bounds
+from noack.theory.bounds.terms import Constants, NetworkConditions
+from noack.theory.certificates.conditions import certified_delay_s
+
+_NOT_COVERED = "not covered by the theorems and the certificates"
+_NOT_BY_THEOREMS = "not covered by the theorems"
+
+
+class AssumptionStatus(StrEnum):
+    """The status of an assumption."""
+
+    HOLDS = "holds"
+    VIOLATED = "violated"
+    IDEALISED = "idealised"
+    """No sampled loop meets it; certificates allow for the difference."""
+    NOT_NEEDED = "not needed"
+    """It does not hold, or is not checked; no computed bound depends on it."""
+    ASSUMED = "assumed"
+    """It depends on the run and is checked in each run."""
+
+
+class Assumption(NamedTuple):
+    """One assumption and its status."""
+
+    what: str
+    source: str
+    """The place in the paper."""
+    verdict: AssumptionStatus
+    why: str
+
+
+def assumptions(resolved: Scenario) -> list[Assumption]:
+    """Return the paper's assumptions for a resolved scenario, with verdicts."""
+    loop, linear = loop_of(resolved), resolved.coverage.is_linear
+    checked = [_closed_loop(loop)] if linear else _not_linear(loop, resolved)
+    if not resolved.coverage.is_decaying:
+        why = f'the policy is "{resolved.trigger.policy}": not covered by the paper\'s theorems'
+        checked.append(_violated("the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", why))
+    elif linear:
+        checked.append(_decay_rate(loop, resolved.decaying.alpha_per_s))
+    if not resolved.controller.is_linear:
+        why = f'controller.kind = "{resolved.controller.kind}": {_NOT_COVERED}'
+        checked.append(_violated("the input is u = K x_c", "eq:ModCont", why))
+    if resolved.protocol.acknowledges:
+        what = "the sensor resets x_s at every event; nothing is acknowledged"
+        checked.append(
+            _violated(what, "Section II", f'protocol = "ack": {UNCERTIFIED_ACKNOWLEDGEMENTS}')
+        )
+    if linear:
+        checked.append(_unstable_and_distinct(loop.A))
+    checked += [_mansd(resolved), _continuous_time(resolved)]
+    if resolved.plant.disturbances:
+        kinds = ", ".join(
+            f"{disturbance.kind} at the {disturbance.at}"
+            for disturbance in resolved.plant.disturbances
+        )
+        checked.append(
+            _violated("the plant is not disturbed", "eq:plant", f"{kinds}: {_NOT_BY_THEOREMS}")
+        )
+    return checked + _estimated(loop, resolved)
+
+
+def _violated(what: str, source: str, why: str) -> Assumption:
+    return Assumption(what, source, AssumptionStatus.VIOLATED, why)
+
+
+def _checked(what: str, source: str, holds: bool, why: str) -> Assumption:
+    status = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
+    return Assumption(what, source, status, why)
+
+
+def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
+    nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
+    kind = f'it is of kind "{resolved.plant.system.kind}": {_NOT_COVERED}'
+    why = f"largest real part of an eigenvalue: {nominal:.3g} /s (Â + B̂K){_other_sign(loop)}"
+    return [
+        _violated("the plant is ẋ = Ax + Bu", "eq:plant", kind),
+        _checked("the gain stabilises the model", "Theorem 2", nominal < 0, why),
+    ]
+
+
+def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
+    """Return the assumptions that replace "the sensor measures x" with an observer or noise."""
+    if resolved.coverage.knows_state:
+        return []
+    estimation = steady_state(resolved)
+    rms = float(np.sqrt(np.trace(estimation.covariance)))
+    how = "with noise"
+    if resolved.observer is not None:
+        p = resolved.message_sizes.outputs
+        entries = "1 entry" if p == 1 else f"{p} entries"
+        how = f"by an observer ({resolved.observer.kind}), from y of {entries}"
+    why = f"x is known {how}: {_NOT_BY_THEOREMS}"
+    checked = [_violated("the sensor measures x", "Section II", why)]
+    decays = estimation.radius < 1
+    if resolved.observer is not None:
+        error = (
+            f"noise and random disturbances alone give ‖x̂ − x‖ = {rms:.3g} (RMS)"
+            if decays
+            else "‖x̂ − x‖ grows"
+        )
+        why = f"steady-state spectral radius {estimation.radius:.4g} per measurement; {error}"
+        if not np.isfinite(estimation.radius):
+            why = "no steady state found: model and covariances differ by too many magnitudes"
+        checked.append(_checked("the observer's error decays", "(I − LC)e^(ÂT)", decays, why))
+    least = resolved.trigger.least_threshold
+    if least is not None and (decays or resolved.observer is None):
+        checked.append(_above_noise(loop, least, estimation))
+    return checked
+
+
+def _above_noise(loop: LoopMatrices, least: float, estimation: SteadyState) -> Assumption:
+    """Return whether the trigger's smallest threshold is above the e_s from estimation errors.
+
+    This e_s is the difference between the estimation error now and at the last event. Its RMS is
+    √2 times that of the error if the two are uncorrelated; three times this value is rarely
+    exceeded. For an unstable plant the error from the last event grows until every threshold is
+    reached.
+    """
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    size = float(np.sqrt(2 * np.trace(weight @ estimation.covariance @ weight.T)))
+    return _checked(
+        "the threshold stays above the noise", "trigger", least >= 3 * size,
+        f"it falls to {least:.3g}; noise alone gives ‖e_s‖ = {size:.3g} (RMS): set "
+        f"trigger.floor ≥ {3 * size:.2g}; below that, noise alone triggers",
+    )  # fmt: skip
+
+
+def _closed_loop(loop: LoopMatrices) -> Assumption:
+    true = spectral_abscissa(loop.A + loop.B @ loop.K)
+    nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
+    return _checked(
+        "the gain stabilises the plant and the model",
+        "Theorem 2",
+        true < 0 and nominal < 0,
+        f"largest real part of an eigenvalue: {true:.3g} /s (A + BK), {nominal:.3g} /s (Â + B̂K)"
+        f"{_other_sign(loop)}",
+    )
+
+
+def _other_sign(loop: LoopMatrices) -> str:
+    """Return a hint if K seems to be the gain of u = −Kx, the convention of most programs."""
+    given, other = (
+        spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0)
+    )
+    return "; the loop's u is +Kx, and −K would stabilise it" if other < 0 <= given else ""
+
+
+def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
+    rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
+    what = "0 < α < ᾱ: the threshold decays more slowly than the closed loop"
+    why = f"α = {alpha_per_s:g} /s; A + BK: {_decays(rate)}"
+    return _checked(what, "Theorem 2", alpha_per_s < rate, why)
+
+
+def _decays(rate_per_s: float) -> str:
+    if rate_per_s > 0:
+        return f"decay rate {rate_per_s:.3g} /s"
+    return f"grows at {0.0 - rate_per_s:.3g} /s"
+
+
+def _unstable_and_distinct(A: Matrix) -> Assumption:
+    eigenvalues = np.linalg.eigvals(A)
+    # A defective pair splits by about the square root of the rounding error.
+    tolerance = math.sqrt(np.finfo(float).eps) * max(float(np.linalg.norm(A, 2)), 1.0)
+    unstable = int((eigenvalues.real > tolerance).sum())
+    n = len(eigenvalues)
+    gaps = [abs(eigenvalues[i] - eigenvalues[j]) for i in range(n) for j in range(i)]
+    distinct = min(gaps, default=math.inf) > tolerance
+    count = "no eigenvalue" if unstable == 0 else f"{unstable} of {n} eigenvalues"
+    why = f"{count} in the open right half plane; "
+    why += "all distinct" if distinct else "repeated eigenvalues"
+    holds = unstable > 0 and distinct
+    return Assumption(
+        "A is unstable with distinct eigenvalues",
+        "Proposition 1, used by Theorem 1",
+        AssumptionStatus.HOLDS if holds else AssumptionStatus.NOT_NEEDED,
+        why if holds else f"{why}; used by the paper's proof, but by no bound computed here",
+    )
+
+
+def _mansd(resolved: Scenario) -> Assumption:
+    network = resolved.network
+    start = {
+        "first_packet": "the first packet is delivered",
+        "known_state": "sensor and controller know x(0)",
+    }[network.initial_sync]
+    enforced = (
+        "enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)"
+    )
+    return _checked(
+        f"{network.guarantee.meaning} after a first delivery at t_0",
+        "Section III",
+        network.enforce_mansd,
+        f"{enforced}; {start}",
+    )
+
+
+def _continuous_time(resolved: Scenario) -> Assumption:
+    period_ms = 1e3 * resolved.timing.measurement_period_ns / NS_PER_S
+    control_ms = 1e3 * resolved.timing.controller_period_ns / NS_PER_S
+    return Assumption(
+        "continuous trigger; network and input without delay",
+        "Section II",
+        AssumptionStatus.IDEALISED,
+        "never true of a sampled loop; the certificates allow for the difference. Here: sampled "
+        f"every {period_ms:g} ms, input held for {control_ms:g} ms"
+        + _network_delay(resolved)
+        + _actuation_gap(resolved),
+    )
+
+
+def _network_delay(resolved: Scenario) -> str:
+    link = resolved.network.link
+    if not link.longest_delay_s:
+        return ""
+    longest_ms, certified_ms = 1e3 * link.longest_delay_s, 1e3 * certified_delay_s(resolved)
+    allowed = f"; the certificates allow for {certified_ms:g} ms"
+    if not link.delay_is_bounded:
+        return f"; no setting bounds the network's delay{allowed}"
+    text = f"; the network delays updates by up to {longest_ms:g} ms"
+    return text if certified_ms == longest_ms else text + allowed
+
+
+def _actuation_gap(resolved: Scenario) -> str:
+    if resolved.network.actuation is None:
+        return ""
+    if (gap_ns := resolved.timing.actuation_gap_ns) is None:
+        return "; nothing limits the losses of actuations"
+    text = f"; losses and delays hold up actuations by up to {1e3 * gap_ns / NS_PER_S:g} ms"
+    if resolved.controller.predictions > 1:
+        text += f", and each has inputs for {1e3 * resolved.timing.predicted_ns / NS_PER_S:g} ms"
+    return text
+
+
+def certificate_assumptions(
+    resolved: Scenario,
+    conditions: NetworkConditions,
+    decay: dict[str, float],
+    constants: Constants | None,
+    void: str | None,
+    loop_gain: float,
+    promise: str,
+    kept: float | None,
+) -> list[Assumption]:
+    """Return the assumptions of a certificate, with verdicts.
+
+    ``decay`` has the decay rates per second of "the models" (infinite if they hold) and "A + BK".
+    Without a certificate, ``constants`` is None and ``void`` is the reason. ``promise`` is what the
+    trigger's rule says about e_s, or empty. ``kept`` is the probability that a run keeps a
+    guarantee that nothing enforces, if it is known.
+    """
+    alpha = resolved.trigger.threshold_decay_per_s
+    slower = 0.0 if constants is None else constants.rate_per_s
+    why = promise or "not where it does not transmit"
+    checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]
+    for of, source in (("the models", "(I1)"), ("A + BK", "Theorem 2")) if alpha else ():
+        holds = below(alpha, decay[of])
+        why = f"α = {alpha:g} /s, {_decays(decay[of])}"
+        if slower and not holds:
+            why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
+        if math.isinf(decay[of]):
+            holds, why = False, "a hold does not decay: the certified bounds are constant"
+        checked.append(_checked(f"α is below the decay rate of {of}", source, holds, why))
+    checked += _conditions(conditions, resolved, kept)
+    checked += _bounded_causes(resolved)
+    if constants is None:
+        checked.append(_violated("there is a certificate", "certificate", void or ""))
+    else:
+        why = f"the loop gain of the errors is {loop_gain:.3g}, below 1"
+        checked.append(_checked("small-gain condition", "certificate", True, why))
+    why = "the bounds rest on (I1), which holds for every plant"
+    what, source = "A is unstable with distinct eigenvalues", "Proposition 1"
+    return [*checked, Assumption(what, source, AssumptionStatus.NOT_NEEDED, why)]
+
+
+def _bounded_causes(resolved: Scenario) -> list[Assumption]:
+    """Return that disturbances and noise stay within their bounds."""
+    if resolved.coverage.is_undisturbed:
+        return []
+    what, source = "disturbances and noise stay within their bounds", "certificate"
+    if (normal := normal_bounds(resolved)) is None:
+        return [Assumption(what, source, AssumptionStatus.HOLDS, "by their settings")]
+    why = (
+        f"normal values have no bound; {normal.limit:.3g} standard deviations are assumed, and "
+        "the like for their sums; a run exceeds one of these with a probability of at most "
+        f"{resolved.certificate.exceedance_probability:g}"
+    )
+    return [Assumption(what, source, AssumptionStatus.ASSUMED, why)]
+
+
+def _conditions(
+    conditions: NetworkConditions, resolved: Scenario, kept: float | None
+) -> list[Assumption]:
+    enforced = resolved.network.enforce_mansd
+    why = "enforced by the network" if enforced else "not enforced"
+    if kept is not None:
+        horizon_s = resolved.timing.horizon_ns / NS_PER_S
+        why += f"; a run of {horizon_s:g} s keeps it with probability {kept:.4g} or more"
+    losses = Assumption(
+        f"{conditions.guarantee.meaning} after a first delivery at t_0",
+        "certificate",
+        AssumptionStatus.HOLDS if enforced else AssumptionStatus.ASSUMED,
+        why,
+    )
+    sampling = (
+        f"every {1e3 * conditions.sampling_s:g} ms" if conditions.sampling_s else "continuously"
+    )
+    schedule = (
+        f"the trigger is tested {sampling}",
+        f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event",
+        f"the applied input is at most {1e3 * conditions.hold_s:g} ms old",
+        f"the first input arrives within {1e3 * conditions.start_s:g} ms",
+    )
+    checked = AssumptionStatus.ASSUMED, "checked in each run"
+    return [losses, *(Assumption(what, "certificate", *checked) for what in schedule)]
+
+
+def below(alpha_per_s: float, decay_per_s: float) -> bool:
+    """Return whether α is below the decay rate by more than rounding."""
+    return alpha_per_s < (1 - 1e-9) * decay_per_s

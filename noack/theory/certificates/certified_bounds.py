@@ -1,0 +1,364 @@
+"""What a certificate guarantees: bounds over time, under its conditions and assumptions.
+
+:class:`ScenarioCertificate` has the bounds from the start of the run on. :class:`KnownStateBounds`
+are sharper ones from the newest event on, at which the sensor knows x. With M = A + BK and the
+input error p = u − Kx, for every t from the event t_k on
+
+    ‖x(t) − e^{M(t−t_k)} x(t_k)‖ ≤ ∫ ‖e^{Ms} B U‖ ‖p(t−s)‖ ds,    0 ≤ s ≤ t − t_k.
+
+The certificate bounds ‖p‖ by πe^{−αt}. Where j events are missing at the controller, p is smaller:
+
+    ‖C e_c‖ ≤ (‖C W⁻¹‖ + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_{C,j} β̃
+    ‖p‖     ≤ D_{K,j} β̃ + q
+
+scaled by e^{αt}. From d after the event until the next one, j is the number of events after the
+newest one that the controller has received. All integrals are tabulated once for a certificate.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.bounds.enclosure import KernelBounds, response
+from noack.theory.bounds.gains import Output, PlantGains, error_gains
+from noack.theory.bounds.terms import Constants, NetworkConditions
+from noack.theory.certificates.assumptions import Assumption
+from noack.theory.certificates.conditions import OWN_PLANT
+
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ScenarioCertificate:
+    """The guaranteed bounds of a loop."""
+
+    scope: str
+    """The plants that it covers."""
+    beta: float
+    """β, or 0 if the threshold has no such part."""
+    alpha_per_s: float
+    floor: float
+    """ε: the constant part of the threshold, or 0."""
+    weighted: bool
+    """Whether the trigger's norm is weighted."""
+    conditions: NetworkConditions
+    assumptions: tuple[Assumption, ...]
+    constants: Constants | None
+    """None if there is no certificate."""
+    floor_constants: Constants | None
+    """The constants from ``floor_from_s`` on, with ε in place of βe^{−αt} and without decay."""
+    void: str | None
+    """Reason for having no certificate; None if there is one."""
+    persistent_constants: Constants | None = None
+    """The constants, in units of 1 and without decay, whose bounds are added to those of
+    ``constants`` under disturbances, noise, an observer or a constant threshold."""
+    other: "ScenarioCertificate | None" = None
+    """A second certificate of the same plants under the same conditions: both bounds hold."""
+
+    @property
+    def source(self) -> str:
+        """Name of the certificate as the source of a claim."""
+        return "certificate" if self.scope == OWN_PLANT else "box certificate"
+
+    @property
+    def floor_from_s(self) -> float:
+        """Time at which βe^{−αt} falls below the floor ε; infinite without a floor."""
+        return floor_from_s(self.beta, self.alpha_per_s, self.floor)
+
+    @property
+    def inter_event_s(self) -> float | None:
+        """Lower bound of the inter-event time; None if there is none."""
+        times_s = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
+        known = [value for value in times_s if value is not None]
+        return min(known) if known and len(known) == len(times_s) else None
+
+    @property
+    def unit(self) -> str:
+        """The unit of Δ and β̃: β or ε; empty for 1."""
+        if self.beta > 0 and self.beta >= self.floor:
+            return "β"
+        is_added = self.persistent_constants is not None
+        decays = self.constants is not None and self.constants.rate_per_s > 0
+        return "ε" if self.floor > 0 and not is_added and not decays else ""
+
+    @property
+    def level(self) -> str:
+        """The unit of the error bounds at all times: βe^{−αt}; without decay β or ε."""
+        rate = 0.0 if self.constants is None else self.constants.rate_per_s
+        return f"{self.unit}e^(−{rate:.3g}t)" if rate else self.unit
+
+    def sensor_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.overshoot * level)
+
+    def controller_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_c‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.delta * level)
+
+    def state(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x‖ at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.state)
+
+    def estimation_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.estimation_error)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all fields for JSON."""
+        constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
+        return asdict(self) | {
+            "conditions": self.conditions._asdict()
+            | {"constraints": [rule.name for rule in self.conditions.constraints]},
+            "assumptions": [assumption._asdict() for assumption in self.assumptions],
+            "constants": None if constants is None else constants._asdict(),
+            "floor_constants": None if late is None else late._asdict(),
+            "persistent_constants": None if rest is None else rest._asdict(),
+            "other": None if self.other is None else self.other.to_json(),
+            "inter_event_s": self.inter_event_s,
+            "floor_from_s": None if self.floor == 0 else self.floor_from_s,
+        }
+
+    def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
+        if self.constants is None:
+            return np.full(len(t_s), np.nan)
+        level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
+        bound = scale(self.constants, level or 1.0) * np.exp(-self.constants.rate_per_s * t_s)
+        if self.floor_constants is not None:
+            late = scale(self.floor_constants, self.floor)
+            bound = np.where(t_s < self.floor_from_s, bound, late)
+        if self.persistent_constants is not None:
+            bound = bound + scale(self.persistent_constants, 1.0)
+        if self.other is not None:
+            bound = np.minimum(bound, self.other._envelope(t_s, scale))
+        return np.asarray(bound)
+
+
+def floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
+    """Return the time at which βe^{−αt} falls below the floor; infinite without a floor."""
+    if floor == 0:
+        return math.inf
+    return math.log(beta / floor) / alpha_per_s if beta > floor else 0.0
+
+
+def envelope_formula(
+    quantity: str,
+    certificate: ScenarioCertificate,
+    constant: Literal["delta", "overshoot", "state", "estimation_error"],
+) -> str:
+    """Return a certificate's bound of a quantity; ``{:.4g}`` stands for its first constant."""
+    in_levels = constant in {"delta", "overshoot"}
+    parts: list[str] = []
+    present: ScenarioCertificate | None = certificate
+    while present is not None and present.constants is not None:
+        rate = present.constants.rate_per_s
+        decay = f"e^(−{rate:.3g}t)" if rate else ""
+        formula = f"{getattr(present.constants, constant):.4g}" if parts else "{:.4g}"
+        formula += f" {level}" if (level := present.level if in_levels else decay) else ""
+        if (late := present.floor_constants) is not None:
+            unit = " ε" if in_levels else ""
+            formula += (
+                f", from {present.floor_from_s:.4g} s on ≤ {getattr(late, constant):.4g}{unit}"
+            )
+        if (rest := present.persistent_constants) is not None:
+            formula += f" + {getattr(rest, constant):.4g}"
+        parts.append(formula)
+        present = present.other
+    return f"{quantity} ≤ {' and ≤ '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class KnownStatePart:
+    """What decays at a rate, or what persists: its constants, with the gains for their rate."""
+
+    plant: PlantGains
+    constants: Constants
+    unit: float
+    """The unit of Δ and of β̃ in the constants."""
+    floor_share: float = 0.0
+    """ε/β: the bounds decay to this share of themselves."""
+
+    @cached_property
+    def _forced(self) -> KernelBounds:
+        return self.plant.forced[Output.STATE]
+
+    @cached_property
+    def _estimated(self) -> KernelBounds:
+        followed = response(self.plant.closed_loop, self.plant.error.inverse_weight)
+        return followed.through(np.eye(len(self.plant.A)))
+
+    def level(self, t_s: Vector) -> Vector:
+        """Return what the scaled bounds are multiplied with, (k,)."""
+        decayed = np.exp(-self.constants.rate_per_s * t_s)
+        return np.asarray(np.maximum(decayed, self.floor_share))
+
+    @property
+    def controller_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖e_c‖_W by the number of missing events, and one for any number."""
+        constants = self.constants
+        return self._by_missing(Output.WEIGHTED, self._event_error), constants.delta * self.unit
+
+    @property
+    def input_errors(self) -> tuple[Vector, float]:
+        """Scaled bounds of ‖u − Kx‖ by the number of missing events, and one for any number."""
+        constants = self.constants
+        by_missing = self._by_missing(Output.GAIN, constants.received_input_error)
+        return by_missing, max(constants.input_error, constants.start_error)
+
+    @property
+    def _event_error(self) -> float:
+        """β̃ + η, the largest x_s − x̂ at an event, scaled."""
+        return self.constants.overshoot * self.unit
+
+    def _by_missing(self, output: Output, none: float) -> Vector:
+        """Return none + Σ_{i<j} sup_{τ≥iδ} ‖C e^{(H+αI)τ} W^{−1}‖ (β̃ + η) for each j."""
+        error, most = self.plant.error, self.constants.missing_events
+        if not error.decays:
+            return np.array([none])
+        ages_s = (self.constants.inter_event_s or 0.0) * np.arange(most, dtype=np.float64)
+        sums = np.append(0.0, np.cumsum(error.kernels[output].sups(ages_s)))
+        return np.asarray(none + sums * self._event_error)
+
+    def deviation(
+        self, input_errors: Vector, age_s: Vector, missing: Counts, delay_s: float
+    ) -> Vector:
+        """Return the scaled bound of the deviation from the prediction, (k,)."""
+        known, forced = _entries(input_errors, missing), self._forced
+        whole = integral_until(forced, age_s)
+        # In the time d after the event, updates before it may be in flight.
+        latest = np.minimum(age_s, delay_s) * forced.sups(np.maximum(age_s - delay_s, 0.0))
+        deviation = known * whole + (input_errors[-1] - known) * np.minimum(latest, whole)
+        if self.constants.estimation_error:
+            deviation = deviation + self.constants.estimation_error * self._estimated.sups(age_s)
+        return np.asarray(deviation)
+
+
+@dataclass(frozen=True)
+class KnownStateBounds:
+    """The bounds of a run from its newest event on, under the conditions of a certificate."""
+
+    parts: tuple[KnownStatePart, ...]
+    """Their bounds are added."""
+    delay_s: float
+    disturbances: Matrix
+    """Columns D_i of disturbances, with the largest value of each, (n, k)."""
+    other: "KnownStateBounds | None" = None
+    """Those of a second certificate, which hold, too."""
+
+    def state_deviation(self, t_s: Vector, age_s: Vector, missing: Counts) -> Vector:
+        """Bound ‖x(t) − e^{M(t−t_k)} x(t_k)‖ at times t, (k,).
+
+        Args:
+            t_s: t, (k,).
+            age_s: t − t_k, the time since the newest event, (k,).
+            missing: number of events after the newest one that the controller has received, (k,).
+        """
+        each = [
+            part.level(t_s) * part.deviation(errors, age_s, missing, self.delay_s)
+            for part, errors in zip(self.parts, self._input_errors, strict=True)
+        ]
+        bound = np.asarray(sum(each) + self._disturbed(age_s))
+        if self.other is None:
+            return bound
+        return np.asarray(np.minimum(bound, self.other.state_deviation(t_s, age_s, missing)))
+
+    def controller_error(self, t_s: Vector, missing: Counts) -> Vector:
+        """Bound ‖e_c‖_W at times t, (k,), given the numbers of missing events."""
+        each = [
+            part.level(t_s) * _entries(errors, missing)
+            for part, errors in zip(self.parts, self._controller_errors, strict=True)
+        ]
+        bound = np.asarray(sum(each))
+        if self.other is None:
+            return bound
+        return np.asarray(np.minimum(bound, self.other.controller_error(t_s, missing)))
+
+    @cached_property
+    def _controller_errors(self) -> list[Vector]:
+        return _together([part.controller_errors for part in self.parts])
+
+    @cached_property
+    def _input_errors(self) -> list[Vector]:
+        return _together([part.input_errors for part in self.parts])
+
+    def _disturbed(self, age_s: Vector) -> Vector:
+        if not self.disturbances.size:
+            return np.zeros(len(age_s))
+        edges_s, sums = self._pushed
+        return np.asarray(sums[np.searchsorted(edges_s, age_s, side="left")])
+
+    @cached_property
+    def _pushed(self) -> tuple[Vector, Vector]:
+        """Nodes, and Σ_i ∫‖e^{Ms} D_i‖ds up to each node and over all times."""
+        plant, total = self.parts[-1].plant, 0.0
+        unscaled = plant.closed_loop - plant.alpha_per_s * np.eye(len(plant.A))
+        followed = response(unscaled, self.disturbances)
+        identity = np.eye(len(plant.A))
+        for column in self.disturbances.T:
+            total += response(unscaled, column[:, None]).through(identity).integral()
+        sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
+        return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
+
+
+def _together(parts: Sequence[tuple[Vector, float]]) -> list[Vector]:
+    """Return each part's bounds by the number of missing events; the last holds for any number.
+
+    For each number all parts take the bound that is made for it, or all the one for any number:
+    bounds of parts may be added only if they bound the signal in the same way.
+    """
+    count = min(len(by_missing) for by_missing, _ in parts)
+    is_smaller = np.all([by_missing[:count] <= most for by_missing, most in parts], axis=0)
+    return [
+        np.append(np.where(is_smaller, by_missing[:count], most), most)
+        for by_missing, most in parts
+    ]
+
+
+def _entries(table: Vector, missing: Counts) -> Vector:
+    return np.asarray(table[np.clip(missing, 0, len(table) - 1)])
+
+
+def integral_until(kernel: KernelBounds, age_s: Vector) -> Vector:
+    """Return bounds of ∫₀^a k for each a, (j,)."""
+    sums = np.append(0.0, np.cumsum(kernel.area))
+    cell = np.searchsorted(kernel.edges_s, age_s, side="right") - 1
+    inside = np.minimum(cell, len(kernel.area) - 1)
+    within = kernel.highest[inside] * (age_s - kernel.edges_s[inside])
+    part = sums[inside] + np.minimum(within, kernel.area[inside])
+    return np.asarray(np.where(cell < len(kernel.area), part, kernel.integral()))
+
+
+def known_state_bounds(
+    resolved: Scenario, certificate: ScenarioCertificate
+) -> KnownStateBounds | None:
+    """Return the bounds from the newest event; None without a certificate, or for a box."""
+    first, late, rest = (
+        certificate.constants, certificate.floor_constants, certificate.persistent_constants,
+    )  # fmt: skip
+    if first is None or certificate.scope != OWN_PLANT:
+        return None
+    loop = loop_of(resolved)
+
+    def part(constants: Constants, unit: float, floor_share: float = 0.0) -> KnownStatePart:
+        rate = constants.rate_per_s
+        error = error_gains(loop, rate)
+        plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], rate)
+        return KnownStatePart(plant, constants, unit, floor_share)
+
+    level = max(certificate.beta, certificate.floor if first.rate_per_s == 0 else 0.0)
+    parts = [part(first, level or 1.0, 0.0 if late is None else certificate.floor / level)]
+    parts += [] if rest is None else [part(rest, 1.0)]
+    forcing = bound_forcing(resolved, loop.B)
+    pushes = np.zeros((loop.n, 0)) if forcing is None else forcing.limited
+    return KnownStateBounds(
+        tuple(parts), certificate.conditions.delay_s, pushes,
+        None if certificate.other is None else known_state_bounds(resolved, certificate.other),
+    )  # fmt: skip

@@ -1,0 +1,174 @@
+"""The conditions of a scenario's run, its own and the paper's; and a set-point moved to 0.
+
+At a set-point x_r the loop is described in the coordinates x − x_r, x_s − x_r and x_c − x_r. The
+models rest at x_r with u_r: Âx_r + B̂u_r = 0. The plant need not. What is left, w = A x_r + B u_r,
+is a constant disturbance of the loop in these coordinates.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from noack.config.resolution import loop_of, setpoint_of
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Vector
+from noack.disturbances.step import StepDisturbance
+from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.impairments.loss_prediction import loss_process
+from noack.impairments.markov_chain import NotPredictableError
+from noack.theory.bounds.terms import NetworkConditions
+
+OWN_PLANT = "the scenario's plant"
+BOX = "every plant of the uncertainty box"
+"""The plants that a certificate covers, by name."""
+_AT_REST = 1e-9
+"""The plant rests if |A x_r + B u_r| is at most this share of its larger term."""
+
+
+def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
+    """Return the conditions of a scenario's schedule, with lateness up to ``late_periods`` steps.
+
+    The conditions are in the plant's time and hold for all rates. An update takes effect at the
+    first step with an actuation from a tick at or after the update. The model state of an applied
+    input ages until the step after it. At equal times, the plant's step comes before arrivals. If
+    the network delay has no bound, four times its jitter is used; a run with a longer delay
+    violates the conditions. Lost and delayed actuations delay updates and make inputs older; if
+    their losses have no bound, an input may be as old as the run. Of predicted inputs, the plant
+    applies the one whose time has come.
+    """
+    step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
+    phase_ns, sample_ns = (
+        resolved.timing.controller_phase_ns,
+        step_ns * resolved.plant.measure_every,
+    )
+    # Age of the newest tick at a step: 0 < age ≤ tick and age ≡ −phase modulo the gcd; all these
+    # values occur. Time from a measurement to the next tick: 0 ≤ wait < tick.
+    newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
+    common_ns = math.gcd(sample_ns, tick_ns)
+    wait_ns = tick_ns - common_ns + phase_ns % common_ns
+    late_ns = late_periods * step_ns
+    under_way_ns = network_delay_ns(resolved, late_periods)
+    if under_way_ns > 0:  # an update in flight for up to this time may just miss a tick
+        wait_ns = under_way_ns + tick_ns - 1
+    gap_ns = resolved.timing.actuation_gap_ns
+    if gap_ns is None:
+        gap_ns = resolved.timing.horizon_ns
+    delay_ns, first_ns = (
+        ((t_ns + gap_ns) // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns)
+    )
+    # With a delay, the newest actuation that has arrived may just be one tick older than that.
+    oldest_ns = gap_ns + (newest_ns if gap_ns % tick_ns == 0 else tick_ns)
+    predicted_ns = resolved.timing.predicted_ns - tick_ns
+    age_ns = max(min(oldest_ns, tick_ns), oldest_ns - predicted_ns)
+    start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
+    return NetworkConditions(
+        **_losses(resolved),
+        sampling_s=sample_ns / NS_PER_S,
+        spacing_s=sample_ns / NS_PER_S,
+        delay_s=delay_ns / NS_PER_S,
+        hold_s=(age_ns + step_ns + late_ns) / NS_PER_S,
+        start_s=start_ns / NS_PER_S,
+    )
+
+
+def certified_delay_s(resolved: Scenario) -> float:
+    """The network delay that the certificates allow for: as given, or the longest one."""
+    given_s = resolved.certificate.network_delay_s
+    return resolved.network.link.longest_delay_s if given_s is None else given_s
+
+
+def network_delay_ns(resolved: Scenario, late_periods: int) -> int:
+    """Return the longest time for which the network may delay an update under these conditions."""
+    late_ns = late_periods * resolved.timing.plant_period_ns
+    return late_ns + math.ceil(certified_delay_s(resolved) * NS_PER_S)
+
+
+def allowed_conditions(resolved: Scenario) -> NetworkConditions:
+    """The conditions of a scenario's certificates: its own schedule, with its allowance."""
+    return nominal_conditions(resolved, resolved.certificate.late_periods)
+
+
+def ideal_conditions(resolved: Scenario) -> NetworkConditions:
+    """The paper's conditions: a continuous trigger, a network and input without delay."""
+    return NetworkConditions(**_losses(resolved))
+
+
+def most_events(resolved: Scenario, inter_event_s: float) -> int:
+    """Return the largest number of events in a run, given a bound of its inter-event times."""
+    return math.floor(resolved.timing.horizon_ns / NS_PER_S / inter_event_s * (1 + 1e-12)) + 1
+
+
+def kept_probability(
+    resolved: Scenario, guarantee: LossGuarantee, inter_event_s: float | None
+) -> float | None:
+    """Bound the probability that a run's losses keep a guarantee that nothing enforces.
+
+    Until the first loss too many, events are at least ``inter_event_s`` apart. None: there is no
+    such bound, or the losses are no Markov chain over the packets.
+    """
+    if not inter_event_s:
+        return None
+    try:
+        losses = loss_process(resolved.network.link)
+        return losses.keeps(guarantee, most_events(resolved, inter_event_s))
+    except NotPredictableError:
+        return None
+
+
+def _losses(resolved: Scenario) -> dict[str, Any]:
+    """Return what the guarantee says: its longest burst, and its rules except the cap M − 1."""
+    guarantee = resolved.network.guarantee
+    further = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
+    return {"dropouts": guarantee.longest_burst, "constraints": tuple(further)}
+
+
+def about_setpoint(resolved: Scenario) -> Scenario:
+    """Return the loop in the coordinates around its set-point, which is 0 there."""
+    setpoint = setpoint_of(resolved)
+    if setpoint is None:
+        return resolved
+    x_r, _ = setpoint
+    w, plant = constant_disturbance(resolved), resolved.plant
+    constant = StepDisturbance(kind="step", at="state", amplitude=tuple(w.tolist()))
+    update = {
+        "initial_state": tuple((np.array(plant.initial_state) - x_r).tolist()),
+        "disturbances": (*plant.disturbances, *([constant] if w.any() else [])),
+    }
+    return resolved.model_copy(
+        update={
+            "plant": plant.model_copy(update=update),
+            "controller": resolved.controller.model_copy(update={"setpoint": None}),
+        }
+    )
+
+
+def constant_disturbance(resolved: Scenario) -> Vector:
+    """Return A x_r + B u_r, (n,), of a linear plant; 0 if that is due to rounding."""
+    loop, setpoint = loop_of(resolved), setpoint_of(resolved)
+    if setpoint is None:
+        return np.zeros(loop.n)
+    x_r, u_r = setpoint
+    drift, push = loop.A @ x_r, loop.B @ u_r
+    largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
+    w = drift + push
+    return w if float(np.abs(w).max()) > _AT_REST * largest else np.zeros(loop.n)
+
+
+def void_at_setpoint(resolved: Scenario) -> Mapping[str, str]:
+    """Return by scope why there is no certificate at the set-point of a linear plant."""
+    setpoint = setpoint_of(resolved)
+    if setpoint is None or not resolved.coverage.is_linear:
+        return {}
+    if resolved.observer is not None:
+        why = "at a set-point the error of the observer's first estimate is not known"
+        return {OWN_PLANT: why, BOX: why}
+    x_r, u_r = setpoint
+    half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
+    moved = np.zeros(len(x_r)) if half_A is None else np.array(half_A) @ np.abs(x_r)
+    moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
+    if moved.any():
+        return {BOX: "not every plant of the box rests at the set-point, A x_r + B u_r ≠ 0"}
+    return {}

@@ -1,0 +1,243 @@
+"""The certificate of a loop with disturbances, noise, an observer or a constant threshold.
+
+For given events all inequalities of a certificate are linear in functions of time, v ≤ T v + g,
+with a positive T. So for g = g₁ + g₂, v is at most the sum of both solutions: one for what decays
+(the start, βe^{−αt}, the first estimate), scaled by e^{αt}; the other, not scaled, for what
+persists (disturbances, noise, the floor ε of the threshold, which is at most βe^{−αt} + ε). Both
+use the same δ. An event needs a threshold of at least λβe^{−αt} + (1 − λ)ε, for any λ in [0, 1]. If
+α is too large, all are bounded together, without decay.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.disturbances import EstimationError, bound_forcing
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains
+from noack.theory.bounds.terms import (
+    Constants,
+    NetworkConditions,
+    NoCertificateError,
+    Part,
+    TriggerBound,
+)
+from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.certificates.solution import solve_parts
+
+PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
+"""Returns the plant's gains from the gains of the models, the start of x, and α."""
+Added = tuple[Constants, Constants | None]
+"""Constants whose bounds are added."""
+_RATES = (0.05, 0.2, 0.4, 0.7)
+"""Rates that are tried, as shares of the loop's decay rate."""
+SHARES = (0.5, 0.2, 0.8)
+"""Values of λ that are tried."""
+Found = TypeVar("Found", bound=Sequence[Constants])
+
+
+@dataclass(frozen=True)
+class DisturbedCertificate:
+    """Computes the constants of a resolved scenario; ``start_error`` as for CertificateScope."""
+
+    resolved: Scenario
+    plant_at: PlantAt
+    trigger: TriggerBounds
+    start_error: float
+    slowest_per_s: float
+    """The decay rate of the models and of A + BK, the smaller one."""
+
+    def constants(
+        self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
+    ) -> list[Added]:
+        """Return the constants that decay and those to be added; without decay only one.
+
+        Where there are several such sums, each bounds the run.
+
+        ``decays``: α is below the decay rates of the models and of the plant. ``longest``: search
+        for the tightest bounds and the longest δ; otherwise any suffice.
+
+        Raises:
+            NoCertificateError: the loop gain is not below 1, or the estimation error is not known.
+            NotDecayingError: a mode of the loop or of the observer does not decay.
+        """
+        if self.resolved.observer is not None and (
+            self.start_error or loop_of(self.resolved).setpoint is not None
+        ):
+            raise NoCertificateError(
+                "after a change or at a set-point the estimation error is not known"
+            )
+        conditions = self.trigger.tested(conditions)
+        structured = self.start_error == 0.0
+        if decays and self.resolved.coverage.is_decaying:
+            try:
+                return [solve_two_parts(
+                    self._decaying, self._persistent, conditions, self.start_error,
+                    structured=structured, shares=SHARES if longest else (),
+                )]  # fmt: skip
+            except NotDecayingError:
+                pass
+        level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
+        bound = self.trigger.bound(conditions, level, floor or None)
+        part = self._together._replace(bound=bound)
+        (constants,) = solve_parts(
+            [part], conditions, self.start_error, structured=structured, longest=longest
+        )
+        # The mean of an integral bounds e_s over a time that suits only one of several parts.
+        is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
+        divided: list[Added] = []
+        if decays and is_divided and longest:
+            divided = self._of_constant_threshold(conditions, constants.inter_event_s or 0.0)
+        return divided or [(constants, None)]
+
+    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> list[Added]:
+        """Return the constants of what follows from the start, and of what persists, if any.
+
+        There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
+        first. The threshold has no rate; that of :func:`choose_rate` is taken. ``apart_s`` is a
+        lower bound of the inter-event time, certified without dividing into parts.
+        """
+        pairs: list[Added] = []
+        for of_start, of_rest in self.trigger.divided(conditions, apart_s):
+            with contextlib.suppress(NoCertificateError, NotDecayingError):
+                pairs.append(self._divided(of_start, of_rest, conditions))
+        return sorted(pairs, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
+
+    def _divided(
+        self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
+    ) -> Added:
+        """Return the constants that one bound of e_s gives.
+
+        Raises: as :func:`choose_rate`.
+        """
+        rest = self._persistent._replace(bound=of_rest)
+        persists = of_rest.beta or rest.plant.forcing is not None or rest.estimation.fixed
+        others = [rest] if persists else []
+
+        def solved(rate_per_s: float) -> list[Constants]:
+            return solve_parts([self._at_rate(rate_per_s, of_start), *others], conditions)
+
+        first, *added = choose_rate(solved, self.slowest_per_s, loop_of(self.resolved).x0)
+        return first, added[0] if added else None
+
+    @cached_property
+    def _decaying(self) -> Part:
+        return self._at_rate(self.trigger.alpha_per_s, TriggerBound(self.trigger.beta, None))
+
+    def _at_rate(self, rate_per_s: float, bound: TriggerBound) -> Part:
+        """What follows from the start, scaled by a rate."""
+        plant = self._plant(rate_per_s)
+        return Part(plant.error, plant, bound, self._estimation.decaying(rate_per_s))
+
+    @cached_property
+    def _persistent(self) -> Part:
+        plant = self._plant(0.0)
+        at_rest = replace(plant, start=np.zeros_like(plant.start), forcing=self._forcing(plant))
+        bound = TriggerBound(self.trigger.floor, None, unit=1.0)
+        return Part(plant.error, at_rest, bound, self._estimation.persistent())
+
+    @cached_property
+    def _together(self) -> Part:
+        """Everything without decay; the trigger's bound depends on the conditions."""
+        plant = self._plant(0.0)
+        pushed = replace(plant, forcing=self._forcing(plant))
+        first, rest = self._estimation.decaying(0.0), self._estimation.persistent()
+        estimation = rest._replace(fixed=rest.fixed + first.fixed)
+        return Part(plant.error, pushed, TriggerBound(0.0, None), estimation)
+
+    def _plant(self, alpha_per_s: float) -> PlantGains:
+        loop = loop_of(self.resolved)
+        plant = self.plant_at(error_gains(loop, alpha_per_s), loop.x0[:, None], alpha_per_s)
+        outputs = {**self._estimation.further_outputs, **self.trigger.outputs}
+        return replace(plant, further_outputs=outputs)
+
+    def _forcing(self, plant: PlantGains) -> Forcing | None:
+        return bound_forcing(self.resolved, plant.B)
+
+    @cached_property
+    def _estimation(self) -> EstimationError:
+        """The estimation error of the plant.
+
+        Raises:
+            NoCertificateError: the plant is not known.
+        """
+        loop = loop_of(self.resolved)
+        models = error_gains(loop, 0.0)
+        plant = self.plant_at(models, loop.x0[:, None], 0.0)
+        if self.resolved.observer is not None and not plant.is_one_plant:
+            raise NoCertificateError(
+                "an observer's error is bounded for one plant only, not for a box"
+            )
+        return EstimationError(self.resolved, plant.A, plant.B, self._forcing(plant))
+
+
+def solve_two_parts(
+    decaying: Part,
+    persistent: Part,
+    conditions: NetworkConditions,
+    earlier_error: float = 0.0,
+    *,
+    structured: bool = True,
+    shares: Sequence[float] = SHARES,
+) -> tuple[Constants, Constants]:
+    """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
+
+    Without ``shares`` δ is searched for only if there is no certificate otherwise.
+
+    Raises:
+        NoCertificateError: the loop gain of one part is not below 1.
+        NotDecayingError: a mode of the loop decays more slowly than a part's bounds.
+    """
+    beta, floor = decaying.bound.beta, persistent.bound.beta
+
+    def solved(share: float | None) -> tuple[Constants, Constants]:
+        reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
+        parts = [
+            part._replace(bound=part.bound._replace(reached=level))
+            for part, level in zip((decaying, persistent), reached, strict=True)
+        ]
+        first, second = solve_parts(parts, conditions, earlier_error, structured=structured)
+        return first, second
+
+    if floor == 0:
+        return solved(None)
+    if not shares:
+        with contextlib.suppress(NoCertificateError):
+            return solved(None)
+    tried = [solved(share) for share in shares or SHARES[:1]]
+    return max(tried, key=lambda pair: pair[0].inter_event_s or 0.0)
+
+
+def choose_rate(solved: Callable[[float], Found], decay_per_s: float, start: Vector) -> Found:
+    """Return the constants for a rate, where none is given.
+
+    It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
+
+    Args:
+        solved: returns constants for a rate in 1/s.
+        decay_per_s: the decay rate of the loop.
+        start: x(0), (n,).
+
+    Raises: what ``solved`` raises at the smallest rate.
+    """
+    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Found]]()
+    for share in _RATES:
+        rate_per_s = share * decay_per_s
+        try:
+            constants = solved(rate_per_s)
+        except (NotDecayingError, NoCertificateError):
+            if not candidates:
+                raise
+            break  # larger rates have larger gains
+        candidates.append(
+            (math.log(max(10 * constants[0].state / size, 1.0)) / rate_per_s, constants)
+        )
+    return min(candidates, key=lambda timed: timed[0])[1]

@@ -1,0 +1,436 @@
+"""Certificates of a scenario: their constants, assumptions and conditions, and the largest times.
+
+:class:`CertificateScope` is a scenario's own plant, or its uncertainty box. :func:`network_limits`
+searches for the largest sampling period, delay and age of inputs for which a certificate exists.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.config.resolution import loop_of, policy_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.settings.section import Rows
+from noack.theory.bounds.box import BoxGains
+from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
+from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.certificates.assumptions import below, certificate_assumptions
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
+from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
+from noack.theory.certificates.solution import solve
+
+MOST_S = 10.0
+"""No larger times are tried."""
+_LEAST_S, _USUAL_S = 1e-6, 1e-3
+_RESOLUTION = 1e-3
+_WIDER, _NEXT = 4.0, 1.2
+_STEPS = 6
+"""After so many steps the middle is tried, if interpolation has not found the limit."""
+Points = Sequence[tuple[float, float]]
+"""Logarithms of loop gains, and of their times."""
+_SLOWER = 0.9
+_SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
+_TOO_LARGE = "intermediate results are too large or too small for floating point"
+Phases = tuple[Constants, Constants | None, Constants | None]
+"""The constants, those from the floor on, and those under persistent disturbances."""
+
+
+def trigger_bounds(resolved: Scenario) -> TriggerBounds:
+    """Return what a certificate uses of a resolved scenario's trigger."""
+    loop = loop_of(resolved)
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
+    return TriggerBounds(policy_of(resolved).trigger_rule(loop.n), weight, fastest)
+
+
+def certify(
+    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
+) -> ScenarioCertificate:
+    """The certificate of a scenario's own plant; see :class:`CertificateScope`."""
+    return own_plant(resolved, start_error).certificate(conditions)
+
+
+def certify_box(
+    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
+) -> ScenarioCertificate | None:
+    """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
+    scope = box(resolved, start_error)
+    return None if scope is None else scope.certificate(conditions)
+
+
+def own_plant(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope":
+    """A scenario's own plant."""
+    loop = loop_of(resolved)
+
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
+        return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
+
+    return CertificateScope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
+
+
+def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | None":
+    """All plants in the scenario's uncertainty box; None if it has none."""
+    loop, plant = loop_of(resolved), resolved.plant
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    half_A, half_B = (
+        _halfwidth(plant.uncertainty_A, loop.A),
+        _halfwidth(plant.uncertainty_B, loop.B),
+    )
+
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantGains:
+        return BoxGains(error, loop.A_model, loop.B_model, start, alpha_per_s, half_A, half_B)
+
+    closed_loop = loop.A_model + loop.B_model @ loop.K
+    return CertificateScope(BOX, resolved, closed_loop, plant_at, start_error)
+
+
+def outside_box(resolved: Scenario) -> str | None:
+    """Return, as text, an entry of the plant outside its uncertainty box; None if there is none."""
+    loop, plant = loop_of(resolved), resolved.plant
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    for name, true, model, rows in (
+        ("A", loop.A, loop.A_model, plant.uncertainty_A),
+        ("B", loop.B, loop.B_model, plant.uncertainty_B),
+    ):
+        half = _halfwidth(rows, true)
+        slack = 1e-12 * (1.0 + np.abs(model))
+        for i, j in np.argwhere(np.abs(true - model) > half + slack):
+            distance = abs(true[i, j] - model[i, j])
+            return (
+                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {distance:.3g} from the "
+                f"model's, the half-width is {half[i, j]:.3g}"
+            )
+    return None
+
+
+def _halfwidth(rows: Rows | None, matrix: Matrix) -> Matrix:
+    return np.zeros_like(matrix) if rows is None else np.array(rows)
+
+
+class CertificateScope:
+    """Plants for which certificates are computed; values without conditions are computed once.
+
+    Args:
+        name: name of the plants.
+        resolved: the scenario.
+        closed_loop: A + BK, for a box that of its centre, (n, n).
+        plant_at: returns the plants' gains.
+        start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
+            at the start. The certificate exists only if its own π is at least that large, so that
+            it covers these inputs.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        resolved: Scenario,
+        closed_loop: Matrix,
+        plant_at: PlantAt,
+        start_error: float = 0.0,
+    ) -> None:
+        self._start_error = start_error
+        self.name = name
+        self._resolved = resolved
+        self._loop = loop_of(resolved)
+        self._trigger = trigger_bounds(resolved)
+        # Where events have a due time, a missed update is missed for a limited time.
+        due = self._trigger.has_due_time
+        self._held = not self._loop.H.any() and not due
+        decays = math.inf if self._held or due else -spectral_abscissa(self._loop.H)
+        self._decay = {"the models": decays, "A + BK": -spectral_abscissa(closed_loop)}
+        self._plant_at = plant_at
+        self._plants: dict[float, PlantGains] = {}
+
+    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
+        """Return the certificate under some conditions; a void certificate has the reason."""
+        trigger, void = self._trigger, None
+        phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
+        try:
+            phases = self._constants(conditions)
+        except (NotDecayingError, NoCertificateError) as error:
+            void = str(error)
+
+        def certificate(
+            phase: tuple[Constants | None, ...], *others: tuple[Constants | None, ...]
+        ) -> ScenarioCertificate:
+            first, late, rest = phase
+            return ScenarioCertificate(
+                self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
+                self._loop.weight is not None, conditions, (), first, late, void, rest,
+                certificate(*others) if others else None,
+            )  # fmt: skip
+
+        unchecked = certificate(*phases)
+        first, rest = unchecked.constants, unchecked.persistent_constants
+        kept = None
+        if not self._resolved.network.enforce_mansd:
+            kept = kept_probability(self._resolved, conditions.guarantee, unchecked.inter_event_s)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, first, void,
+            max((phase.loop_gain for phase in (first, rest) if phase is not None), default=0.0),
+            trigger.text(), kept,
+        )  # fmt: skip
+        return replace(unchecked, assumptions=tuple(assumptions))
+
+    def loop_gain(self, conditions: NetworkConditions) -> float:
+        """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
+        # Whether inputs of an earlier run are covered depends on the constants.
+        try:
+            constants = self._constants(conditions, longest=self._start_error > 0)
+        except NoCertificateError as error:
+            return max(error.loop_gain, 1.0)
+        except NotDecayingError:
+            return math.inf
+        return max(phase.loop_gain for phase in constants[0] if phase is not None)
+
+    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> list[Phases]:
+        """Return the constants of each bound of the run; all of them hold.
+
+        ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
+
+        Raises:
+            NoCertificateError: there is no certificate.
+            NotDecayingError: a mode of the loop decays too slowly.
+        """
+        try:
+            with np.errstate(all="ignore"):
+                if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
+                    return [(*self._phases(conditions, longest=longest), None)]
+                pairs = self._disturbed_phases(conditions, longest=longest)
+                return [(first, None, rest) for first, rest in pairs]
+        except (OverflowError, np.linalg.LinAlgError):
+            raise NoCertificateError(_TOO_LARGE) from None
+
+    def _phases(
+        self, conditions: NetworkConditions, *, longest: bool
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants, and those after the threshold has reached its floor, if any."""
+        trigger, late = self._trigger, None
+        conditions = trigger.tested(conditions)
+        first = self._first_phase(conditions, longest=longest)
+        if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
+            late = _at_floor(first, trigger.floor / trigger.beta)
+        return self._checked(first, late)
+
+    def _disturbed_phases(
+        self, conditions: NetworkConditions, *, longest: bool
+    ) -> list[tuple[Constants, Constants | None]]:
+        """Return the constants, and those that are added to them under persistent disturbances."""
+        alpha = self._trigger.alpha_per_s
+        decays = not self._held and below(alpha, min(self._decay.values()))
+        pairs = self._disturbed.constants(conditions, decays=decays, longest=longest)
+        return [self._checked(*pair) for pair in pairs]
+
+    @cached_property
+    def _disturbed(self) -> DisturbedCertificate:
+        return DisturbedCertificate(
+            self._resolved, self._plant_at, self._trigger, self._start_error,
+            min(self._decay.values()),
+        )  # fmt: skip
+
+    def _checked(
+        self, first: Constants, other: Constants | None
+    ) -> tuple[Constants, Constants | None]:
+        """Return the constants.
+
+        Raises:
+            NoCertificateError: they do not cover the inputs at the start, or are not finite.
+        """
+        if first.input_error < self._start_error:
+            raise NoCertificateError(
+                f"at its start the input was {self._start_error:.3g} from Kx; a certificate "
+                f"covers at most {first.input_error:.3g}"
+            )
+        for constants in (first, other):
+            if constants is not None and not _is_finite(constants):
+                raise NoCertificateError(_TOO_LARGE)
+        return first, other
+
+    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Constants:
+        trigger, decay = self._trigger, min(self._decay.values())
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        if trigger.is_homogeneous:
+            if not longest:
+                with contextlib.suppress(NoCertificateError):
+                    return self._solve(conditions, 0.0, 0.0, None, longest=False)
+            return self._fastest(conditions, decay)
+        if not self._held and below(alpha, decay) and floor < beta:
+            try:
+                return self._solve(conditions, alpha, beta, beta, longest=longest)
+            except NotDecayingError:
+                if floor > 0:
+                    raise
+                return self._slower(conditions, alpha)
+        # Certify a slower decay or none; the smallest event level is then the floor, if any.
+        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
+        level = max(beta, floor)
+        return self._solve(conditions, slower, level, floor or None, longest=longest)
+
+    def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
+        """Return bounds for a threshold that is a share of the state: any rate may be certified.
+
+        Raises:
+            NoCertificateError: there are no bounds, not even without decay.
+        """
+        # Inputs of an earlier run are bounded without a rate.
+        if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
+            with contextlib.suppress(NotDecayingError, NoCertificateError):
+                return choose_rate(
+                    lambda rate: (self._solve(conditions, rate, 0.0, None),),
+                    decay, self._loop.x0,
+                )[0]  # fmt: skip
+        return self._solve(conditions, 0.0, 0.0, None)
+
+    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Constants:
+        """Return bounds that decay more slowly than the threshold, for a box too large for α.
+
+        Raises:
+            NotDecayingError: there are no such bounds.
+        """
+        for share in _SHARES_OF_ALPHA:
+            rate = share * alpha_per_s
+            with contextlib.suppress(NotDecayingError):
+                return self._solve(conditions, rate, self._trigger.beta, None)
+        raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+
+    def _solve(
+        self,
+        conditions: NetworkConditions,
+        alpha_per_s: float,
+        level: float,
+        reached: float | None,
+        *,
+        longest: bool = True,
+    ) -> Constants:
+        if alpha_per_s not in self._plants:
+            error = error_gains(self._loop, alpha_per_s)
+            plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
+            plant = replace(plant, further_outputs=self._trigger.outputs)
+            self._plants[alpha_per_s] = _first_equal(_EqualPlant(plant)).at_start(plant.start)
+        plant = self._plants[alpha_per_s]
+        # Inputs of an earlier run are covered by their norm only.
+        earlier = self._start_error
+        bound = self._trigger.bound(conditions, level, reached)
+        return solve(
+            plant.error, plant, conditions, bound, earlier,
+            structured=earlier == 0.0, longest=longest,
+        )  # fmt: skip
+
+
+class _EqualPlant:
+    """A plant that equals others from another x(0)."""
+
+    def __init__(self, plant: PlantGains) -> None:
+        self.plant = plant
+
+    def __hash__(self) -> int:
+        return hash(self.plant.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _EqualPlant) and self.plant.key == other.plant.key
+
+
+@lru_cache(maxsize=16)
+def _first_equal(one: _EqualPlant) -> PlantGains:
+    """Return the first of several equal plants, whose gains the others use."""
+    return one.plant
+
+
+def _at_floor(first: Constants, share: float) -> Constants:
+    """Return the constants from the floor on, ``share`` = ε/β.
+
+    With θ(t) = max(βe^{−αt}, ε) in place of βe^{−αt}, all bounds of the first phase hold at all
+    times: for s ≤ t, θ(s) ≤ θ(t) e^{α(t−s)}, which is all that their proof uses of βe^{−αt}.
+    """
+    scaled = (
+        "input_error", "start_error", "state", "state_weighted", "mismatch",
+        "received_input_error",
+    )  # fmt: skip
+    return first._replace(rate_per_s=0.0, **{name: share * getattr(first, name) for name in scaled})
+
+
+def _is_finite(constants: Constants) -> bool:
+    """Return whether every constant is finite; only the inter-event time may be infinite."""
+    numbers = [v for v in constants._replace(inter_event_s=None) if v is not None]
+    return all(map(math.isfinite, numbers)) and not math.isnan(constants.inter_event_s or 0.0)
+
+
+class NetworkLimits(NamedTuple):
+    """Largest certified value of each quantity; the others are those of the schedule."""
+
+    sampling_s: float
+    delay_s: float
+    hold_s: float
+
+
+def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
+    """Return the limits for some plants; 0 means that there is no certificate at any time."""
+
+    def limit(change: Callable[[float], NetworkConditions], usual_s: float) -> float:
+        return largest(lambda value_s: scope.loop_gain(change(value_s)), usual_s)
+
+    return NetworkLimits(
+        limit(lambda v: scheduled._replace(sampling_s=v, spacing_s=v), scheduled.sampling_s),
+        limit(lambda v: scheduled._replace(delay_s=v, start_s=v), scheduled.delay_s),
+        limit(lambda v: scheduled._replace(hold_s=v), scheduled.hold_s),
+    )
+
+
+def largest(loop_gain: Callable[[float], float], usual_s: float) -> float:
+    """Return the largest time with a loop gain below 1, to 0.1 %, or 0 below 1 µs.
+
+    The gain grows with the time; it is infinite where it is not known.
+
+    Args:
+        loop_gain: of a time in s.
+        usual_s: a time in s for which the gain is probably below 1.
+    """
+    low_s, high_s, known = 0.0, math.inf, list[tuple[float, float]]()
+    tried_s, step = min(usual_s or _USUAL_S, MOST_S), 0
+    while high_s > _LEAST_S and (math.isinf(high_s) or high_s - low_s > _RESOLUTION * high_s):
+        gain = loop_gain(tried_s)
+        if 0 < gain < math.inf:
+            known.append((math.log(gain), math.log(tried_s)))
+        low_s, high_s = (tried_s, high_s) if gain < 1 else (low_s, tried_s)
+        if low_s == MOST_S:
+            break
+        step += low_s > 0 and math.isfinite(high_s)
+        tried_s = _next_s(low_s, high_s, known, middle=step % _STEPS == 0)
+    return low_s
+
+
+def _next_s(low_s: float, high_s: float, known: Points, *, middle: bool) -> float:
+    """Return the time to try next, between those with gains below and above 1."""
+    guess_s = _interpolated_s(known)
+    if low_s == 0:
+        return high_s / _WIDER
+    if math.isinf(high_s):
+        is_found = len(known) > 1 and guess_s > low_s
+        guess_s = max(guess_s, _NEXT * low_s) if is_found else _WIDER * low_s
+        return min(guess_s, _WIDER**2 * low_s, MOST_S)
+    if middle or not low_s < guess_s < high_s:
+        return math.sqrt(low_s * high_s)
+    # Next to a time that is close to the guess, the next one is on the other side of it.
+    near = 0.9 * _RESOLUTION
+    return min(max(guess_s, low_s * (1 + near)), high_s * (1 - near))
+
+
+def _interpolated_s(known: Points) -> float:
+    """Return the time at which the gain is 1, from the gains nearest to it, in logarithms."""
+    nearest = sorted(known, key=lambda point: abs(point[0]))[:3]
+    interpolated = 0.0
+    for gain, time in nearest:
+        others = [other for other, _ in nearest if other != gain]
+        interpolated += time * math.prod(other / (other - gain) for other in others)
+    return math.exp(min(interpolated, math.log(MOST_S)))

@@ -1,0 +1,168 @@
+"""Matrices with all rounding: enclosures in double precision, and 384 digits after the point.
+
+:class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
+from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
+whichever order it is summed (Higham, *Accuracy and Stability of Numerical Algorithms*, section
+3.1). The bounds themselves are rounded too; they are enlarged by more than that can be, and by more
+than underflow can hide. Stacks of thousands of matrices are one product.
+
+:class:`FixedPointMatrix`: 384 binary digits after the point, with a bound of the error. Products of
+hundreds of steps are computed with them, so that what remains is the rounding of the result to
+double precision. The entries are Python integers, in units of 2⁻³⁸⁴.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix
+
+_UNIT = 2.0**-53
+_ENLARGED = 1 + 2.0**-40
+_UNDERFLOW = 1e-290
+_DIGITS = 384
+_ONE = 1 << _DIGITS
+_TERMS = 60
+"""Of Taylor's series of an exponential with a norm up to 1/16: the remainder is below 2⁻⁵⁰⁰."""
+
+
+class IntervalMatrix(NamedTuple):
+    """All matrices, or stacks of matrices, that differ from ``middle`` by at most ``radius``."""
+
+    middle: Matrix
+    radius: Matrix
+    """Not negative, of the shape of ``middle``."""
+
+    def __matmul__(self, other: "IntervalMatrix") -> "IntervalMatrix":
+        """Enclose the products."""
+        size, others = np.abs(self.middle), np.abs(other.middle)
+        terms = size.shape[-1] + 4
+        radius = size @ (other.radius + terms * _UNIT * others) + self.radius @ (
+            others + other.radius
+        )
+        return IntervalMatrix(self.middle @ other.middle, radius * _ENLARGED + terms * _UNDERFLOW)
+
+    def __sub__(self, other: "IntervalMatrix") -> "IntervalMatrix":
+        """Enclose the differences."""
+        middle = self.middle - other.middle
+        radius = self.radius + other.radius + 2 * _UNIT * np.abs(middle)
+        return IntervalMatrix(middle, radius * _ENLARGED + _UNDERFLOW)
+
+    def scaled(self, exponent: int) -> "IntervalMatrix":
+        """Return the matrices times 2^exponent."""
+        return IntervalMatrix(
+            np.ldexp(self.middle, exponent), np.ldexp(self.radius, exponent) + _UNDERFLOW
+        )
+
+    @property
+    def magnitude(self) -> Matrix:
+        """Upper bounds of the absolute values."""
+        bound: NDArray[np.float64] = (np.abs(self.middle) + self.radius) * _ENLARGED
+        return bound
+
+
+def exactly(matrix: Matrix) -> IntervalMatrix:
+    """Return a matrix that is known exactly."""
+    return IntervalMatrix(matrix, np.zeros_like(matrix))
+
+
+def inverse(matrix: Matrix) -> IntervalMatrix | None:
+    """Enclose the inverse of an invertible matrix, (n, n); None if that fails.
+
+    With an approximate inverse R and E = I − R M: M⁻¹ − R = E M⁻¹, so M⁻¹ differs from R by at most
+    ‖E‖∞/(1 − ‖E‖∞) times the largest entry of each column of R.
+    """
+    try:
+        approximate: Matrix = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    product = exactly(approximate) @ exactly(matrix)
+    defect = float((exactly(np.eye(len(matrix))) - product).magnitude.sum(axis=1).max())
+    if not defect * _ENLARGED < 0.5:
+        return None
+    columns = np.abs(approximate).max(axis=0) * (defect / (1 - defect)) * _ENLARGED**4
+    return IntervalMatrix(approximate, np.broadcast_to(columns, matrix.shape).copy())
+
+
+@dataclass(frozen=True)
+class FixedPointMatrix:
+    """A matrix; each entry differs from the exact one by at most ``error``."""
+
+    entries: Any
+    """Integers in units of 2⁻³⁸⁴, an array of objects."""
+    error: int = 0
+    """In the same unit."""
+
+    def __matmul__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
+        """Return the product."""
+        rows = int(abs(self.entries).sum(axis=1).max())
+        columns = int(abs(other.entries).sum(axis=0).max())
+        crossed = self.error * other.error * len(other.entries)
+        error = ((rows * other.error + self.error * columns + crossed) >> _DIGITS) + 2
+        return FixedPointMatrix((self.entries @ other.entries) >> _DIGITS, error)
+
+    def __add__(self, other: "FixedPointMatrix") -> "FixedPointMatrix":
+        """Return the sum."""
+        return FixedPointMatrix(self.entries + other.entries, self.error + other.error)
+
+    def rows(self, which: slice | list[int]) -> "FixedPointMatrix":
+        """Return some of the rows."""
+        return FixedPointMatrix(self.entries[which], self.error)
+
+    def interval(self) -> IntervalMatrix:
+        """Return the matrix in double precision, with its error."""
+        middle = np.array(
+            [[entry / _ONE for entry in row] for row in self.entries.tolist()], dtype=np.float64
+        ).reshape(self.entries.shape)
+        # A quotient of integers is rounded correctly.
+        return IntervalMatrix(
+            middle, np.abs(middle) * 2.0**-52 + (self.error / _ONE) * (1 + 1e-9) + 1e-290
+        )
+
+
+def fixed(matrix: Matrix) -> FixedPointMatrix:
+    """Return a matrix of finite doubles; digits beyond the last are dropped."""
+    entries = np.empty(matrix.shape, dtype=object)
+    for index, value in np.ndenumerate(matrix):
+        numerator, denominator = float(value).as_integer_ratio()
+        entries[index] = numerator * _ONE // denominator
+    return FixedPointMatrix(entries, 1)
+
+
+def stacked(*parts: FixedPointMatrix) -> FixedPointMatrix:
+    """Return matrices on top of each other."""
+    entries = np.concatenate([part.entries for part in parts])
+    return FixedPointMatrix(entries, max(part.error for part in parts))
+
+
+def power(matrix: FixedPointMatrix, exponent: int) -> FixedPointMatrix:
+    """Return a power by repeated squaring; the exponent is not negative."""
+    result = fixed(np.eye(len(matrix.entries)))
+    while exponent:
+        if exponent & 1:
+            result = matrix @ result
+        exponent >>= 1
+        if exponent:
+            matrix = matrix @ matrix
+    return result
+
+
+def exponential(generator: Matrix, dt_ns: int) -> FixedPointMatrix:
+    """Return e^{G dt}, with G per second, by Taylor's series and repeated squaring."""
+    whole = fixed(generator)
+    scaled = [value * dt_ns // NS_PER_S for value in whole.entries.ravel()]
+    norm = sum(abs(value) for value in scaled) or 1
+    halvings = max(norm.bit_length() - _DIGITS + 4, 0)
+    entries = np.empty(generator.shape, dtype=object)
+    entries.ravel()[:] = [value >> halvings for value in scaled]
+    step = FixedPointMatrix(entries, dt_ns // NS_PER_S + 3)
+    total = term = fixed(np.eye(len(generator)))
+    for order in range(1, _TERMS):
+        term = term @ step
+        term = FixedPointMatrix(term.entries // order, term.error // order + 2)
+        total = total + term
+    total = FixedPointMatrix(total.entries, total.error + 1)
+    return power(total, 1 << halvings)

@@ -1,0 +1,228 @@
+"""Upper bounds of the joint spectral radius by polytopes, one per node of a switched system.
+
+If every edge takes the polytope of its source, shrunk by γ^duration, into that of its target, no
+path grows faster than γ. The polytopes are built as by Guglielmi and Protasov (2013): each begins
+with a few vertices; images of vertices that are outside are added until none is left. For γ above
+the joint spectral radius this ends. Whatever vertices result, the bound is then computed from them
+anew with all rounding included, so it does not depend on how they were found.
+
+The norm whose unit ball is a symmetric polytope is ‖y‖ = min Σ|c_i| over all y = Σ c_i v_i, v_i the
+vertices. It is computed for many points at once by the simplex method. Each basis of n vertices
+gives an upper bound of ‖y‖, and an exchange of one vertex improves it. Every basis is thus a proof.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
+from noack.theory.margins.switched_system import Cycle, SwitchedSystem
+
+_EXCHANGES = 400
+_IMPROVEMENT = 1e-11
+_PIVOT = 1e-9
+_PRODUCTS = 250_000
+"""Of a product of matrices: the BLAS uses several threads for larger ones, which is slower here."""
+_NONE = -1
+_ENLARGED = 1 + 2.0**-40
+UNIT = 0.1
+_INSIDE = 1 - 1e-9
+_MUCH_LARGER = 1.3
+_ROUNDS = 60
+_FARTHEST = 1e3
+"""Entries of a vertex, whose first ones have at most 1; products are rarely that much larger."""
+
+
+class Combinations(NamedTuple):
+    """Points as combinations of n vertices each."""
+
+    vertices: NDArray[np.int64]
+    """(k, n), numbers of vertices."""
+    coefficients: Matrix
+    """(k, n)."""
+
+    @property
+    def norms(self) -> Vector:
+        """Upper bounds of the norms, up to rounding, (k,)."""
+        return np.asarray(np.abs(self.coefficients).sum(axis=1))
+
+
+class PolytopeNorm:
+    """The norm of a polytope with the vertices ±v_i.
+
+    Args:
+        vertices: (m, n); the first n are multiples s_i of the unit vectors.
+    """
+
+    def __init__(self, vertices: Matrix) -> None:
+        self.vertices = vertices
+
+    @property
+    def _units(self) -> Vector:
+        n = self.vertices.shape[1]
+        return np.abs(np.diag(self.vertices[:n]))
+
+    def combinations(self, points: Matrix, enough: float = 0.0) -> Combinations:
+        """Return combinations for points, (k, n), of the smallest norm, or at most ``enough``."""
+        none = np.full(len(points), _NONE)
+        return self._in_chunks(points, enough, none)
+
+    def redundant(self, first: int, enough: float) -> NDArray[np.bool_]:
+        """Return which vertices from number ``first`` on have a norm up to ``enough`` without them.
+
+        Each is compared with all others; the unit vectors are never redundant.
+        """
+        numbers = np.arange(first, len(self.vertices))
+        norms = self._in_chunks(self.vertices[first:], enough, numbers).norms
+        redundant = np.zeros(len(self.vertices), dtype=bool)
+        redundant[first:] = (norms <= enough) & (numbers >= self.vertices.shape[1])
+        return redundant
+
+    def _in_chunks(self, points: Matrix, enough: float, without: NDArray[np.int64]) -> Combinations:
+        chunk = max(_PRODUCTS // self.vertices.size, 16)
+        parts = [
+            self._combinations(points[i : i + chunk], enough, without[i : i + chunk])
+            for i in range(0, len(points), chunk)
+        ]
+        return Combinations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+    def _combinations(
+        self, points: Matrix, enough: float, without: NDArray[np.int64]
+    ) -> Combinations:
+        (k, n), V = points.shape, self.vertices
+        chosen = np.tile(np.arange(n), (k, 1))
+        signs = np.where(points >= 0, 1.0, -1.0) * np.sign(np.diag(V[:n]))
+        coefficients = np.abs(points) / self._units
+        active = np.arange(k)
+        for _ in range(_EXCHANGES):
+            active = active[coefficients[active].sum(axis=1) > enough]
+            if not len(active):
+                break
+            try:
+                undone = np.linalg.inv(V[chosen[active]] * signs[active][:, :, None])
+            except np.linalg.LinAlgError:  # by rounding
+                break
+            # The vertex that violates the dual's inequalities most enters the basis.
+            scores = undone.sum(axis=2) @ V.T
+            scores[without[active] != _NONE, without[active][without[active] != _NONE]] = 0.0
+            entering = np.abs(scores).argmax(axis=1)
+            value = scores[np.arange(len(active)), entering]
+            sign = np.sign(value)
+            rates = np.einsum("ki,kij->kj", V[entering] * sign[:, None], undone)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratios = np.where(rates > _PIVOT, coefficients[active] / rates, np.inf)
+            # The vertex whose coefficient reaches 0 first leaves it.
+            leaving = ratios.argmin(axis=1)
+            step = ratios[np.arange(len(active)), leaving]
+            go = (np.abs(value) > 1 + _IMPROVEMENT) & np.isfinite(step)
+            active, step, leaving = active[go], step[go], leaving[go]
+            coefficients[active] = np.maximum(coefficients[active] - step[:, None] * rates[go], 0)
+            coefficients[active, leaving] = step
+            chosen[active, leaving] = entering[go]
+            signs[active, leaving] = sign[go]
+        return Combinations(chosen, coefficients * signs)
+
+    def bounds(self, points: IntervalMatrix, enough: float = 0.0) -> Vector:
+        """Return rigorous upper bounds of the norms of points, (k, n).
+
+        A bound that is at most ``enough`` is not improved further.
+        Nothing is assumed about the combinations; what they miss is a combination of unit vectors.
+        """
+        combinations = self.combinations(points.middle, enough)
+        basis = exactly(self.vertices[combinations.vertices])
+        sums = exactly(combinations.coefficients[:, None, :]) @ basis
+        missed = (points - IntervalMatrix(sums.middle[:, 0], sums.radius[:, 0])).magnitude
+        bounds = (combinations.norms + (missed / self._units).sum(axis=1)) * _ENLARGED
+        return np.where(np.isnan(bounds), np.inf, bounds)
+
+
+def initial_vertices(system: SwitchedSystem, cycle: Cycle, growth: float) -> dict[int, Matrix]:
+    """Return small unit vectors, and the leading eigenvectors of a cycle, at each node."""
+    vertices = {node: [UNIT * np.eye(n)] for node, n in system.dimensions.items()}
+    if cycle.path:
+        values, vectors = np.linalg.eig(system.product(cycle.path).middle)
+        leading = vectors[:, int(np.abs(values).argmax())]
+        rows = np.array([leading.real, leading.imag])
+        rows = rows[np.linalg.norm(rows, axis=1) > 1e-9]
+        for number in cycle.path:
+            edge = system.edges[number]
+            vertices[edge.source].append(rows)
+            rows = rows @ edge.matrix.middle.T / growth**edge.duration
+    return {node: np.concatenate(parts) for node, parts in vertices.items()}
+
+
+@dataclass
+class InvariantPolytopes:
+    """Polytopes of a system for a growth γ per unit of time."""
+
+    system: SwitchedSystem
+    growth: float
+    vertices: dict[int, Matrix]
+    """By node, (m, n)."""
+    _examined: dict[int, int] = field(default_factory=dict)
+    """Number of vertices after the last search for redundant ones, by node."""
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return sum(map(len, self.vertices.values()))
+
+    def grow(self, most_vertices: int) -> bool:
+        """Add images until all are inside.
+
+        Return False at ``most_vertices`` vertices, or when the vertices show that a path grows
+        faster than γ, or after 60 rounds.
+        """
+        pending = dict(self.vertices)
+        for _ in range(_ROUNDS):
+            images: dict[int, list[Matrix]] = {}
+            for edge in self.system.edges:
+                if edge.source in pending:
+                    image = pending[edge.source] @ edge.matrix.middle.T
+                    images.setdefault(edge.target, []).append(image / self.growth**edge.duration)
+            pending = {}
+            for node, parts in images.items():
+                added = self._add(node, np.concatenate(parts))
+                if len(added):
+                    pending[node] = added
+            if not pending:
+                return True
+            farthest = max(float(np.abs(points).max()) for points in pending.values())
+            if self.count > most_vertices or not farthest < _FARTHEST:
+                break
+        return False
+
+    def _add(self, node: int, points: Matrix) -> Matrix:
+        """Add the points that are outside, the farthest first; return those that are vertices."""
+        before = len(self.vertices[node])
+        while len(points):
+            norm = PolytopeNorm(self.vertices[node])
+            norms = norm.combinations(points, enough=_INSIDE).norms
+            order = np.argsort(-norms)
+            order = order[norms[order] > _INSIDE]
+            first, points = np.split(points[order], [max(4, len(order) // 4)])
+            self.vertices[node] = np.concatenate([self.vertices[node], first])
+        if len(self.vertices[node]) == before:
+            return points
+        # Without points in its interior it is the same polytope.
+        everywhere = len(self.vertices[node]) > _MUCH_LARGER * self._examined.get(node, 0)
+        kept = ~PolytopeNorm(self.vertices[node]).redundant(0 if everywhere else before, _INSIDE)
+        added = self.vertices[node][before:][kept[before:]]
+        self.vertices[node] = self.vertices[node][kept]
+        if everywhere:
+            self._examined[node] = len(self.vertices[node])
+        return added
+
+    def bound(self) -> float:
+        """Return a rigorous upper bound of the joint spectral radius, from the polytopes."""
+        growths = [0.0]
+        for edge in self.system.edges:
+            M = edge.matrix
+            images = exactly(self.vertices[edge.source]) @ IntervalMatrix(M.middle.T, M.radius.T)
+            norm, inside = PolytopeNorm(self.vertices[edge.target]), self.growth**edge.duration
+            largest = float(norm.bounds(images, inside).max())
+            growths.append(largest ** (1 / edge.duration) * (1 + 1e-15))
+        return max(growths)

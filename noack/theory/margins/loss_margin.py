@@ -1,0 +1,343 @@
+"""The losses that a loop tolerates whatever its sensor measures: stable for all patterns, or not.
+
+The sensor is time-triggered, or transmits at unknown times with a longest time between two. What
+may happen between two deliveries under a guarantee is a graph. Its nodes are the states of the
+guarantee's automaton just after a delivery, and the times at which the sensor transmits relative to
+the controller's ticks. An edge is the time from a delivered update to the next delivered one. A
+pattern of losses, and of such times, is a path. The edges, with the loop's maps over their times
+(:mod:`noack.theory.margins.time_triggered_loop`), are a switched system
+(:mod:`noack.theory.margins.switched_system`).
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.config.resolution import loop_of, policy_of
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.loss_guarantee import (
+    LongestBurst,
+    LossAutomaton,
+    LossGuarantee,
+    outcome_letters,
+)
+from noack.theory.margins.joint_spectral_radius import (
+    ACCURACY,
+    MOST_VERTICES,
+    JointSpectralRadius,
+    joint_spectral_radius,
+)
+from noack.theory.margins.switched_system import Edge
+from noack.theory.margins.time_triggered_loop import LoopTimes, TimeTriggeredLoop
+from noack.trigger.trigger_rule import NEVER_NS
+
+MOST_EDGES = 5000
+_WITHOUT_DELAY = ("loss", "corrupt", "blackout", "duplicate")
+_FIRST_ACCURACY = 1e-2
+_QUICK_ACCURACY = 3e-2
+_LAST_ACCURACY = 1e-8
+
+
+class EventTimes(NamedTuple):
+    """The time between two transmissions, in steps: any number within these limits."""
+
+    shortest: int = 1
+    longest: int = 1
+
+
+EVERY_STEP = EventTimes()
+
+
+class Burst(NamedTuple):
+    """Losses between two deliveries, as an edge of the graph."""
+
+    source: int
+    target: int
+    slot: int
+    """Number of the step of the first delivered update, modulo the number of slots."""
+    losses: int
+    steps: int
+    """Time between the two deliveries."""
+
+    def intervals(self, times: EventTimes) -> list[int]:
+        """Return times between the transmissions, (losses + 1,), in steps; the longest first."""
+        intervals, left = [], self.steps
+        for further in range(self.losses, -1, -1):
+            intervals.append(min(times.longest, left - further * times.shortest))
+            left -= intervals[-1]
+        return intervals
+
+
+def list_bursts(
+    guarantee: LossGuarantee, slots: int = 1, times: EventTimes = EVERY_STEP
+) -> list[Burst]:
+    """Return the graph of a guarantee between deliveries; node 0 is that of the first delivery.
+
+    Different states of the automaton after which the same is allowed are one node.
+
+    Of edges between the same nodes with the same time, there is the one with the fewest losses.
+
+    Raises:
+        CallerError: there are more than 5,000 edges.
+    """
+    automaton = LossAutomaton(guarantee)
+    first = int(automaton.after_delivery(np.zeros(1, int))[0])
+    numbers, pending = {(first, 0): 0}, [(first, 0)]
+    bursts: dict[tuple[int, int, int], Burst] = {}
+    while pending:
+        state, slot = pending.pop()
+        source, losses = numbers[state, slot], 0
+        while state >= 0:
+            after = int(automaton.after_delivery(np.array([state]))[0])
+            sent = losses + 1
+            for steps in range(sent * times.shortest, sent * times.longest + 1):
+                target = (after, (slot + steps) % slots)
+                if target not in numbers:
+                    numbers[target] = len(numbers)
+                    pending.append(target)
+                burst = Burst(source, numbers[target], slot, losses, steps)
+                bursts.setdefault((source, numbers[target], steps), burst)
+            if len(bursts) > MOST_EDGES:
+                raise CallerError(
+                    f"network: {guarantee.meaning}: more than {MOST_EDGES:,} transitions; reduce "
+                    "mansd, the windows of the constraints, or the number of measurements between "
+                    "two events"
+                )
+            state, losses = int(automaton.after_loss(np.array([state]))[0]), sent
+    return _merged(list(bursts.values()))
+
+
+def _merged(bursts: list[Burst]) -> list[Burst]:
+    """Return the graph with one node for all that have the same paths, the lowest of them.
+
+    Nodes are divided as long as edges of one class differ in their losses, times or targets' class.
+    """
+    leaving: dict[int, list[Burst]] = {}
+    for burst in bursts:
+        leaving.setdefault(burst.source, []).append(burst)
+    classes, count = dict.fromkeys(leaving, 0), 0
+    while len(set(classes.values())) > count:
+        count = len(set(classes.values()))
+        seen = {
+            node: frozenset((*burst[2:], classes[burst.target]) for burst in ones)
+            for node, ones in leaving.items()
+        }
+        numbers = {future: number for number, future in enumerate(dict.fromkeys(seen.values()))}
+        classes = {node: numbers[future] for node, future in seen.items()}
+    lowest: dict[int, int] = {}
+    for node in sorted(classes):
+        lowest.setdefault(classes[node], node)
+    return [
+        burst._replace(target=lowest[classes[burst.target]])
+        for node in lowest.values() for burst in leaving[node]
+    ]  # fmt: skip
+
+
+class Stability(NamedTuple):
+    """What is known about all loss patterns of a guarantee."""
+
+    lower: float
+    """The pattern grows at least by this factor per longest interval, in the long run."""
+    upper: float
+    """No pattern grows by more than this factor per longest interval, in the long run."""
+    pattern: tuple[bool, ...]
+    """Whether each update is delivered, in a pattern that repeats; it begins with a delivery."""
+    intervals_s: tuple[float, ...]
+    """The time from each update of the pattern to the next one."""
+    vertices: int
+    """Number of vertices of the polytopes that prove the upper bound; 0: it has another proof."""
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in a word: stable, destabilised or undecided."""
+        if self.upper < 1:
+            return "stable"
+        return "destabilised" if self.lower > 1 else "undecided"
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether the updates of the pattern are equally far apart."""
+        return len(set(self.intervals_s)) <= 1
+
+    @property
+    def text(self) -> str:
+        """The pattern, one letter per update: ``D`` delivered, ``L`` lost.
+
+        If they differ, the times to the next update stand between.
+        """
+        letters = outcome_letters(self.pattern)
+        if self.is_periodic:
+            return letters
+        return " ".join(
+            f"{letter} ({interval_s:g} s)"
+            for letter, interval_s in zip(letters, self.intervals_s, strict=True)
+        )
+
+
+def capped(guarantee: LossGuarantee, losses: int) -> LossGuarantee:
+    """Return a guarantee with another maximum number of consecutive losses."""
+    others = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
+    return LossGuarantee((LongestBurst(losses), *others))
+
+
+class LossMargin:
+    """The loop of a scenario, with its own or another longest time between two transmissions.
+
+    Args:
+        resolved: the resolved scenario.
+        longest_ns: longest time between two transmissions, a multiple of the time between
+            measurements; by default the scenario's.
+
+    Raises:
+        CallerError: the loop is not covered; the message names the setting.
+    """
+
+    def __init__(self, resolved: Scenario, longest_ns: int | None = None) -> None:
+        require_covered(resolved)
+        loop, timing = loop_of(resolved), resolved.timing
+        self.guarantee = resolved.network.guarantee
+        self.shortest_ns, self.longest_ns = intervals_ns(resolved)
+        if longest_ns is not None:
+            same = self.shortest_ns == self.longest_ns
+            self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
+            self.longest_ns = longest_ns
+        is_periodic = self.shortest_ns == self.longest_ns
+        self._unit_ns = unit_ns = self.longest_ns if is_periodic else _step_ns(resolved)
+        self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
+        times = LoopTimes(
+            timing.plant_period_ns,
+            timing.controller_period_ns,
+            timing.controller_phase_ns,
+            unit_ns,
+            update_delay_ns(resolved),
+        )
+        if times.delay_ns >= unit_ns:
+            what = "two updates" if is_periodic else "two measurements"
+            raise CallerError(
+                f"network.impairments: a delay of {times.delay_ns / NS_PER_S:g} s; expected less "
+                f"than the period between {what}, {unit_ns / NS_PER_S:g} s"
+            )
+        self.loop = TimeTriggeredLoop(loop.A, loop.B, loop.K, loop.H, times)
+        self.maps = cache(self.loop.map)
+        """The loop's maps by slot and number of lost updates."""
+
+    def stability(
+        self,
+        guarantee: LossGuarantee | None = None,
+        accuracy: float = ACCURACY,
+        *,
+        refine: bool = True,
+    ) -> Stability:
+        """Bound the growth of all patterns of a guarantee, by default the scenario's.
+
+        Args:
+            guarantee: the guarantee.
+            accuracy: wanted upper/lower − 1.
+            refine: whether the accuracy is refined if the bounds are on both sides of 1.
+
+        Raises:
+            CallerError: the loop grows so much between deliveries that products overflow.
+        """
+        bursts = list_bursts(guarantee or self.guarantee, self.loop.times.slots, self._times)
+        try:
+            with np.errstate(over="raise"):
+                return self._bounded(bursts, accuracy, refine=refine)
+        except (OverflowError, FloatingPointError):
+            raise CallerError(
+                "the loop grows beyond 1e308 within some deliveries; reduce mansd or the period"
+            ) from None
+
+    def _bounded(self, bursts: list[Burst], accuracy: float, *, refine: bool) -> Stability:
+        edges = [
+            Edge(burst.source, burst.target, self.maps(burst.slot, burst.steps - 1), burst.steps)
+            for burst in bursts
+        ]
+        # Short steps would need many vertices.
+        vertices = MOST_VERTICES if self._times == EVERY_STEP else 0
+        while True:
+            radius = joint_spectral_radius(
+                edges, accuracy=accuracy / self._times.longest, most_vertices=vertices
+            )
+            finest = _LAST_ACCURACY if radius.vertices else ACCURACY  # of quadratic norms
+            decided = not radius.lower <= 1 <= radius.upper
+            if decided or not refine or accuracy < finest:
+                return self._stability(radius, bursts)
+            accuracy = min(accuracy / 10, (1 - radius.lower) / 2)
+
+    def is_stable(self, guarantee: LossGuarantee | None = None) -> Stability:
+        """Return coarser bounds, which decide whether all patterns are stable."""
+        return self.stability(guarantee, _FIRST_ACCURACY)
+
+    def first_bounds(self) -> Stability:
+        """Return bounds that take less than a second; they may leave stability undecided."""
+        return self.stability(accuracy=_QUICK_ACCURACY, refine=False)
+
+    def _stability(self, radius: JointSpectralRadius, bursts: list[Burst]) -> Stability:
+        path = [bursts[number] for number in radius.cycle]
+        pattern = [delivered for burst in path for delivered in (True, *[False] * burst.losses)]
+        intervals_s = (
+            steps * self._unit_ns / NS_PER_S
+            for burst in path
+            for steps in burst.intervals(self._times)
+        )
+        return Stability(
+            radius.lower**self._times.longest, radius.upper**self._times.longest,
+            tuple(pattern), tuple(intervals_s), radius.vertices,
+        )  # fmt: skip
+
+
+def require_covered(resolved: Scenario) -> None:
+    """Raise CallerError unless the loop is linear, transmits in time, and the watchdog is idle."""
+    resolved.coverage.require_direct_inputs()
+    resolved.coverage.require_exact()
+    resolved.coverage.require_constant()
+    timing = resolved.timing
+    if timing.plant_period_ns + timing.controller_period_ns > timing.actuation_timeout_ns:
+        raise CallerError(
+            "plant.watchdog.timeout_s: shorter than the age of the actuations without any delay"
+        )
+
+
+def intervals_ns(resolved: Scenario) -> tuple[int, int]:
+    """Return the shortest and the longest time between two transmissions, as measurements allow.
+
+    Raises:
+        CallerError: there is no longest time.
+    """
+    rule, step_ns = policy_of(resolved).trigger_rule(loop_of(resolved).n), _step_ns(resolved)
+    if rule.longest_ns == NEVER_NS:
+        raise CallerError(
+            f'trigger.policy = "{resolved.trigger.policy}": the margin needs a longest time '
+            "between two events, as periodic and deadline have; use e.g. "
+            "--set 'trigger={policy=\"periodic\", period_s=0.5}'"
+        )
+    longest_ns = max(-int(-rule.longest_ns // step_ns), 1) * step_ns
+    if rule.forecast is None and not len(rule.form.up):  # nothing is compared
+        return longest_ns, longest_ns
+    least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
+    return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
+
+
+def _step_ns(resolved: Scenario) -> int:
+    return resolved.timing.measurement_period_ns
+
+
+def update_delay_ns(resolved: Scenario) -> int:
+    """Return the constant delay of the updates; raise CallerError if it may vary."""
+    delay_ns = 0
+    for number, impairment in enumerate(resolved.network.impairments):
+        constant = isinstance(impairment, Delay) and not (
+            impairment.jitter_s or impairment.samples_s or impairment.file
+        )
+        if isinstance(impairment, Delay) and constant:
+            delay_ns += round(impairment.delay_s * NS_PER_S)
+        elif impairment.kind not in _WITHOUT_DELAY:
+            raise CallerError(
+                f"network.impairments.{number}: {impairment.kind}: the margin is for a constant "
+                "delay; use delay_s alone"
+            )
+    return delay_ns

@@ -1,0 +1,178 @@
+"""The loop of a time-triggered sensor between two deliveries, as a linear map without rounding.
+
+Every T the sensor transmits x. The loop is that of the processes, with no step late:
+
+* at kh the plant, ẋ = Ax + Bu, replaces its input u by the newest actuation w that it has received;
+* at its ticks φ, φ + τ, … the controller sends w = K x_c; it arrives at once, after a step of the
+  plant at the same time;
+* between updates ẋ_c = H x_c; an update of time t_k that arrives at t_k + d sets x_c to
+  e^{Hd} x(t_k). At one time, the order is: step of the plant, transmission, arrival, tick.
+
+A delivered update removes all knowledge of older ones. So the state of the loop just after the
+delivery, if d = 0, is z = (x, u): x_c = x and w = u there. If 0 < d < T, z is the state at the
+time of the transmission, (x, x_c); there u is K e^{−Hδ} x_c for the last tick, δ ago, unless there
+may be no tick since the last arrival; then z = (x, x_c, u).
+"""
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix
+from noack.theory.margins.exact_matrices import (
+    FixedPointMatrix,
+    IntervalMatrix,
+    exponential,
+    fixed,
+    power,
+    stacked,
+)
+
+
+class LoopTimes(NamedTuple):
+    """The times of a time-triggered loop, in nanoseconds."""
+
+    step_ns: int
+    """h, of the plant."""
+    tick_ns: int
+    """τ, of the controller."""
+    phase_ns: int
+    """φ, of its first tick; below τ."""
+    period_ns: int
+    """T, between two transmissions; a multiple of h."""
+    delay_ns: int
+    """d, of an update; below T."""
+
+    @property
+    def slots(self) -> int:
+        """Number of transmissions after which their times repeat, relative to the ticks."""
+        cycle_ns = math.lcm(self.step_ns, self.tick_ns)
+        return cycle_ns // math.gcd(cycle_ns, self.period_ns)
+
+    def since_tick_ns(self, t_ns: int) -> int:
+        """Time from the last tick before ``t_ns`` to ``t_ns``, above 0."""
+        return (t_ns - self.phase_ns - 1) % self.tick_ns + 1
+
+
+class TimeTriggeredLoop:
+    """The maps of a loop with the matrices A, (n, n), B, (n, m), K, (m, n), and H, (n, n)."""
+
+    def __init__(self, A: Matrix, B: Matrix, K: Matrix, H: Matrix, times: LoopTimes) -> None:
+        n, m = B.shape
+        self.times, self._H = times, H
+        self._cycle_ns = math.lcm(times.step_ns, times.tick_ns)
+        # The state of the loop is (x, x_c, u, w).
+        size = 2 * (n + m)
+        generator = np.zeros((size, size))
+        generator[:n, :n], generator[n : 2 * n, n : 2 * n] = A, H
+        generator[:n, 2 * n : 2 * n + m] = B
+        x, x_c, u, w = np.split(np.eye(size), [n, 2 * n, 2 * n + m])
+        self._x, self._x_c, self._K = slice(n), slice(n, 2 * n), fixed(K)
+        self._inputs = slice(2 * n, size)
+        self._latch = fixed(np.vstack([x, x_c, w, w]))
+        self._tick = fixed(np.vstack([x, x_c, u, K @ x_c]))
+        self._flow = cache(lambda dt_ns: exponential(generator, dt_ns))
+        self._advance = cache(self._advance_from_cycle)
+        self._states: dict[int, list[FixedPointMatrix]] = {}
+        """By slot: (x, x_c, u, w) after 1, 2, … periods, as functions of z."""
+        since_ns = [times.since_tick_ns(k * times.period_ns) for k in range(times.slots)]
+        follows = max(since_ns) <= times.period_ns - times.delay_ns
+        if times.delay_ns == 0:
+            self._kept = [*range(n), *range(2 * n, 2 * n + m)]  # x, u
+        else:
+            self._kept = [*range(2 * n if follows else 2 * n + m)]  # x, x_c and perhaps u
+        self.dimension = len(self._kept)
+
+    def map(self, slot: int, losses: int) -> IntervalMatrix:
+        """Return the map of z from a delivered update to the next one.
+
+        Args:
+            slot: number of the first update, modulo the number of slots.
+            losses: number of lost updates between the two.
+        """
+        return self._after(slot, losses).rows(self._kept).interval()
+
+    def state_after(self, slot: int, losses: int) -> Matrix:
+        """Return (x, x_c, u, w) at the transmission after the losses as a function of z, rounded.
+
+        Args:
+            slot: number of the first update, which is delivered, modulo the number of slots.
+            losses: number of lost updates after it.
+        """
+        return self._after(slot, losses).interval().middle
+
+    def _after(self, slot: int, losses: int) -> FixedPointMatrix:
+        period_ns = self.times.period_ns
+        states = self._states.setdefault(slot, [])
+        while len(states) <= losses:
+            from_ns = (slot + len(states)) * period_ns
+            if states:
+                states.append(self._between(from_ns, from_ns + period_ns) @ states[-1])
+            else:
+                states.append(self._first_period(from_ns))
+        return states[losses]
+
+    def period(self, slot: int, delivered: bool) -> Matrix:
+        """Return the map of (x, x_c, u, w) from a transmission to the next one, rounded.
+
+        Args:
+            slot: number of the transmission, modulo the number of slots.
+            delivered: whether its update arrives.
+        """
+        from_ns, size = slot * self.times.period_ns, len(self._latch.entries)
+        until_ns, arrival_ns = from_ns + self.times.period_ns, from_ns + self.times.delay_ns
+        start = fixed(np.eye(size))
+        if not delivered:
+            return self._between(from_ns, until_ns).interval().middle
+        state = self._between(from_ns, arrival_ns) @ start
+        updated = exponential(self._H, self.times.delay_ns) @ start.rows(self._x)
+        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
+        return (self._between(arrival_ns, until_ns) @ state).interval().middle
+
+    def _first_period(self, from_ns: int) -> FixedPointMatrix:
+        state, until_ns = self._state(from_ns), from_ns + self.times.period_ns
+        if not self.times.delay_ns:
+            return self._between(from_ns, until_ns) @ state
+        # Until the update arrives, x_c is that of older ones.
+        sent, arrival_ns = state.rows(self._x), from_ns + self.times.delay_ns
+        state = self._between(from_ns, arrival_ns) @ state
+        updated = exponential(self._H, self.times.delay_ns) @ sent
+        state = stacked(state.rows(self._x), updated, state.rows(self._inputs))
+        return self._between(arrival_ns, until_ns) @ state
+
+    def _state(self, t_ns: int) -> FixedPointMatrix:
+        """Return (x, x_c, u, w) as a function of z at a transmission."""
+        z, n = fixed(np.eye(self.dimension)), self._x.stop
+        if self.times.delay_ns == 0:
+            x, u = z.rows(slice(n)), z.rows(slice(n, None))
+            return stacked(x, x, u, u)
+        if self.dimension > 2 * n:
+            return stacked(z, z.rows(slice(2 * n, None)))
+        u = self._K @ exponential(-self._H, self.times.since_tick_ns(t_ns)) @ z.rows(self._x_c)
+        return stacked(z, u, u)
+
+    def _between(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
+        """Return the map of (x, x_c, u, w); a tick at its end is excluded, a step at its start."""
+        return self._advance(from_ns % self._cycle_ns, until_ns - from_ns)
+
+    def _advance_from_cycle(self, from_ns: int, duration_ns: int) -> FixedPointMatrix:
+        cycles, rest_ns = divmod(duration_ns, self._cycle_ns)
+        rest = self._occurrences(from_ns, from_ns + rest_ns)
+        if not cycles:
+            return rest
+        return rest @ power(self._occurrences(from_ns, from_ns + self._cycle_ns), cycles)
+
+    def _occurrences(self, from_ns: int, until_ns: int) -> FixedPointMatrix:
+        times = self.times
+        first = -(-(from_ns - times.phase_ns) // times.tick_ns)
+        ticks = range(first * times.tick_ns + times.phase_ns, until_ns, times.tick_ns)
+        steps = range((from_ns // times.step_ns + 1) * times.step_ns, until_ns + 1, times.step_ns)
+        both = [(t_ns, 0, self._latch) for t_ns in steps]
+        both += [(t_ns, 1, self._tick) for t_ns in ticks]
+        result, now_ns = fixed(np.eye(len(self._latch.entries))), from_ns
+        for t_ns, _, occurrence in sorted(both, key=lambda occurrence: occurrence[:2]):
+            result = occurrence @ self._flow(t_ns - now_ns) @ result
+            now_ns = t_ns
+        return self._flow(until_ns - now_ns) @ result

@@ -1,0 +1,19 @@
+"""What holds of a loop whose losses are random and not limited: probabilities and moments.
+
+The paper and the certificates assume at most M − 1 consecutive losses. If nothing enforces that, a
+run keeps it with some probability, and other statements take the place of bounds (docs/theory.md,
+"Without a limit on the losses"). The losses are a Markov chain over the packets
+(``noack/impairments/loss_prediction.py``).
+
+1. A certificate for at most m consecutive losses holds for a whole run if no longer burst happens.
+   Until then events are at least δ apart, so a run of T seconds has at most ⌊T/δ⌋ + 1 of them; the
+   chain gives the probability that so many packets keep the limit.
+2. Moments. Each update is lost with a probability of at most p̄, whatever happened before. In the
+   inequalities of a certificate, (I1) then holds for (E‖·‖ʳ)^{1/r} with ρ = p̄^{1/r} in place of
+   the number of missing events. They are linear, and solved in the same way. A moment that decays
+   as e^{−αt} gives almost sure decay at every smaller rate (Borel and Cantelli). 1 and 2 are
+   ``moments.py``.
+3. Time-triggered loops. From one transmission to the next the state becomes M₀z or M₁z. The second
+   moments follow a linear map, so its spectral radius decides stability in mean square exactly; the
+   mean logarithm of products bounds the growth almost surely (``mean_square_growth.py``).
+"""

@@ -1,0 +1,61 @@
+"""Prints digests of what the core computes: records of the shipped scenarios, exact batches, and
+functions. ``test_same_bits.py`` compares those of cores that were built in different ways."""
+
+import hashlib
+
+import numpy as np
+
+from cosim.shipped_files import find_shipped, shipped_names
+from cosim.simulation.batch import run_with_events
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.core.core_library import core
+from noack.core.errors import CallerError
+from tests.cosim.simulation.batch.exact import random_population, random_setting
+from tests.cosim.simulation.batch.test_policies import POLICIES
+
+FUNCTIONS = ("exp", "expm1", "log", "cube_root", "normal_cdf", "normal_score")
+
+
+def _print(name: str, *parts: bytes) -> None:
+    print(name, hashlib.sha256(b"".join(parts)).hexdigest(), flush=True)
+
+
+def _records() -> None:
+    for name in shipped_names("scenarios"):
+        try:
+            record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=5"])))
+        except CallerError:  # several loops, or a plant that needs an extra
+            continue
+        for table in sorted(record.tables):
+            rows = record[table]
+            for column in rows.dtype.names or ():
+                _print(f"{name} {table} {column}", rows[column].tobytes())
+
+
+def _batches() -> None:
+    for policy, draw in POLICIES.items():
+        for n in (1, 2, 3, 4, 7, 20):
+            rng = np.random.default_rng(n)
+            setting = random_setting(rng, n, 2)
+            trigger = draw(rng, n, setting.trigger.weight) if n == 2 else setting.trigger
+            setting = setting.__class__(**{**vars(setting), "trigger": trigger, "most_events": 200})
+            rows, events = run_with_events(setting, random_population(rng, setting, 3))
+            times = (run.event_s.tobytes() for run in events)
+            _print(f"batch {policy} n={n}", rows.tobytes(), *times)
+
+
+def _functions() -> None:
+    rng = np.random.default_rng(1)
+    numbers = np.concatenate([rng.normal(0, scale, 5000) for scale in (0.01, 1.0, 300.0)])
+    for name in FUNCTIONS:
+        function = getattr(core, f"noack_{name}")
+        arguments = rng.uniform(0, 1, 15000) if name == "normal_score" else numbers
+        _print(name, np.array([function(x) for x in arguments.tolist()]).tobytes())
+
+
+if __name__ == "__main__":
+    _records()
+    _batches()
+    _functions()

@@ -1,0 +1,51 @@
+"""The core computes the same bits whichever compiler has built it, with any optimisation."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from native.build import LIBRARY
+from tests.native import sanitized_core
+
+ROOT = sanitized_core.ROOT
+MODULE = "tests.native.digests"
+
+
+def run(command: Sequence[str | Path], **environment: str) -> list[str]:
+    done = subprocess.run(
+        command, env=os.environ | environment, cwd=ROOT, capture_output=True, text=True,
+        check=False, timeout=500,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
+    return done.stdout.splitlines()
+
+
+@cache
+def own_digests() -> list[str]:
+    digests = run([sys.executable, "-m", MODULE])
+    assert len(digests) > 500
+    return digests
+
+
+def test_with_sanitizers_and_little_optimisation() -> None:
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    try:
+        command, environment = sanitized_core.command(MODULE)
+    except sanitized_core.NoSanitizersError as error:
+        pytest.skip(str(error))
+    assert run(command, **environment) == own_digests()
+
+
+@pytest.mark.skipif(find_spec("ziglang") is None, reason="the package ziglang is not installed")
+def test_built_by_ziglang(tmp_path: Path) -> None:
+    build = [sys.executable, ROOT / "native" / "build.py", "--into", tmp_path]
+    run(build, CC="", PATH=str(tmp_path))  # as on a machine that has no compiler
+    other = ["tests.native.sanitized_core", str(tmp_path / LIBRARY), MODULE]
+    assert run([sys.executable, "-m", *other]) == own_digests()
