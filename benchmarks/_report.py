@@ -1,14 +1,12 @@
 """Rounds, rows, tables and JSON of the benchmarks, and the machine's other load."""
 
 import argparse
-import json
 import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -236,40 +234,27 @@ def table_of(title: str, rows: Sequence[Row]) -> Table:
         goal = "" if row.goal is None else str(row.goal)
         holds = {True: "[green]yes[/]", False: "[bold red]no[/]", None: "?" if goal else ""}
         table.add_row(
-            row.name, f"{_number(row.value)} {row.unit}",
+            row.name, f"{number_text(row.value)} {row.unit}",
             "" if row.peer is None else row.peer.name,
-            "" if row.peer is None else f"{_number(row.peer.value)} {row.unit}",
-            "" if row.ratio is None else _number(row.ratio),
+            "" if row.peer is None else f"{number_text(row.peer.value)} {row.unit}",
+            "" if row.ratio is None else number_text(row.ratio),
             goal, holds[row.holds],
         )  # fmt: skip
     return table
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+    """Return a figure with four digits; a dash for None."""
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
 
 
-def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of some benchmarks; return 0 if all of them could be measured."""
-    parser = argparse.ArgumentParser(
-        description="Measure " + ", ".join(benchmark.title for benchmark in benchmarks) + "."
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
-    names = [benchmark.name for benchmark in benchmarks]
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}")
-    for benchmark in benchmarks:
-        benchmark.add_arguments(parser)
-    options = parser.parse_args(arguments)
-    chosen = options.names or names
-    if unknown := [name for name in chosen if name not in names]:
-        parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(names)}")
-    benchmarks = [benchmark for benchmark in benchmarks if benchmark.name in chosen]
-    console = Console()
-    if not console.is_terminal:
-        console.width = _TABLE_WIDTH
-    everything, failures = [], 0
+def measured(
+    benchmarks: Iterable[Benchmark], options: argparse.Namespace, console: Console
+) -> tuple[list[tuple[str, Row]], int]:
+    """Run benchmarks and print their tables; return (benchmark, row) and the number of failures."""
+    everything, failures = list[tuple[str, Row]](), 0
     for benchmark in benchmarks:
         print(f"{benchmark.name}:", file=sys.stderr)
         load, begun_s = Load(), time.monotonic()
@@ -283,7 +268,5 @@ def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None)
         for row in rows:
             if (note := row.as_json().get("note")) is not None:
                 console.print(f"{row.name}: {note}", highlight=False, markup=False)
-        everything += [row.as_json() | {"benchmark": benchmark.name} for row in rows]
-    if options.json is not None:
-        options.json.write_text(json.dumps(everything, indent=2, allow_nan=False) + "\n")
-    return 1 if failures else 0
+        everything += [(benchmark.name, row) for row in rows]
+    return everything, failures

@@ -23,9 +23,8 @@ from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, med
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import local
-from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.chunk_store import Store, run_campaign
 
 NAME = "mb_vs_zoh"
 ROUNDS = 3

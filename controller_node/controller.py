@@ -8,13 +8,14 @@ Losses are compared with the network's guarantee from the recorded rows.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule, settings_key
+from noack.config.parameter_changes import ChangeSchedule
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
@@ -24,7 +25,7 @@ from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
-from noack.machines.loop_machines import LoopMachines, Role, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -228,6 +229,12 @@ class Controller:
         })  # fmt: skip
         self._set_point(controller, self.setpoint)
 
+    def redraw(self, controller: Any, memory: CoreMemory) -> None:
+        """Set what x(0) determines."""
+        self._memory = memory
+        if self.x0 is not None:
+            reals_at(controller.x_c, controller.machine.n)[:] = self.x0
+
     def answer(self, question: int, controller: Any) -> Sequence[Notice]:
         """Apply changes, or call the user's control law."""
         n, t_ns = controller.machine.n, controller.asked_ns
@@ -303,19 +310,29 @@ def controllers_of(
 
     Of the plant's data they use at most x(0).
     """
-    results: dict[str, Any] = {}
-    phases = tuple(phases_ns or (0,) * len(loops))
+    parts, alike = alike_parts(loops, partial(_part, start), _redrawn)
+    if not start.is_restart:
+        return LoopMachines(parts, phases_ns, alike=alike)
+    phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks
     parts = [
-        _part(
-            one, start._replace(from_ns=start.from_ns - phase_ns),
-            results.setdefault(settings_key(one), {}),
-        )
-        for one, phase_ns in zip(loops, phases, strict=True)
-    ]  # fmt: skip
+        replace(part, start=start._replace(from_ns=start.from_ns - phase_ns))
+        for part, phase_ns in zip(parts, phases, strict=True)
+    ]
     return LoopMachines(parts, phases)
 
 
-def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Controller:
+def _redrawn(controller: Controller, resolved: Scenario) -> Controller:
+    """Return a controller as another one, whose plant has other draws."""
+    law, schedule = controller.law, controller.schedule
+    return replace(
+        controller,
+        law=law if isinstance(law, LinearFeedback) else law_of(resolved),
+        x0=None if controller.x0 is None else np.array(resolved.plant.initial_state),
+        schedule=None if schedule is None else schedule.of_alike(resolved),
+    )
+
+
+def _part(start: Start, resolved: Scenario) -> Controller:
     loop = loop_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input, acknowledges = resolved.controller.safe_input, resolved.protocol.acknowledges
@@ -334,7 +351,7 @@ def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Controll
         predictive=resolved.message_sizes.is_predictive,
         predictions=resolved.controller.predictions,
         setpoint=setpoint_of(resolved),
-        schedule=None if acknowledges else ChangeSchedule(resolved, setpoint_of, results),
+        schedule=None if acknowledges else ChangeSchedule(resolved, setpoint_of),
     )
 
 

@@ -20,7 +20,7 @@ applied. The policy then determines the input:
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -35,7 +35,7 @@ from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
-from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, set_machine
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_parts, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
@@ -216,14 +216,16 @@ class Plant:
             "measure_every": self.measure_every, "reports_inputs": self.reports_inputs,
             "predictions": self.predictions, "input_period_ns": self.input_period_ns,
             "newest_sequence": NO_SEQUENCE, "fallback_sequence": NO_SEQUENCE, "missing_ns": -1,
-            "x": np.array(self.system.x), "z": np.array(self.system.z), "u": np.zeros(m),
+            "x": np.zeros(n), "z": np.zeros(shape.internal), "u": np.zeros(m),
             "applied": np.zeros(sources), "held": np.zeros((shown, m)),
             "inputs": np.zeros((self.predictions, m)), "x_c": np.zeros(n),
             "x_fallback": np.zeros(n), "scratch": np.zeros(2 * n + 2 * m),
         })  # fmt: skip
         if isinstance(self.system, LinearSystem):
-            Ad, Bd = discretise(self.system.A, self.system.B, self.period_ns)
-            memory.fill(plant, {"system": core.NOACK_LINEAR, "Ad": Ad, "Bd": Bd})
+            memory.fill(plant, {
+                "system": core.NOACK_LINEAR, "Ad": np.zeros((n, n)), "Bd": np.zeros((n, sources)),
+            })  # fmt: skip
+        self.redraw(plant, memory)
         self.watchdog.fill(plant, memory, self.period_ns)
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measuring is not None and self.measuring.is_noisy
@@ -233,6 +235,14 @@ class Plant:
             signal = getattr(plant, name)
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
+
+    def redraw(self, plant: Any, memory: CoreMemory) -> None:
+        """Set the state, and the matrices of a linear system."""
+        n, system = plant.machine.n, self.system
+        reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
+        if isinstance(system, LinearSystem):
+            Ad, Bd = discretise(system.A, system.B, self.period_ns)
+            reals_at(plant.Ad, n, n)[:], reals_at(plant.Bd, n, plant.sources)[:] = Ad, Bd
 
     def answer(self, question: int, plant: Any) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""
@@ -287,7 +297,8 @@ def plants_of(
 
     A plant cannot be restarted during the run: ``start`` has no effect.
     """
-    return LoopMachines([_part(loop) for loop in loops], phases_ns)
+    parts, alike = alike_parts(loops, _part, _redrawn)
+    return LoopMachines(parts, phases_ns, alike=alike)
 
 
 def _part(resolved: Scenario) -> Plant:
@@ -306,6 +317,13 @@ def _part(resolved: Scenario) -> Plant:
     )
 
 
+def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
+    return replace(
+        plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
+        measuring=measurement_model_of(resolved),
+    )  # fmt: skip
+
+
 def system_of(resolved: Scenario) -> PlantSystem:
     """Return the system of a resolved scenario's plant, at x(0).
 
@@ -316,11 +334,12 @@ def system_of(resolved: Scenario) -> PlantSystem:
         CallerError: a file or module that the system needs is missing, or differs from the
             settings.
     """
-    loop, plant = loop_of(resolved), resolved.plant
-    B: Matrix = loop.B
+    plant, model = resolved.plant, resolved.model
+    A: Matrix = np.array(model.A if plant.A is None else plant.A)
+    B: Matrix = np.array(model.B if plant.B is None else plant.B)
     if any(one.at == "state" for one in plant.disturbances):
-        B = np.hstack([B, np.eye(loop.n)])
-    start = PlantStart(np.array(plant.initial_state), loop.A, B, resolved.timing.plant_period_ns)
+        B = np.hstack([B, np.eye(len(A))])
+    start = PlantStart(np.array(plant.initial_state), A, B, resolved.timing.plant_period_ns)
     return plant.system.system(start)
 
 

@@ -16,19 +16,20 @@ are unknown, and the first known input is used.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule, settings_key
+from noack.config.parameter_changes import ChangeSchedule
 from noack.config.resolution import assumed_model, loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.machines.loop_machines import LoopMachines, Role, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
@@ -173,6 +174,15 @@ class Sensor:
         if self.x0 is not None:
             self._start(sensor, 0, self.x0)
 
+    def redraw(self, sensor: Any, memory: CoreMemory) -> None:
+        """Set what x(0) determines."""
+        self._memory = memory
+        if self.observer is not None:
+            self.observer.fill(sensor, memory)
+        if self.x0 is not None:
+            reals_at(sensor.x_s, sensor.machine.n)[:] = self.x0
+            self._start(sensor, 0, self.x0)
+
     def answer(self, question: int, sensor: Any) -> Sequence[Notice]:
         """Apply changes, let the user's trigger decide, or make room for sent updates."""
         if question == core.NOACK_ASK_CHANGE:
@@ -279,12 +289,11 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    results: dict[str, Any] = {}
-    parts = [_part(one, start, results.setdefault(settings_key(one), {})) for one in loops]
-    return LoopMachines(parts, phases_ns)
+    parts, alike = alike_parts(loops, partial(_part, start), partial(_redrawn, start))
+    return LoopMachines(parts, phases_ns, alike=alike)
 
 
-def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Sensor:
+def _part(start: Start, resolved: Scenario) -> Sensor:
     loop, acknowledges = loop_of(resolved), resolved.protocol.acknowledges
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     return Sensor(
@@ -295,10 +304,21 @@ def _part(resolved: Scenario, start: Start, results: dict[Any, Any]) -> Sensor:
         period_ns=resolved.timing.measurement_period_ns,
         first_number=start.first_number,
         setpoint=None if acknowledges else loop.setpoint,
-        schedule=None if acknowledges else ChangeSchedule(resolved, _prepared, results),
+        schedule=None if acknowledges else ChangeSchedule(resolved, _prepared),
         timeout_ns=resolved.timing.acknowledgement_timeout_ns if acknowledges else None,
         observer=observer_of(resolved, restarted=start.is_restart),
         horizon_ns=resolved.timing.horizon_ns,
+    )
+
+
+def _redrawn(start: Start, sensor: Sensor, resolved: Scenario) -> Sensor:
+    """Return a sensor as another one, whose plant has other draws."""
+    schedule, observer = sensor.schedule, sensor.observer
+    return replace(
+        sensor,
+        x0=None if sensor.x0 is None else np.array(resolved.plant.initial_state),
+        schedule=None if schedule is None else schedule.of_alike(resolved),
+        observer=None if observer is None else observer_of(resolved, restarted=start.is_restart),
     )
 
 

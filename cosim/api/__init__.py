@@ -18,12 +18,12 @@ from cosim.api.scenarios import from_system as from_system
 from cosim.api.scenarios import load as load
 from cosim.api.scenarios import with_settings as with_settings
 from cosim.api.studies import CampaignResult as CampaignResult
+from cosim.api.studies import Measurement as Measurement
 from cosim.api.studies import campaign as campaign
 from cosim.api.studies import certify as certify
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
-from cosim.measurement.network_measurement import Measurement as Measurement
 from cosim.output.certificates import Certificates as Certificates
 from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError

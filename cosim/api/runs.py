@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from cosim.analysis.summary_model import Claim, RunSummary
     from cosim.output.figure_description import FigureDescription
     from cosim.record.run_record import RecordedRun, RunRecord
-    from cosim.studies.comparison.run_comparison import RunComparison
-    from cosim.studies.reproduction.run_repetition import Repetition
+    from cosim.studies.run_comparison import RunComparison
+    from cosim.studies.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -258,7 +258,7 @@ class Run:
         Raises:
             NoackError: the file cannot be written.
         """
-        from cosim.studies.reproduction.run_archive import write_archive
+        from cosim.studies.run_archive import write_archive
 
         self.summary  # noqa: B018  # of a temporary run, it is computed now
         write_archive(self.directory, Path(path))
@@ -418,7 +418,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "R
         NoackError: the file is not such an archive, is damaged, or contains code without
             ``run_code`` or a long run without ``long``.
     """
-    from cosim.studies.reproduction.run_repetition import repeat_archive
+    from cosim.studies.run_repetition import repeat_archive
 
     return repeat_archive(Path(path), run_code=run_code, long=long)
 
@@ -437,7 +437,7 @@ def compare(*runs: Run | Folder) -> "RunComparison":
         NoackError: there are fewer than two or more than seven runs, or their plants have different
             numbers of states.
     """
-    from cosim.studies.comparison.run_comparison import compare_runs
+    from cosim.studies.run_comparison import compare_runs
 
     for one in runs:
         if isinstance(one, Run):

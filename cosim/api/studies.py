@@ -9,12 +9,14 @@ from contextlib import nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load
-from cosim.measurement.network_measurement import Measurement, MeasurementOptions
+from cosim.measurement.measurement_outputs import write_network
+from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
+from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
 from cosim.output.certificates import Certificates, certificates_of
 from cosim.shipped_files import find_shipped
@@ -74,6 +76,31 @@ def margin(
     return find_margin(
         resolve(load(scenario)), most_m=most_m, accuracy=accuracy, with_period=period
     )
+
+
+class Measurement(NetworkMeasurement):
+    """The measurement of a network, which writes its page and a network that reproduces it."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the page of tables and figures (``.html``).
+
+        Raises:
+            NoackError: the name has another ending, or the file cannot be written.
+        """
+        # Here: it imports matplotlib, which a measurement without a page does not need.
+        from cosim.measurement.measurement_page import write_page
+
+        write_page(self, None, Path(path))
+
+    def write_network(
+        self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
+    ) -> None:
+        """Write a ``[network]`` section that reproduces the network (``.toml``).
+
+        Raises:
+            NoackError: the name has another ending, or a file cannot be written.
+        """
+        write_network(self, Path(path), form)
 
 
 def measure(

@@ -2,12 +2,21 @@
 
 A packet is effective (``docs/mansd.md``) if it is received within the deadline, before every later
 packet. A receiver that uses only the newest data misses all others.
+
+The statistics of bursts (histogram, the M of a quantile, (m, K) table) follow. Their confidence
+intervals are those of likelihoods, and the exact ones of a Poisson rate.
 """
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq, minimize
+from scipy.special import xlogy
+from scipy.stats import binom, chi2
 
 from noack.traces.packet_trace import LOST_NS, Int64s, PacketTrace
 
@@ -108,3 +117,196 @@ def loss_bursts(effective: Flags) -> LossBursts:
     steps = np.diff(np.concatenate([[1], effective.view(np.int8), [1]]))
     first = np.flatnonzero(steps < 0)
     return LossBursts(len(effective), first, np.flatnonzero(steps > 0) - first)
+
+
+Reals = NDArray[np.float64]
+LEVEL = 0.95
+"""Nominal coverage of all intervals."""
+_ALLOWED = float(chi2.ppf(LEVEL, 1)) / 2
+"""Loss of log-likelihood at the ends of an interval."""
+_TOLERANCE = 0.01
+_LONGEST_STEP = 4.0
+
+
+class Estimate(NamedTuple):
+    """A value with its confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def binomial_estimate(successes: int, trials: int) -> Estimate | None:
+    """Return a probability with its likelihood-ratio interval; None without trials."""
+    if not trials:
+        return None
+    failures, share = trials - successes, successes / trials
+
+    def lacking(probability: float) -> float:
+        at = xlogy(successes, probability) + xlogy(failures, 1 - probability)
+        return float(xlogy(successes, share) + xlogy(failures, 1 - share) - at) - _ALLOWED
+
+    def end(outer: float, certain: bool) -> float:
+        return outer if certain else float(brentq(lacking, share, outer, xtol=1e-15))
+
+    low = 0.0 if not successes else end(min(1e-300, share / 2), False)
+    return Estimate(share, low, 1.0 if not failures else end(1 - 1e-16, False))
+
+
+def poisson_estimate(count: int, exposure: float) -> Estimate:
+    """Return a rate with its exact interval (Garwood, 1936)."""
+    tail = (1 - LEVEL) / 2
+    low = float(chi2.ppf(tail, 2 * count)) / 2 if count else 0.0
+    high = float(chi2.ppf(1 - tail, 2 * count + 2)) / 2
+    return Estimate(count / exposure, low / exposure, high / exposure)
+
+
+def exponential_estimate(count: int, total: float) -> Estimate | None:
+    """Return a mean with its exact interval, from the sum of ``count`` values; None without any."""
+    if not count:
+        return None
+    tail = (1 - LEVEL) / 2
+    ends = (2 * total / float(chi2.ppf(at, 2 * count)) for at in (1 - tail, tail))
+    return Estimate(total / count, *ends)
+
+
+class Minimum(NamedTuple):
+    """A minimum of a function of n parameters."""
+
+    at: Reals
+    """(n,)"""
+    value: float
+
+
+def minimise(function: Callable[[Reals], float], start: Reals, limit: float) -> Minimum:
+    """Return a local minimum with all parameters within ± ``limit``."""
+    if not len(start):
+        return Minimum(start, function(start))
+    found = minimize(
+        function, start, method="L-BFGS-B", bounds=[(-limit, limit)] * len(start),
+        options={"eps": 1e-5, "ftol": 1e-10, "gtol": 1e-5, "maxiter": 200},
+    )  # fmt: skip
+    return Minimum(np.asarray(found.x), float(found.fun))
+
+
+def profile_interval(
+    function: Callable[[Reals], float], best: Minimum, place: int, limit: float
+) -> tuple[float, float]:
+    """Return the profile-likelihood interval of a parameter, from its minimum outwards.
+
+    Args:
+        function: minus the log-likelihood of n parameters.
+        best: its minimum.
+        place: place of the parameter.
+        limit: bound of the parameters' sizes; an interval that reaches it ends there.
+    """
+    low, high = (_profile_end(function, best, place, sign * limit) for sign in (-1, 1))
+    return low, high
+
+
+def _profile_end(
+    function: Callable[[Reals], float], best: Minimum, place: int, outer: float
+) -> float:
+    """Return where the profile has lost what an interval allows, or ``outer``.
+
+    The profile at a value is searched for from the minimum at the last step inside the interval.
+    So it is a function of the value alone between two steps, although there may be several local
+    minima, and it has the sign that the steps found at both of them.
+    """
+
+    def profile(value: float, others: Reals) -> Minimum:
+        return minimise(lambda rest: function(np.insert(rest, place, value)), others, abs(outer))
+
+    def lacking(value: float, others: Reals) -> float:
+        return profile(value, others).value - limit
+
+    limit = best.value + _ALLOWED
+    inside, others, step = float(best.at[place]), np.delete(best.at, place), 0.25
+    while inside != outer:
+        beyond = inside + float(np.sign(outer)) * min(step, abs(outer - inside))
+        following = profile(beyond, others)
+        if following.value > limit:
+            return float(brentq(lacking, inside, beyond, args=(others,), xtol=_TOLERANCE))
+        inside, others, step = beyond, following.at, min(2 * step, _LONGEST_STEP)
+    return outer
+
+
+WINDOWS = (2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""K of the (m, K) table."""
+
+
+@dataclass(frozen=True)
+class QuantileM:
+    """The paper's M (at most M − 1 consecutive losses) for a share of bursts or packets."""
+
+    share: float
+    bursts: int
+    """Smallest M with at least this share of the loss bursts not longer than M − 1."""
+    bursts_confident: int | None
+    """The same for the network's bursts, if they are independent, with confidence 95 %; None: too
+    few bursts."""
+    packets: int
+    """Smallest M such that at least this share of the packets end no more than M − 1 consecutive
+    losses."""
+
+
+def histogram(bursts: LossBursts) -> dict[int, int]:
+    """Return the number of bursts by length."""
+    lengths, counts = np.unique(bursts.length, return_counts=True)
+    return dict(zip(lengths.tolist(), counts.tolist(), strict=True))
+
+
+def quantile_m(bursts: LossBursts, share: float) -> QuantileM:
+    """Return M for a share; without bursts it is 1."""
+    ordered = np.sort(bursts.length)
+    count = len(ordered)
+    place = math.ceil(share * count - 1e-9)
+    # P(at most rank − 1 of the bursts are in the share) ≥ 95 % (Wilks, 1941)
+    rank = int(binom.ppf(LEVEL, count, share)) + 1
+    confident = int(ordered[rank - 1]) + 1 if rank <= count else None
+    return QuantileM(
+        share,
+        int(ordered[place - 1]) + 1 if place > 0 else 1,
+        confident,
+        _packet_quantile(bursts, share),
+    )
+
+
+def _packet_quantile(bursts: LossBursts, share: float) -> int:
+    """Return the smallest M with Σ max(length − (M − 1), 0) ≤ (1 − share) packets."""
+    allowed = math.floor((1 - share) * bursts.packets + 1e-9)
+    low, high = 0, bursts.longest
+    while low < high:
+        middle = (low + high) // 2
+        if int(np.maximum(bursts.length - middle, 0).sum()) <= allowed:
+            high = middle
+        else:
+            low = middle + 1
+    return low + 1
+
+
+def most_losses(
+    bursts: LossBursts, windows: Sequence[int], left_out: Flags | None = None
+) -> dict[int, int]:
+    """Return the largest number of losses in any K consecutive packets, by K.
+
+    Windows that touch a burst that is left out do not count; a K without a window has no entry.
+    """
+    lost = _before(bursts)
+    skipped = None if left_out is None or not left_out.any() else _before(bursts.only(left_out))
+    found = {}
+    for window in (one for one in windows if one <= bursts.packets):
+        most = lost[window:] - lost[:-window]
+        if skipped is not None:
+            most = most[skipped[window:] == skipped[:-window]]
+        if len(most):
+            found[window] = int(most.max())
+    return found
+
+
+def _before(bursts: LossBursts) -> NDArray[np.int32]:
+    """Return the number of losses before each of the k packets, and in all, (k + 1,)."""
+    steps = np.zeros(bursts.packets + 1, np.int32)
+    steps[bursts.first] = 1
+    steps[bursts.end] -= 1
+    return np.append(np.int32(0), np.cumsum(np.cumsum(steps[:-1]), dtype=np.int32))

@@ -8,9 +8,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.measurement.burst_statistics import histogram
 from cosim.measurement.certificate_time import CertificateTime
-from cosim.measurement.confidence_interval import Estimate
+from cosim.measurement.loss_bursts import Estimate, histogram
 from cosim.measurement.network_measurement import Measurement
 from noack.core.number_format import NONE, duration, number, percent
 

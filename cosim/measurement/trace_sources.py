@@ -1,19 +1,43 @@
-"""Packet traces from all that can be measured: files of known formats, run directories."""
+"""Packet traces from all that can be measured.
 
+The sources are files of known formats, fate files of the emulator (``noack netem --record-fates``),
+run directories (the updates, from the emulator to the controller), and the delivery opportunities
+of mahimahi. The latter say when the link could deliver, and nothing about losses. So their trace is
+that of a simulated probe through the emulator's link: its delays are those of waiting for the next
+opportunity.
+"""
+
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from cosim.measurement.fate_source import is_fate_file, read_fate_file
-from cosim.measurement.opportunity_source import is_opportunity_file, read_opportunities
-from cosim.measurement.run_source import read_run
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cosim.record.run_events import packet_outcomes
+from cosim.record.run_record import RunRecord, load_record
+from netem.fates import opened_fates
+from netem.link_state import LinkState
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, one_line, why
 from noack.core.file_access import open_regular
+from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
-from noack.traces.packet_trace import PacketTrace
+from noack.traces.packet_trace import (
+    LOST_NS,
+    MAX_PACKETS,
+    PacketTrace,
+    TraceRecordError,
+    packet_trace,
+)
 from noack.traces.trace_formats import read_trace
 
 _HEAD_BYTES = 64
@@ -107,3 +131,152 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
     except (OSError, ValueError) as error:
         names = ", ".join(map(str, paths))
         raise CallerError(f"{names}: {one_line(error)}") from None
+
+
+_FLOW = ("link", "direction", "flow")
+_COLUMNS = (
+    *_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit",
+)  # fmt: skip
+_LATEST_NS = 2**61
+
+
+def is_fate_file(head: bytes) -> bool:
+    """Whether a file that begins with these bytes may be a fate file: it is Parquet."""
+    return head[:4] == b"PAR1"
+
+
+def read_fate_file(path: Path, number: int) -> PacketTrace:
+    """Return the trace of a flow, chosen by its number of packets; 1 is the largest.
+
+    A corrupted datagram is a lost one; of a datagram and its copy, the first intact one counts.
+
+    Raises:
+        CallerError: one line; it is not a complete fate file, or has no such flow.
+    """
+    with opened_fates(path) as (file, _):
+        counts: Counter[tuple[Any, ...]] = Counter()
+        for batch in file.iter_batches(columns=list(_FLOW)):
+            table = pa.Table.from_batches([batch]).group_by([*_FLOW]).aggregate([([], "count_all")])
+            for row in table.to_pylist():
+                counts[tuple(row[name] for name in _FLOW)] += row["count_all"]
+        if not 1 <= number <= len(counts):
+            raise CallerError(f"{path}: has no flow {number}; its flows are 1 to {len(counts)}")
+        chosen, packets = counts.most_common(number)[-1]
+        if packets > MAX_PACKETS:
+            raise CallerError(f"{path}: the flow has more than {MAX_PACKETS} packets")
+        parts = []
+        for batch in file.iter_batches(columns=list(_COLUMNS)):
+            columns = {
+                name: np.asarray(batch[name].to_numpy(zero_copy_only=False)) for name in _COLUMNS
+            }
+            here = np.logical_and.reduce(
+                [columns[name] == value for name, value in zip(_FLOW, chosen, strict=True)]
+            )
+            parts.append([columns[name][here] for name in _COLUMNS[3:]])
+    rows = dict(zip(_COLUMNS[3:], map(np.concatenate, zip(*parts, strict=True)), strict=True))
+    received_ns, lost = _received(path, rows)
+    try:
+        trace = packet_trace(rows["arrival_ns"], received_ns, lost, rows["packet"])
+    except TraceRecordError as error:
+        raise CallerError(f"{path}: packet {rows['packet'][error.row]} {error}") from None
+    link, direction, flow = chosen
+    others = f"; --flow chooses another of the {len(counts)} flows" if len(counts) > 1 else ""
+    return trace.noted(f"flow {number}: {link} {direction}, flow {flow}, {packets} packets{others}")
+
+
+def _received(
+    path: Path, rows: dict[str, NDArray[Any]]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the times of the first intact delivery, and which packets have none."""
+    delays = rows["delay_ns"], rows["copy_delay_ns"]
+    if max(int(np.abs(one).max(initial=0)) for one in (*delays, rows["arrival_ns"])) > _LATEST_NS:
+        raise CallerError(f"{path}: has a time that is too large")
+    never = np.iinfo(np.int64).max
+    dropped = np.isin(rows["fate"], [Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT])
+    intact = [
+        np.where((delay >= 0) & (rows[bit] < 0) & ~dropped, delay, never)
+        for delay, bit in zip(delays, ("bit", "copy_bit"), strict=True)
+    ]
+    delay_ns = np.minimum(*intact)
+    lost = delay_ns == never
+    return np.where(lost, LOST_NS, rows["arrival_ns"] + np.where(lost, 0, delay_ns)), lost
+
+
+def read_run(run_dir: Path) -> PacketTrace:
+    """Return the trace of a run's updates.
+
+    Raises:
+        NoackError: it is not a run, or has no updates.
+    """
+    try:
+        return updates_trace(load_record(run_dir))
+    except ValueError as error:
+        raise CallerError(f"{run_dir}: {error}") from None
+
+
+def updates_trace(record: RunRecord) -> PacketTrace:
+    """Return the trace of the updates: sent when they reached the emulator.
+
+    Updates that were in flight at the end are left out. Raise ValueError if there are none.
+    """
+    outcomes = packet_outcomes(record)
+    arrived = record.columns(CONTROLLER_DELIVERY, "sequence", "now_ns")
+    numbers, first = np.unique(arrived["sequence"], return_index=True)
+    received_ns = np.full(len(outcomes.sequence), LOST_NS)
+    if len(numbers):
+        at = np.minimum(np.searchsorted(numbers, outcomes.sequence), len(numbers) - 1)
+        here = numbers[at] == outcomes.sequence
+        received_ns[here] = arrived["now_ns"][first[at[here]]]
+    sent_ns, lost = outcomes.now_ns, received_ns == LOST_NS
+    ended = ~(outcomes.in_flight & lost)
+    if not ended.any():
+        raise ValueError("no updates reached the network emulator")
+    # Numbers of restarted sensors begin anew far above; the order at the emulator has no gaps.
+    trace = packet_trace(sent_ns[ended], np.maximum(received_ns, sent_ns)[ended], lost[ended])
+    flying = int((~ended).sum())
+    notes = [f"left out: {flying} updates in flight at the end"] if flying else []
+    return trace.noted("the updates of the run, from emulator to controller", *notes)
+
+
+_LINES = re.compile(rb"(?:[0-9]{1,15}[ \t]*\r?\n)+[0-9]{0,15}")
+_PROBE_BYTES = 100
+_MOST_PROBES = 5_000_000
+
+
+def is_opportunity_file(head: bytes) -> bool:
+    """Whether a file begins with lines of one whole number each."""
+    return _LINES.fullmatch(head) is not None
+
+
+def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
+    """Return the trace of a probe with this period, for as long as the file.
+
+    Raises:
+        CallerError: one line; the file cannot be read, or is wrong.
+    """
+    read = Opportunities(file=str(path.absolute())).without_files(Path("/"), "")
+    times_ms = np.array(read.times_ms)
+    probes = read.length_ns // period_ns
+    if not 1 <= probes <= _MOST_PROBES:
+        raise CallerError(
+            f"{path}: {read.length_ns / 1e9:g} s are {probes} datagrams of the simulated probe; "
+            f"expected 1 to {_MOST_PROBES}; choose another --rate"
+        )
+    link = LinkState(LinkSettings(impairments=(read,), mansd=None), 0, "link", "forward")
+    link.start_flow(0, 0)
+    sent_ns = np.arange(probes) * period_ns
+    received_ns = np.full(probes, LOST_NS)
+    for k, at_ns in enumerate(sent_ns.tolist()):
+        release_ns = link.decide(0, _PROBE_BYTES, at_ns).release_ns
+        if release_ns != NEVER_NS:
+            received_ns[k] = release_ns
+    rate_bps = len(times_ms) * OPPORTUNITY_BYTES * 8 * NS_PER_S / read.length_ns
+    gaps_ms = np.diff(times_ms, prepend=0)
+    k = int(gaps_ms.argmax())
+    return packet_trace(sent_ns, received_ns, received_ns == LOST_NS).noted(
+        f"delivery opportunities of mahimahi: {len(times_ms)} in {read.length_ns / 1e9:g} s, "
+        f"{rate_bps / 1e6:.4g} Mbit/s; longest time without one: {gaps_ms[k]} ms, "
+        f"before {times_ms[k] / 1e3:g} s",
+        f"they say nothing about losses: this is a simulated probe, {_PROBE_BYTES} bytes every "
+        f"{period_ns / 1e6:g} ms, through a link with them",
+    )

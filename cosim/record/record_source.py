@@ -272,6 +272,14 @@ class NetworkRows:
         self._orders = {table: np.argsort(loop, kind="stable") for table, loop in loops.items()}
         self._counts: dict[tuple[str, int], int] = {}
 
+    def counts(self) -> dict[str, NDArray[np.int64]]:
+        """Return the number of rows of each loop by table, shape (loops,)."""
+        loops = len(self._phases_ns)
+        return {
+            table: np.diff(self._ends[table]) if table in self._ends else np.full(loops, len(rows))
+            for table, rows in self._rows.items()
+        }
+
     def of_loop(self, number: int) -> dict[str, Rows]:
         """Return the rows of a loop."""
         own = {}

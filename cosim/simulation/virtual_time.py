@@ -6,18 +6,27 @@ live run in which no deadline is missed. It depends on its scenario alone, bit f
 of the network couple the loops.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, without_loop
+from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, without_loop
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.parameter_changes import change_notice, scheduled
-from noack.config.resolution import has_loop, network_tables, resolve, shape_of, tables_of
-from noack.config.scenario import Scenario, loops_of, phases_ns
+from noack.config.resolution import (
+    has_loop,
+    is_of_network,
+    network_tables,
+    resolved_loops,
+    shape_of,
+    tables_of,
+)
+from noack.config.scenario import Scenario, phases_ns
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.machine_interface import Notice, Record
@@ -37,6 +46,7 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
     "controller": controllers_of,
 }
 """In the order of ``noack_role``."""
+_REASONS = tuple(reason.value for reason in Rejection)
 _INPUTS_PER_PROGRESS = 2048
 _SENT_PLACES = 64
 
@@ -62,9 +72,22 @@ class RecordCollector:
 
     def rows(self, table: str, dtype: np.dtype[np.void]) -> Rows:
         """Return all rows of a table of this type."""
-        announced = np.array(self._settings.get(table, []), dtype)
-        batches = [rows for rows in self._batches.get(table, []) if rows.dtype == dtype]
-        return np.concatenate([announced, *batches])
+        return _joined(
+            [np.array(self._settings.get(table, []), dtype), *self._batches.get(table, [])]
+        )
+
+    def counts(self, table: str, loops: int) -> NDArray[np.int64]:
+        """Return the number of rows of each loop in a table of the machines, shape (loops,)."""
+        numbers = [rows[LOOP] for rows in self._batches.get(table, [])]
+        numbers.append(np.array([row[0] for row in self._settings.get(table, [])], np.uint16))
+        return np.bincount(np.concatenate(numbers), minlength=loops)
+
+    def take_by_loop(self, table: str, dtype: np.dtype[np.void], loops: int) -> list[Rows]:
+        """Return the rows of each loop in a table of the machines, and keep them no longer."""
+        batches = self._batches.pop(table, [])
+        if settings := self._settings.pop(table, []):
+            batches = [np.array(settings, dtype), *batches]
+        return _split(_joined(batches or [np.zeros(0, dtype)]), loops)
 
     def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
@@ -144,10 +167,10 @@ class VirtualRun:
         """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
         machine = self.machines[role].machines[loop].machine
         counts = machine.acknowledgements if acknowledges else machine.received
-        rejected = zip(Rejection, counts.rejected, strict=True)
+        rejected = zip(_REASONS, counts.rejected, strict=True)
         return {
             "accepted": counts.accepted,
-            "rejected": {reason.value: count for reason, count in rejected if count},
+            "rejected": {reason: count for reason, count in rejected if count},
         }
 
     def _new_core(self, loops: int) -> Any:
@@ -174,16 +197,16 @@ class VirtualRun:
         self._sent = simulation.sent = larger
         simulation.sent_places, simulation.sent_first = 2 * places, 0
 
-    def _take(self, role: str) -> None:
+    def _take(self, role: str, *, last: bool = False) -> None:
         """Take the rows and notices of the machines of a role."""
-        for table, rows in self.machines[role].take_rows():
+        for table, rows in self.machines[role].take_rows(last=last):
             self.record.extend(table, rows)
         for notice in self.machines[role].take_notices():
             self.record.take(role, notice)
 
     def _take_all(self) -> None:
         for role in self.machines:
-            self._take(role)
+            self._take(role, last=True)
         for table, rows in self.channel.take_rows():
             self.record.extend(table, rows)
 
@@ -214,8 +237,7 @@ def simulate_loops(scenario: Scenario, progress: Progress | None = None) -> Reco
     Returns:
         The record of the run; its reports have no entries about sockets or real-time settings.
     """
-    loops = [resolve(loop) for loop in loops_of(scenario)]
-    return _simulated(scenario, loops, None, progress)
+    return _simulated(scenario, resolved_loops(scenario), None, progress)
 
 
 def _simulated(
@@ -230,29 +252,84 @@ def _simulated(
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
     packets = NetworkRows(of_network, run.phases_ns)
-    by_loop = {
-        table: _split(run.record.rows(table, dtype), len(loops))
-        for table, dtype in row_types(map(shape_of, loops)).items()
-        if has_loop(table)
+    types = row_types(map(shape_of, loops))
+    counts = packets.counts() | {
+        table: run.record.counts(table, len(loops)) for table in types if not is_of_network(table)
     }
+    by_table: dict[str, list[Rows]] = {}
     records = []
     for number, loop in enumerate(loops):
-        found = packets.of_loop(number)
-        found |= {table: rows[number] for table, rows in by_loop.items()}
-        # Nothing in virtual time compares clocks: these tables are empty.
-        tables = {
-            table: without_loop(found[table], dtype) if table in found else np.zeros(0, dtype)
-            for table, dtype in tables_of(loop).items()
-        }
-        reports = _reports(run, tables, scenario, number)
+        own_types = tables_of(loop)
+        rows = _LoopRows(run.record, by_table, types, packets, number, len(loops), own_types)
+        own_counts = {table: int(counts[table][number]) for table in own_types}
+        reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
         shared = number if len(loops) > 1 else None
-        records.append(RunRecord(loop, tables, notices, reports, "simulated", number=shared))
-    reports = {"netem": _report("netem", of_network, {"rejected": {}})}
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=shared))
+    of_all = {table: len(rows) for table, rows in of_network.items()}
+    reports = {"netem": _report("netem", of_all, {"rejected": {}})}
     common = RunRecord(
         scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
     )
     return RecordedRun(common, records)
+
+
+class _LoopRows(RecordSource):
+    """The rows of a loop. A table of the run is split by loops when one of them is first read.
+
+    Args:
+        record: the rows of the run's machines.
+        by_table: the tables that have been split, of all loops.
+        run_types: the types of the run's rows.
+        packets: the rows of the network.
+        number: the number of the loop.
+        loops: the number of loops.
+        types: the types of the loop's rows.
+    """
+
+    def __init__(
+        self,
+        record: RecordCollector,
+        by_table: dict[str, list[Rows]],
+        run_types: Mapping[str, np.dtype[np.void]],
+        packets: NetworkRows,
+        number: int,
+        loops: int,
+        types: Mapping[str, np.dtype[np.void]],
+    ) -> None:
+        super().__init__(types)
+        self._record, self._by_table, self._run_types = record, by_table, run_types
+        self._packets, self._number, self._loops = packets, number, loops
+
+    @cached_property
+    def _of_network(self) -> Mapping[str, Rows]:
+        return self._packets.of_loop(self._number)
+
+    def whole(self, table: str) -> Rows:
+        """Return all rows of a table."""
+        if is_of_network(table):
+            return self._of_network[table]
+        if not has_loop(table):  # nothing in virtual time compares clocks
+            return np.zeros(0, self.types[table])
+        if table not in self._by_table:
+            whole = self._run_types[table]
+            self._by_table[table] = self._record.take_by_loop(table, whole, self._loops)
+        return without_loop(self._by_table[table][self._number], self.types[table])
+
+    def count(self, table: str) -> int:
+        """Return the number of rows of a table."""
+        return len(self.whole(table))
+
+    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
+        """Yield the rows of a table in order."""
+        yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
+
+
+def _joined(batches: Sequence[Rows]) -> Rows:
+    """Return rows of one type in one array; numpy's own function takes as long for each column."""
+    if len(batches) == 1:
+        return batches[0]
+    return np.concatenate([rows.view(np.uint8) for rows in batches]).view(batches[0].dtype)
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:
@@ -266,19 +343,21 @@ def _split(rows: Rows, loops: int) -> list[Rows]:
 
 
 def _reports(
-    run: VirtualRun, rows: Mapping[str, Rows], scenario: Scenario, loop: int = 0
+    run: VirtualRun, counts: Mapping[str, int], scenario: Scenario, loop: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the final report of each role, as of a loop."""
+    """Return the final report of each role, as of a loop with these numbers of rows."""
     reports = {
-        role: _report(role, rows, run.reception(role, loop) if role in _ROLES else {"rejected": {}})
+        role: _report(
+            role, counts, run.reception(role, loop) if role in _ROLES else {"rejected": {}}
+        )
         for role in LOOP_ROLES
     }
     if scenario.protocol.acknowledges:
-        counts = run.reception("sensor", loop, acknowledges=True)
-        reports["sensor"]["channel"]["acknowledgements"] = counts
+        received = run.reception("sensor", loop, acknowledges=True)
+        reports["sensor"]["channel"]["acknowledgements"] = received
     return reports
 
 
-def _report(role: str, rows: Mapping[str, Rows], channel: dict[str, Any]) -> dict[str, Any]:
-    owned = {table: len(found) for table, found in rows.items() if OWNER[table] == role}
+def _report(role: str, counts: Mapping[str, int], channel: dict[str, Any]) -> dict[str, Any]:
+    owned = {table: count for table, count in counts.items() if OWNER[table] == role}
     return {"ended": HORIZON, "channel": channel, "rows": owned}

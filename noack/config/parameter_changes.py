@@ -10,6 +10,7 @@ notice.
 import json
 from bisect import bisect
 from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
@@ -24,12 +25,15 @@ from noack.config.runtime_parameters import (
 )
 from noack.config.scenario import Scenario
 from noack.config.scenario_checks import content_with_settings, with_settings
+from noack.config.sections import PlantSection
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
 
+_shared_tables = attrgetter(*(Scenario.model_fields.keys() - {"name", "plant", "seeds"}))
+_shared_of_plant = attrgetter(*(PlantSection.model_fields.keys() - {"initial_state", "A", "B"}))
 LATE = "violation"  # level of the notice of a process that applies a change late
 
 
@@ -101,9 +105,13 @@ def scheduled(scenario: Scenario) -> list[ParameterChange]:
     ]
 
 
-def settings_key(resolved: Scenario) -> str:
-    """Return what loops have in common whose scenarios differ in their plants' draws only."""
-    return repr((resolved.model, resolved.trigger, resolved.controller, resolved.network))
+def settings_key(resolved: Scenario) -> tuple[int, ...]:
+    """Return what resolved loops of one entry of [[loops]] have in common.
+
+    Loops with the same key differ in their names, seeds and plants' draws only. A key is of the
+    identities of their tables, so it is valid while the loops exist.
+    """
+    return tuple(map(id, _shared_tables(resolved) + _shared_of_plant(resolved.plant)))
 
 
 CHANGED = "change"  # level of the notice of a change
@@ -147,24 +155,30 @@ class AppliedParameters(NamedTuple):
 class ChangeSchedule:
     """The scenarios of a run in the order of time, as announced to a machine.
 
-    ``prepare`` computes the data that the machine needs of a scenario, before it is in force. Loops
-    whose scenarios differ in their draws only may share ``results``: what the changes so far, by
-    their numbers, have made of the scenario, and the data.
+    ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
     """
 
     def __init__(
         self,
         scenario: Scenario,
         prepare: Callable[[Scenario], Any] = lambda scenario: None,
-        results: dict[tuple[int, ...], tuple[Scenario, Any]] | None = None,
     ) -> None:
         self._prepare = prepare
-        self._results = {} if results is None else results
+        self._results: dict[tuple[int, ...], tuple[Scenario, Any]] = {}
         self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
         """Time at which the next scenario that is not yet applied takes effect; None if there is
         none."""
+
+    def of_alike(self, scenario: Scenario) -> "ChangeSchedule":
+        """Return a schedule for a loop that differs in its draws only.
+
+        What the changes so far, by their numbers, make of the scenario is computed once for both.
+        """
+        schedule = ChangeSchedule(scenario, self._prepare)
+        schedule._results = self._results
+        return schedule
 
     def announce(
         self, table: str, change: ParameterChange, number: int, now_ns: int, reached_ns: int

@@ -5,14 +5,20 @@ What follows from it is here, too: matrices, the trigger's policy, the tables of
 noise of its plant and of its observer's model.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
-from noack.config.scenario import Scenario, loop_scenario, loop_sections, loops_of
+from noack.config.scenario import (
+    Scenario,
+    loop_scenario,
+    loop_sections,
+    loops_by_entry,
+    loops_of,
+)
 from noack.config.scenario_checks import input_at
 from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError
@@ -81,7 +87,7 @@ def resolve(scenario: Scenario) -> Scenario:
         raise CallerError(
             f"{scenario.name}: it has {len(loops)} loops; give a scenario of one loop"
         )
-    return _resolved(loops[0])
+    return _resolved(loops)[0]
 
 
 def resolve_run(scenario: Scenario) -> Scenario:
@@ -115,37 +121,46 @@ def resolved_loops(scenario: Scenario) -> tuple[Scenario, ...]:
     Raises:
         CallerError: as :func:`resolve`.
     """
-    return tuple(map(_resolved, loops_of(scenario)))
+    return tuple(loop for loops in loops_by_entry(scenario) for loop in _resolved(loops))
 
 
-def _resolved(scenario: Scenario) -> Scenario:
+def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
+    """Return the resolved scenarios of loops that differ in their names and seeds only."""
+    scenario = loops[0]
     scenario.plant.system.require_installed()
-    model = _explicit_model(scenario.model)
-    A, B = np.array(model.A), np.array(model.B)
-    (n, m), plant = B.shape, scenario.plant
-    x0 = np.array(plant.initial_state)
-    if plant.initial_state_halfwidth is not None:
-        halfwidth = np.array(plant.initial_state_halfwidth)
-        x0 += halfwidth * stream(scenario.seeds.initial_state, "initial_state").uniform(-1, 1, n)
-    if plant.draw == "given":
-        A, B = np.array(plant.A), np.array(plant.B)
-    elif plant.draw in ("uniform", "vertex"):
-        rng = stream(scenario.seeds.plant, "plant")
-        A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
-        B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
-    K = np.array(model.gain)
-    _require_finite("plant", A, B, scenario.timing.plant_period_ns)
+    model, plant = _explicit_model(scenario.model), scenario.plant
+    period_ns = scenario.timing.plant_period_ns
+    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
+    n, m = B_model.shape
+    is_linear, found = scenario.coverage.is_linear, list[Scenario]()
+    for loop in loops:
+        x0, A, B = np.array(plant.initial_state), A_model, B_model
+        if plant.initial_state_halfwidth is not None:
+            halfwidth = np.array(plant.initial_state_halfwidth)
+            x0 += halfwidth * stream(loop.seeds.initial_state, "initial_state").uniform(-1, 1, n)
+        if plant.draw == "given":
+            A, B = np.array(plant.A), np.array(plant.B)
+        elif plant.draw in ("uniform", "vertex"):
+            rng = stream(loop.seeds.plant, "plant")
+            A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
+            B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
+        _require_finite("plant", A, B, period_ns)
+        drawn: dict[str, object] = {
+            "initial_state": tuple(x0.tolist()),
+            "initial_state_halfwidth": None,
+        }
+        if is_linear:
+            drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
+        found.append(loop.model_copy(update={
+            "model": model, "plant": plant.model_copy(update=drawn), "observer": None,
+        }))  # fmt: skip
     if scenario.mode == "model":
-        H = np.array(model.A) + np.array(model.B) @ K
+        H = A_model + B_model @ K
         _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
-    drawn: dict[str, object] = {
-        "initial_state": tuple(x0.tolist()),
-        "initial_state_halfwidth": None,
-    }
-    if scenario.coverage.is_linear:
-        drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
-    update = {"model": model, "plant": plant.model_copy(update=drawn)}
-    return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
+    observer = _observer(scenario, model)
+    if observer is None:
+        return found
+    return [loop.model_copy(update={"observer": observer}) for loop in found]
 
 
 def _explicit_model(model: ModelSection) -> ModelSection:
@@ -264,7 +279,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of a loop, from its resolved scenario."""
-    return tables(**asdict(shape_of(resolved)))
+    return tables(**vars(shape_of(resolved)))
 
 
 def shape_of(resolved: Scenario) -> RecordShape:
@@ -297,7 +312,7 @@ def run_tables(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
     shapes = {shape_of(loop_scenario(scenario, one)) for one in loop_sections(scenario)}
     return {
         table: np.dtype([(LOOP, "<u2"), *dtype.descr]) if has_loop(table) else dtype
-        for table, dtype in tables(**asdict(largest(shapes))).items()
+        for table, dtype in tables(**vars(largest(shapes))).items()
     }
 
 

@@ -8,21 +8,23 @@ place in :func:`loops_of`. A loop begins at its phase: its time 0 is that time o
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, Self
 
+import numpy as np
 from pydantic import BaseModel, ValidationError, create_model, model_validator
 
 from noack.config.run_sections import (
     MOST_LOOPS,
     LoopSection,
+    SeedsSection,
 )
 from noack.config.scenario_checks import check_changes, check_sections
 from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
-from noack.core.random_streams import stream, stream_key
+from noack.core.random_streams import named_stream_keys, stream
 from noack.settings.section import ScenarioSection
 from noack.trigger.periodic_trigger import PeriodicSettings
 
@@ -48,6 +50,8 @@ _KINDS: Mapping[str, tuple[str, ...]] = {
     "controller": ("kind",),
 }
 """The tables of a loop, each with the keys that make it replace the table of the top level."""
+_DRAWN = ("plant", "initial_state", "disturbance", "noise")
+"""The seeds that each loop has of its own."""
 
 
 def loop_sections(scenario: Scenario) -> tuple[LoopSection, ...]:
@@ -66,25 +70,33 @@ def loops_of(scenario: Scenario) -> tuple[Scenario, ...]:
     The first loop has the seeds of the run; those of the others are drawn from these and the loop's
     number. So a run with one entry of [[loops]] computes what the run without it does.
     """
-    found: list[Scenario] = []
-    for section in loop_sections(scenario):
-        entry = loop_scenario(scenario, section)
-        for name in section.names:
-            seeds = _seeds(scenario, section, len(found))
-            found.append(entry.model_copy(update={"name": name, "seeds": seeds}))
-    return tuple(found)
+    return tuple(loop for loops in loops_by_entry(scenario) for loop in loops)
+
+
+def loops_by_entry(scenario: Scenario) -> list[list[Scenario]]:
+    """Return the loops of each entry of [[loops]]; they differ in their names and seeds only."""
+    sections = loop_sections(scenario)
+    seeds = iter(_seeds(scenario, sections))
+    return [
+        [entry.model_copy(update={"name": name, "seeds": next(seeds)}) for name in section.names]
+        for section in sections
+        for entry in [loop_scenario(scenario, section)]
+    ]
 
 
 def phases_ns(scenario: Scenario) -> tuple[int, ...]:
     """Return when each loop begins: the time of the run at which the time of the loop is 0."""
-    given = [section.phase for section in loop_sections(scenario) for _ in section.names]
-    phases = []
-    for number, (phase, loop) in enumerate(zip(given, loops_of(scenario), strict=True)):
-        if phase is None:
-            seed = loop.seeds.initial_state
-            drawn = stream(seed, "phase", str(number)).uniform() if number else 0.0
-            phase = float(drawn)
-        phases.append(int(phase * _period_ns(loop)))
+    sections, phases = loop_sections(scenario), list[int]()
+    is_drawn = any(section.phase is None for section in sections)
+    seeds = _seeds(scenario, sections, ("initial_state",)) if is_drawn else []
+    for section in sections:
+        period_ns = _period_ns(loop_scenario(scenario, section))
+        for number in range(len(phases), len(phases) + section.count):
+            phase = section.phase
+            if phase is None:
+                seed = seeds[number].initial_state
+                phase = float(stream(seed, "phase", str(number)).uniform()) if number else 0.0
+            phases.append(int(phase * period_ns))
     return tuple(phases)
 
 
@@ -176,15 +188,25 @@ def _period_ns(loop: Scenario) -> int:
     return loop.timing.measurement_period_ns
 
 
-def _seeds(scenario: Scenario, section: LoopSection, number: int) -> Any:
-    given = section.seeds.model_dump(exclude_none=True)
-    if number == 0:
-        return scenario.seeds.model_copy(update=given)
-    drawn = {}
-    for name in ("plant", "initial_state", "disturbance", "noise"):
-        low, high = stream_key(getattr(scenario.seeds, name), "loop", str(number), name)
-        drawn[name] = (low | high << 32) >> 1  # 63 bits, the range of a TOML integer
-    return scenario.seeds.model_copy(update=drawn | given)
+def _seeds(
+    scenario: Scenario, sections: Sequence[LoopSection], drawn_names: Sequence[str] = _DRAWN
+) -> list[SeedsSection]:
+    """Return the seeds of each loop; those of the given names are the loop's own."""
+    seeds, count = scenario.seeds, sum(section.count for section in sections)
+    drawn: list[dict[str, int]] = [{}]
+    if count > 1:
+        names = [("loop", str(number), name) for number in range(1, count) for name in drawn_names]
+        keys = named_stream_keys([getattr(seeds, name) for *_, name in names], names)
+        low, high = keys.astype(np.uint64).T
+        bits = (low | high << np.uint64(32)) >> np.uint64(1)  # 63, the range of a TOML integer
+        by_loop = bits.reshape(-1, len(drawn_names)).tolist()
+        drawn += [dict(zip(drawn_names, values, strict=True)) for values in by_loop]
+    all_seeds: list[SeedsSection] = []
+    for section in sections:
+        given = section.seeds.model_dump(exclude_none=True)
+        own = drawn[len(all_seeds) : len(all_seeds) + section.count]
+        all_seeds += [seeds.model_copy(update=values | given) for values in own]
+    return all_seeds
 
 
 @cache

@@ -1,12 +1,15 @@
 """Memory of the core's structures: arrays that live as long as what points to them."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from noack.core.core_library import core, ffi
+from noack.core.core_library import core, ffi, pointer_to
 from noack.core.linear_systems import SCRATCH_MATRICES, Matrix, Vector
 
 _MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
@@ -24,6 +27,7 @@ class CoreMemory:
     def __init__(self) -> None:
         self._kept: list[Any] = []
         self._transitions: dict[bytes, Any] = {}
+        self._shared: list[NDArray[Any]] = []
 
     def keep(self, owner: Any) -> Any:
         """Keep an object alive as long as this memory; return it."""
@@ -47,7 +51,7 @@ class CoreMemory:
 
         The matrices of ``steps_ns`` are computed at once, so that first deadlines are not delayed.
         """
-        H = np.array(H, np.float64)
+        H = np.array(H, np.float64, order="C")
         shared = self._transitions.get(H.tobytes())
         if shared is None:
             shared = self._transitions[H.tobytes()] = self._new_transitions(H)
@@ -78,24 +82,64 @@ class CoreMemory:
             value = self.reals(number) if isinstance(number, np.ndarray) else number
             setattr(structure, name, ffi.NULL if value is None else value)
 
+    @property
+    def size(self) -> int:
+        """What is kept: a mark for :meth:`copy`."""
+        return len(self._kept)
+
+    def copy(self, structures: Any, first: int, others: Sequence[int], mark: int) -> None:
+        """Make structures of an array copies of one of them, each with arrays of its own.
+
+        Args:
+            structures: the array of structures.
+            first: number of the one that has been filled, since ``mark``.
+            others: numbers of those that become like it; they share its transition matrices.
+            mark: the size of this memory before it was filled.
+        """
+        arrays = [kept.reshape(-1) for kept in self._kept[mark:] if isinstance(kept, np.ndarray)]
+        ends = [*accumulate(map(len, arrays), initial=0)]
+        own = np.empty((len(others), ends[-1] + 1), np.uint64)
+        own[:, : ends[-1]] = np.concatenate([array.view(np.uint64) for array in arrays])
+        self._kept.append(own)
+        words = np.frombuffer(ffi.buffer(structures), np.uint64).reshape(len(structures), -1)
+        copies = np.repeat(words[None, first], len(others), axis=0)
+        starts = {array.ctypes.data: end for array, end in zip(arrays, ends[:-1], strict=True)}
+        for word in _pointer_words(ffi.typeof(structures).item):
+            if (start := starts.get(int(words[first, word]))) is not None:
+                copies[:, word] = own.ctypes.data + start * 8 + own.strides[0] * np.arange(len(own))
+        words[others] = copies
+
     def _new_transitions(self, H: Matrix) -> Any:
         n = len(H)
         fits = max(_MOST_NUMBERS // (n * n), 4)
         places = min(_MOST_PLACES, 1 << fits.bit_length() - 1)
-        steps = self._pointer(np.zeros(places, np.int64), "int64_t *")
         made = ffi.new("noack_transitions *", {"n": n, "is_static": not H.any(), "places": places})
-        made.H, made.steps_ns = self.reals(H), steps
-        made.matrices = self.zeros(places * n * n)
-        made.scratch = self.zeros(SCRATCH_MATRICES * n * n + 3 * n)
-        return self.keep(made)
+        steps_ns, matrices = np.zeros(places, np.int64), np.zeros(places * n * n)
+        scratch = np.zeros(SCRATCH_MATRICES * n * n + 3 * n)
+        made.H, made.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
+        made.matrices, made.scratch = (pointer_to(one, "double *") for one in (matrices, scratch))
+        self._shared += [H, steps_ns, matrices, scratch]
+        return made
 
     def _pointer(self, array: NDArray[Any], kind: str) -> Any:
         self._kept.append(array)
         return ffi.cast(kind, array.ctypes.data)
 
 
+@cache
+def _pointer_words(kind: Any) -> tuple[int, ...]:
+    """Return the places of the pointers in a structure of words of 64 bits, e.g. noack_plant."""
+    words: list[int] = []
+    for _, field in kind.fields:
+        word = field.offset // 8
+        if field.type.kind == "pointer":
+            words.append(word)
+        elif field.type.kind == "struct":
+            words += (word + inner for inner in _pointer_words(field.type))
+    return tuple(words)
+
+
 def reals_at(pointer: Any, *shape: int) -> NDArray[np.float64]:
     """Return the numbers at a ``double *`` as an array, which shares their memory."""
-    count = int(np.prod(shape))
-    data = ffi.buffer(pointer, 8 * count)
+    data = ffi.buffer(pointer, 8 * math.prod(shape))
     return np.frombuffer(data, np.float64).reshape(shape)

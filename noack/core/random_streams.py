@@ -5,6 +5,7 @@ not depend on the random numbers of the plant, the timing or other links.
 """
 
 import hashlib
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,11 +67,20 @@ def stream_key(seed: int, *name: str) -> tuple[int, int]:
 
 def stream_keys(seeds: NDArray[np.uint64], *name: str) -> NDArray[np.int64]:
     """Return the keys of :func:`stream_key` under k seeds below 2⁶⁴ at once, shape (k, 2)."""
+    return _keys(seeds, np.array(_words(name), np.uint32)[:, None])
+
+
+def named_stream_keys(seeds: Sequence[int], names: Sequence[tuple[str, ...]]) -> NDArray[np.int64]:
+    """Return the key of :func:`stream_key` of each seed below 2⁶⁴ and name, shape (k, 2)."""
+    return _keys(np.array(seeds, np.uint64), np.array([*map(_words, names)], np.uint32).T)
+
+
+def _keys(seeds: NDArray[np.uint64], names: NDArray[np.uint32]) -> NDArray[np.int64]:
     # numpy's SeedSequence for many seeds at once. A seed below 2¹²⁸ is four words of entropy.
     words = np.zeros((8, len(seeds)), np.uint32)
     words[0] = seeds & np.uint64(0xFFFFFFFF)
     words[1] = seeds >> np.uint64(32)
-    words[4:] = np.array(_words(name), np.uint32)[:, None]
+    words[4:] = names
     hashed = _Hash(0x43B0D7E5, 0x931E8875)
     pool = [hashed(word) for word in words[:4]]
     for source in range(4):

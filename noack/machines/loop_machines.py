@@ -11,15 +11,16 @@ The loops may have vectors of different sizes. The rows of a table then have roo
 what a loop's own row lacks is missing in them (:func:`row_layout`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_key
+from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
@@ -75,6 +76,10 @@ class MachinePart(Protocol):
         """Fill the core's structure, at the start of the machine's work."""
         ...
 
+    def redraw(self, structure: Any, memory: CoreMemory) -> None:
+        """Set what the draws determine, in a copy of a structure that an alike part has filled."""
+        ...
+
     def answer(self, question: int, structure: Any) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
         ...
@@ -86,6 +91,29 @@ class MachinePart(Protocol):
     def note(self, structure: Any, note: Any) -> Notice:
         """Return the line for the log that a step has asked for by a ``noack_note``."""
         ...
+
+
+Part = TypeVar("Part", bound=MachinePart)
+
+
+def alike_parts(
+    loops: Sequence[Scenario],
+    make: Callable[[Scenario], Part],
+    redrawn: Callable[[Part, Scenario], Part],
+) -> tuple[list[Part], list[int]]:
+    """Return the part of each loop, and the number of the first loop that is alike.
+
+    Loops are alike if they differ in their draws only. ``make`` makes the part of the first of
+    them, ``redrawn`` one with the draws of another loop.
+    """
+    parts: list[Part] = []
+    alike: list[int] = []
+    firsts: dict[tuple[int, ...], int] = {}
+    for number, loop in enumerate(loops):
+        first = firsts.setdefault(settings_key(loop), number)
+        parts.append(make(loop) if first == number else redrawn(parts[first], loop))
+        alike.append(first)
+    return parts, alike
 
 
 def set_machine(
@@ -134,6 +162,8 @@ class LoopMachines:
     Args:
         parts: the machine of each loop.
         phases_ns: when each loop begins, in the run's time; by default 0.
+        alike: the number of the first loop, for each loop, from which it differs in draws only; by
+            default its own.
         rows: rows of each table until they must be taken; by default as many as suit the loops.
 
     Raises:
@@ -145,6 +175,7 @@ class LoopMachines:
         parts: Sequence[MachinePart],
         phases_ns: Sequence[int] | None = None,
         *,
+        alike: Sequence[int] | None = None,
         rows: int | None = None,
     ) -> None:
         self.parts = tuple(parts)
@@ -154,7 +185,7 @@ class LoopMachines:
         self._notices: list[Notice] = []
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
-        self._fill_machines()
+        self._fill_machines(alike or range(len(self.parts)))
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
@@ -165,7 +196,7 @@ class LoopMachines:
             raise ValueError(f"{self.role.name}: {ffi.string(wrong).decode()}")
         core.noack_process_begin(self.core)
 
-    def _fill_machines(self) -> None:
+    def _fill_machines(self, alike: Sequence[int]) -> None:
         process, count, keep = self.core, len(self.parts), self._memory.keep
         process.role, process.loops = self.role.number, count
         machines = keep(ffi.new(f"{self.role.structure}[]", count))
@@ -174,8 +205,17 @@ class LoopMachines:
         process.heap = keep(ffi.new("int64_t[]", count))
         self.machines: Any = machines
         """(loops,) The structures of the machines."""
-        for part, structure, phase_ns in zip(self.parts, machines, self.phases_ns, strict=True):
-            part.fill(structure, self._memory)
+        copies: dict[int, list[int]] = {}
+        for number, first in enumerate(alike):
+            copies.setdefault(first, []).append(number)
+        for first, (_, *others) in copies.items():
+            mark = self._memory.size
+            self.parts[first].fill(machines[first], self._memory)
+            if others:
+                self._memory.copy(machines, first, others, mark)
+            for number in others:
+                self.parts[number].redraw(machines[number], self._memory)
+        for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
     def _fill_tables(self, rows: int) -> None:
@@ -213,13 +253,21 @@ class LoopMachines:
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
 
-    def take_rows(self) -> list[tuple[str, Rows]]:
-        """Return the rows since the last call, by table, and empty the core's tables."""
+    def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
+        """Return the rows since the last call, by table, and empty the core's tables.
+
+        ``last``: the machines make no more steps.
+        """
         taken: list[tuple[str, Rows]] = []
         for number, rows in self._tables.items():
             table = self.core.tables[number]
             if table.count:
-                found, table.count = rows[: table.count].copy(), 0
+                found, table.count = rows[: table.count], 0
+                if not last and 2 * len(found) < len(rows):
+                    found = found.copy()
+                elif not last:
+                    self._tables[number] = np.empty(len(rows), rows.dtype)
+                    table.rows = pointer_to(self._tables[number], "uint8_t *")
                 name = self.role.tables[number]
                 assert name is not None
                 taken.append((name, found))

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.measurement.live.probe_rows import ProbeRows
+from cosim.measurement.live.live_measurement import ProbeRows
 from cosim.output.viewer.recording import RecordingFile
 from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
 from netem.capture import CaptureWriter

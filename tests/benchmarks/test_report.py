@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.__main__ import all_benchmarks, run
 from benchmarks._report import (
     Benchmark,
     Goal,
@@ -13,8 +14,8 @@ from benchmarks._report import (
     Peer,
     Rounds,
     Row,
-    run,
 )
+from benchmarks.goals import BEGIN, BENCHMARKS, END, rows_of_figures, write_docs
 
 KEYS = {"name", "value", "unit", "peer", "ratio", "goal", "holds"}
 
@@ -180,3 +181,31 @@ def test_a_side_without_measurements_is_named_and_not_judged(side: str) -> None:
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)
     assert row.holds is None
     assert f"{side}: lost a datagram" in row.as_json()["note"]
+
+
+def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_path: Path) -> None:
+    rows = [
+        ("size", Row("C", 4000, "lines", goal=Goal("<=", 5000))),
+        ("startup", Row("noack run → first control step", 0.7, "s", goal=Goal("<=", 0.6))),
+        ("startup", Row("the same, against a bare import", 0.7, "s", Peer("Python", 0.2))),
+        (
+            "fleet",
+            Row("1,000 loops: end of the run", 3.0, "s", Peer("the run", 60), Goal("<=", 0.1)),
+        ),
+    ]
+    figures = rows_of_figures(rows)
+    assert [row.unit for _, row in figures] == ["s", "s", "lines"]
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    write_docs(page, figures)
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1]) == ("before", "after")
+    assert "| `noack run` to the first control step | 0.7 s |  |  | <= 0.6 | no |" in lines
+    assert "| 1,000 loops: end of the run | 3 s | the run, 60 s | 0.05 | <= 0.1 | yes |" in lines
+    page.write_text("no marks")
+    with pytest.raises(MeasurementError, match="marks"):
+        write_docs(page, figures)
+
+
+def test_every_goal_is_of_a_benchmark() -> None:
+    assert set(BENCHMARKS) <= {benchmark.name for benchmark in all_benchmarks()}

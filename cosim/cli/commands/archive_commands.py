@@ -36,7 +36,7 @@ def archive(
     `noack reproduce` repeats it.
     """
     from cosim.live.progress import PatientConsole
-    from cosim.studies.reproduction.run_archive import SUFFIX, write_archive
+    from cosim.studies.run_archive import SUFFIX, write_archive
 
     chosen = chosen_run(run_dir, runs)
     path = out or Path(f"{chosen.resolve().name}{SUFFIX}")
@@ -79,8 +79,7 @@ def reproduce(
     Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
     """
     from cosim.live.progress import PatientConsole
-    from cosim.studies.reproduction.repetition_table import print_repetition
-    from cosim.studies.reproduction.run_repetition import repeat_archive
+    from cosim.studies.run_repetition import print_repetition, repeat_archive
 
     with PatientConsole(stderr=True).status("repeating"):
         found = repeat_archive(file, run_code=run_code, long=long, into=into)
@@ -156,7 +155,7 @@ def compare(
 ) -> int:
     """Compare runs: key numbers, settings that differ, curves overlaid."""
     from cosim.live.progress import PatientConsole
-    from cosim.studies.comparison.run_comparison import compare_runs
+    from cosim.studies.run_comparison import compare_runs
 
     with PatientConsole(stderr=True).status("comparing"):
         found = compare_runs(directories)

@@ -14,7 +14,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
 
 if TYPE_CHECKING:
-    from cosim.studies.design.candidate_measures import DesignLimits
+    from cosim.studies.design.candidates import DesignLimits
     from noack.config.scenario import Scenario
     from noack.core.linear_systems import Matrix
 
@@ -192,7 +192,7 @@ def design(
     from cosim.output.figure_format import figure_files
     from cosim.studies.design import design_page as pages
     from cosim.studies.design.design_search import design as designed
-    from cosim.studies.design.loop_families import families_of
+    from cosim.studies.design.design_space import families_of
     from noack.config.scenario_file import dumps
 
     files_of_figures = figure_files(figure_format, width)
@@ -224,7 +224,7 @@ def design(
 def _limits(
     settling: float, quantile: float, settle: float, bounds: list[str], under: str
 ) -> "DesignLimits":
-    from cosim.studies.design.candidate_measures import DesignLimits
+    from cosim.studies.design.candidates import DesignLimits
 
     for option, value, most in (
         ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),

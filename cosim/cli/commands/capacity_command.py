@@ -15,8 +15,7 @@ from noack.runtime.command_line import print_to_stderr
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from cosim.studies.capacity.capacity_plan import CapacityPlan, Depth
-    from cosim.studies.capacity.loop_mixture import Kind
+    from cosim.studies.capacity.capacity_plan import CapacityPlan, Depth, Kind
 
 Loops = Annotated[
     str | None,
@@ -183,24 +182,24 @@ def _announce(
 ) -> float:
     """Print on standard error what is computed and about how long it takes; return the seconds."""
     from cosim.studies.campaign.campaign_grid import grid
-    from cosim.studies.capacity import capacity_time
+    from cosim.studies.capacity import capacity_criteria
     from cosim.studies.capacity.capacity_plan import THOROUGH
 
     points = grid(plan.campaign(), Path("noack capacity"))
     longer = plan if thorough else plan.with_depth(THOROUGH)
-    missing = capacity_time.missing_loops(plan, points, folder)
+    missing = capacity_criteria.missing_loops(plan, points, folder)
     if not missing:
         return 0.0
-    cpu_s = capacity_time.cpu_per_loop_s(points)
-    estimated_s = capacity_time.estimated_s(missing, cpu_s, workers)
-    longer_s = capacity_time.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
+    cpu_s = capacity_criteria.cpu_per_loop_s(points)
+    estimated_s = capacity_criteria.estimated_s(missing, cpu_s, workers)
+    longer_s = capacity_criteria.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
     of_live = f", and {live} live" if live else ""
     idle = "an idle core" if workers == 1 else f"{workers} idle cores"
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
         f"with {min(plan.sizes):,} to {max(plan.sizes):,} loops{of_live}; the simulation takes "
-        f"about {capacity_time.time_text(estimated_s)} on {idle}"
-        + ("" if longer == plan else f"; --thorough: {capacity_time.time_text(longer_s)}")
+        f"about {capacity_criteria.time_text(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {capacity_criteria.time_text(longer_s)}")
     )
     return estimated_s
 
@@ -210,7 +209,6 @@ def _plan(
     rate_bps: int | None, period_s: float | None, deadline_s: float | None, seed: int,
 ) -> "CapacityPlan":  # fmt: skip
     from cosim.studies.capacity import capacity_plan as plans
-    from cosim.studies.capacity import loop_mixture
     from noack.config.scenario_file import load, value_of
 
     settings: dict[str, Any] = {}
@@ -228,12 +226,12 @@ def _plan(
     for option, seconds in (("--update-period", period_s), ("--late-after", deadline_s)):
         if seconds is not None and not 0 < seconds < given.horizon_s:
             raise CallerError(f"{option} {seconds:g}: between 0 and the horizon of the scenario")
-    kinds = loop_mixture.kinds_of(given, period_s)
+    kinds = plans.kinds_of(given, period_s)
     shortest_s = min(kind.period_s for kind in kinds)
     deadline_s = deadline_s or given.certificate.network_delay_s or shortest_s
     settings["certificate.network_delay_s"] = deadline_s
-    compared = loop_mixture.policies_of(kinds) | _more_policies(policies, kinds)
-    least = loop_mixture.smallest_mixture(kinds)
+    compared = plans.policies_of(kinds) | _more_policies(policies, kinds)
+    least = plans.smallest_mixture(kinds)
     if loops is None:
         counts = plans.default_counts(plans.periodic_loops(given, kinds), least, depth)
     else:
@@ -245,7 +243,7 @@ def _plan(
 
 
 def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, dict[str, Any]]:
-    from cosim.studies.capacity.loop_mixture import MODEL, PERIODIC, ZOH
+    from cosim.studies.capacity.capacity_plan import MODEL, PERIODIC, ZOH
     from noack.config.run_sections import NAME_PATTERN
     from noack.config.scenario_file import value_of
 

@@ -12,7 +12,7 @@ from noack.core.errors import CallerError, ExitStatus
 
 if TYPE_CHECKING:
     from cosim.measurement.live.live_measurement import LiveOptions
-    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.live.probe_ends import ProbeResult
     from cosim.measurement.network_measurement import MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
 
@@ -212,7 +212,7 @@ def _result(
         receive_live,
         send_live,
     )
-    from cosim.measurement.live.probe_result import ProbeResult
+    from cosim.measurement.live.probe_ends import ProbeResult
     from cosim.measurement.trace_sources import FILE_OPTIONS, read_source, refuse_unused
     from noack.traces.trace_formats import find_trace
 
@@ -254,8 +254,8 @@ def _share(text: str) -> float:
 def _options(
     deadline: str | None, shares: list[str] | None, window: list[int] | None, outage: str | None
 ) -> "MeasurementOptions":
-    from cosim.measurement.burst_statistics import WINDOWS
     from cosim.measurement.live.live_measurement import time_s_of
+    from cosim.measurement.loss_bursts import WINDOWS
     from cosim.measurement.network_measurement import QUANTILES, MeasurementOptions
 
     return MeasurementOptions(

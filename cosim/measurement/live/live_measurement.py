@@ -1,15 +1,25 @@
-"""A live measurement from the options of the command line."""
+"""A live measurement, from the options of the command line to the result.
 
+It drives a sender or a receiver (``probe_ends.py``) from a socket and the monotonic clock. The raw
+trace is written meanwhile, so that a killed process loses nothing.
+"""
+
+import os
 import re
+import secrets
+import select
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import Self
 
-from cosim.measurement.live.probe_result import ProbeResult
-from cosim.measurement.live.probe_run import listen, send
-from cosim.measurement.live.probe_sender import ProbePlan
+from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
+from cosim.measurement.live.stamped_socket import StampedSocket, host_number
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, NeverStartedError, PeerError, why
+from noack.core.file_access import open_growing
 from noack.impairments.words import OWN_TIME_S
 from noack.protocol.probe_format import (
     LONGEST_PERIOD_NS,
@@ -18,8 +28,8 @@ from noack.protocol.probe_format import (
     PROBE_BYTES,
     SHORTEST_PERIOD_NS,
 )
-from noack.runtime.address import parse_address, parse_destination, text_of
-from noack.runtime.command_line import print_to_stderr
+from noack.runtime.address import Address, parse_address, parse_destination, text_of
+from noack.runtime.command_line import Signals, print_to_stderr
 
 _ADDRESS = re.compile(r".*:[0-9]{1,5}")
 _RATE = re.compile(r"([0-9]+(?:\.[0-9]+)?)(k?)(?:hz)?", re.IGNORECASE)
@@ -98,3 +108,170 @@ def send_live(address: str, options: LiveOptions) -> ProbeResult:
 
 def _log(line: str) -> None:
     print_to_stderr(f"noack measure: {line}")
+
+
+_LONGEST_WAIT_S = 0.1
+_BATCH = 256
+
+
+def listen(
+    address: Address, silence_s: float, save: Path | None, log: Callable[[str], None]
+) -> ProbeResult:
+    """Receive one probe, until its sender has ended it, a long silence, or a signal.
+
+    Args:
+        address: where to listen.
+        silence_s: the probe is over after so long without a datagram.
+        save: file for the raw trace; None: no file.
+        log: takes a line for the user.
+
+    Raises:
+        NoackError: the address or the file cannot be used, or nothing was received.
+    """
+    socket = StampedSocket(listen=address)
+    with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
+        log(f"listening on {text_of(socket.endpoint.getsockname())}")
+        receiver = ProbeReceiver(
+            host_number(), time.monotonic_ns(), int(silence_s * 1e9), log, rows.add
+        )
+        while signals.received is None:
+            select.select([socket.endpoint], (), (), _LONGEST_WAIT_S)
+            read = 0
+            while read < _BATCH and (arrival := socket.receive()) is not None:
+                read += 1
+                source = arrival.source
+                answer = receiver.handle(arrival.data, text_of(source), arrival.received_ns)
+                if answer is not None:
+                    socket.send(answer, source)
+            rows.flush()
+            if not read and receiver.is_over(time.monotonic_ns()):
+                break
+        result = _consistent(receiver.finish, socket)
+        if result is None:
+            raise NeverStartedError("stopped before a datagram of a probe arrived", signals.status)
+    return result
+
+
+def send(
+    address: Address, plan: ProbePlan, save: Path | None, log: Callable[[str], None]
+) -> ProbeResult:
+    """Send a probe; a signal ends it early.
+
+    Args:
+        address: where a listener receives it.
+        plan: what to send.
+        save: file for the raw trace; None: no file.
+        log: takes a line for the user.
+
+    Raises:
+        NoackError: the address or the file cannot be used, or no process listens there.
+    """
+    socket = StampedSocket(to=address)
+    with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
+        sender = ProbeSender(
+            plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add
+        )
+        refused = 0
+        while not sender.is_over(now_ns := time.monotonic_ns()):
+            wait_ns = sender.next_deadline_ns() - now_ns
+            if wait_ns <= 0:
+                socket.send(sender.on_timer(time.monotonic_ns()))
+                wait_ns = 0
+                if sender.ends <= 1:  # a send reports the failure of the one before
+                    if socket.send_errors and not refused:
+                        log(f"{socket.last_send_error}: is a listener running there?")
+                    refused = min(socket.send_errors, sender.sent)
+            select.select([socket.endpoint], (), (), min(wait_ns * 1e-9, _LONGEST_WAIT_S))
+            for _ in range(_BATCH):
+                if (arrival := socket.receive()) is None:
+                    break
+                sender.handle(arrival.data, arrival.received_ns)
+            rows.flush()
+            if signals.received is not None:
+                sender.stop(time.monotonic_ns())
+        if refused:
+            reason = f"{refused} of {sender.sent} sends failed: {socket.last_send_error}"
+            if refused == sender.sent:
+                raise PeerError(f"{text_of(address)}: {reason}; is a listener running there?")
+            log(reason)
+        result = _consistent(sender.finish, socket)
+        assert result is not None
+    return result
+
+
+def _consistent(
+    finish: Callable[[int | None], ProbeResult | None], socket: StampedSocket
+) -> ProbeResult | None:
+    """Return the result, with what the socket found."""
+    try:
+        result = finish(socket.kernel_drops)
+    except ValueError as error:
+        raise PeerError(f"the datagrams of the other end contradict each other: {error}") from None
+    if result is None:
+        return None
+    notes = list(result.notes)
+    if socket.clock_sets:
+        notes.append(
+            f"this host's real-time clock was set {socket.clock_sets} times; "
+            "the probe uses the monotonic clock"
+        )
+    if result.kernel_drops:
+        notes.append(
+            f"unintended losses: the kernel of this host dropped {result.kernel_drops} datagrams "
+            "because this process did not read them in time; the network delivered them, "
+            "but they are counted as lost"
+        )
+    return result._replace(notes=tuple(notes))
+
+
+class ProbeRows:
+    """A CSV file that grows row by row; an error while writing is logged, and ends the file.
+
+    Args:
+        path: the file, which is replaced; None: no file.
+        log: takes a line for the user.
+
+    Raises:
+        CallerError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path | None, log: Callable[[str], None]) -> None:
+        self._path, self._log = path, log
+        self._waiting: list[str] = []
+        self._file: int | None = None
+        if path is not None:
+            try:
+                self._file = open_growing(path, follow=True)
+            except (OSError, ValueError) as error:
+                raise CallerError(f"--save {path}: cannot be written: {why(error)}") from None
+
+    def add(self, *values: object) -> None:
+        """Add a row."""
+        if self._file is not None:
+            self._waiting.append(",".join(map(str, values)) + "\n")
+
+    def flush(self) -> None:
+        """Pass the added rows to the system."""
+        if self._file is None or not self._waiting:
+            return
+        data = "".join(self._waiting).encode()
+        self._waiting.clear()
+        try:
+            while data:
+                data = data[os.write(self._file, data) :]
+        except OSError as error:
+            self._log(f"--save {self._path}: ends here: {why(error)}; the probe continues")
+            self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.flush()
+        self.close()

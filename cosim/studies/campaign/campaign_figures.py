@@ -27,8 +27,7 @@ from cosim.output.figure_description import (
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.draw_statistics import Estimate
-from cosim.studies.campaign.metrics import METRICS, Metric
+from cosim.studies.campaign.metrics import METRICS, Estimate, Metric
 from noack.core.linear_systems import Matrix, Vector
 
 _HEIGHT_IN = 3.4

@@ -19,8 +19,7 @@ from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_
 from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
-from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
+from cosim.studies.campaign.sampled_draws import SampledWork, SharedNetworkWork, in_virtual_time
 from noack.config import toml_file
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

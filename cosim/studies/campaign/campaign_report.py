@@ -18,8 +18,7 @@ from cosim.output.result_tables import ResultTable
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
 from cosim.studies.campaign.chunk_store import RUNS, Store
-from cosim.studies.campaign.draw_statistics import Estimate
-from cosim.studies.campaign.metrics import METRICS
+from cosim.studies.campaign.metrics import METRICS, Estimate
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
 

@@ -6,18 +6,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from cosim.studies.campaign.burst_frequency import BurstFrequency, burst_frequency
 from cosim.studies.campaign.campaign_file import Campaign, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.draw_statistics import (
+from cosim.studies.campaign.metrics import (
     CONFIDENCE,
+    BurstFrequency,
     Estimate,
+    Metric,
     PairedDifference,
+    burst_frequency,
     difference,
     estimate,
+    measured,
 )
-from cosim.studies.campaign.metrics import Metric, measured
 from noack.core.linear_systems import Vector
 
 _ROUNDING = 1e-9

@@ -7,7 +7,7 @@ computed again.
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from hashlib import blake2b
 from pathlib import Path
@@ -20,9 +20,15 @@ from numpy.typing import NDArray
 
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point, row_type
-from cosim.studies.campaign.campaign_workers import Chunk
-from cosim.studies.campaign.worker_identity import arithmetic, difference
-from noack.core.errors import CallerError, MachineError, shortened, why
+from cosim.studies.campaign.campaign_workers import (
+    Chunk,
+    LostWorkersError,
+    OtherArithmeticError,
+    Runner,
+    arithmetic,
+    difference,
+)
+from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, shortened, why
 from noack.core.file_access import PARTIAL, locked, write_whole
 
 RUNS, MANIFEST = "runs", "campaign.json"
@@ -215,3 +221,48 @@ def _difference(there: Any, here: Any, key: str = "") -> str | None:
     places = (f"{key}.{name}".removeprefix(".") for name in names)
     found = (_difference(*pair, place) for pair, place in zip(pairs, places, strict=True))
     return next(filter(None, found), None)
+
+
+Progress = Callable[[int, int], None]
+"""Called with the number of finished runs and the number of all runs."""
+
+
+class InterruptedCampaignError(NoackError):
+    """A user or a signal interrupted the campaign; written runs are kept."""
+
+    def __init__(self, message: str, exit_status: ExitStatus) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
+
+
+def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
+    """Compute the missing runs; return their number.
+
+    Raises:
+        InterruptedCampaignError: a signal was received.
+        LostWorkersError: workers have died.
+        MachineError: the results cannot be written.
+    """
+    missing = list(store.missing())
+    total = len(store.points) * store.draws
+    before = done = total - sum(len(chunk.draws) for chunk in missing)
+    report = progress or (lambda done, total: None)
+    report(done, total)
+
+    def message(what: object) -> str:
+        return (
+            f"{what}; {done:,} of {total:,} runs are in {store.folder}; "
+            "the same command continues the campaign"
+        )
+
+    try:
+        for chunk, rows in runner([point.work for point in store.points], missing):
+            store.write(chunk, rows)
+            done += len(chunk.draws)
+            report(done, total)
+    except KeyboardInterrupt as error:
+        status = getattr(error, "exit_status", ExitStatus.INTERRUPTED)
+        raise InterruptedCampaignError(message(str(error) or "interrupted"), status) from None
+    except (LostWorkersError, OtherArithmeticError, MachineError) as error:
+        raise type(error)(message(error)) from None
+    return total - before

@@ -9,10 +9,9 @@ from cosim.output.figure_format import FigureFiles
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import base_of, grid
 from cosim.studies.campaign.campaign_report import write_report
-from cosim.studies.campaign.campaign_run import Progress, run_campaign
 from cosim.studies.campaign.campaign_summary import CampaignSummary, summarise
 from cosim.studies.campaign.campaign_workers import Runner
-from cosim.studies.campaign.chunk_store import Store, opened
+from cosim.studies.campaign.chunk_store import Progress, Store, opened, run_campaign
 from noack.runtime.command_line import stop_requests_raised
 
 Show = Callable[[str], AbstractContextManager[object]]

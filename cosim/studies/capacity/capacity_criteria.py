@@ -12,9 +12,17 @@ A run reaches a limit if
 The capacity of a draw is the largest number of loops of the study up to which no run reaches the
 limit: 0 if one loop reaches it, infinite if none does. The estimate is the median over the draws,
 with the 95 % confidence interval of order statistics.
+
+How long a study takes is estimated before it starts. The time of a run is proportional to its loops
+and its steps. The time per loop and simulated second is measured with a short run on this machine,
+as processor time, so that other programs that run meanwhile do not count. Loops that overload the
+link take up to twice as long.
 """
 
+import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,8 +31,8 @@ from numpy.typing import NDArray
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_summary import CampaignSummary, runs_at
 from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.draw_statistics import quantile_interval, quartiles
-from cosim.studies.campaign.metrics import Metric
+from cosim.studies.campaign.metrics import Metric, quantile_interval, quartiles
+from cosim.studies.campaign.sampled_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_plan import (
     DISTURBANCE,
     LOOPS,
@@ -33,6 +41,7 @@ from cosim.studies.capacity.capacity_plan import (
     CapacityPlan,
     unshared,
 )
+from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 
 LATE, COST_FACTOR = 0.01, 2.0
@@ -141,3 +150,55 @@ def capacity_of(
 def _estimate(draws: Vector) -> Capacity:
     low, high = quantile_interval(draws, 0.5)
     return Capacity(quartiles(draws).median, max(low, 0.0), high)
+
+
+_MEASURED_LOOPS, _MEASURED_STEPS = 20, 4000
+"""Number of loops of the measured run, if there is such a point, and steps of all its loops."""
+_OVERLOADED = 1.2
+"""Mean time of the runs of a study, relative to the measured one."""
+_START_S = 3.0
+"""Time until the worker processes run."""
+
+
+def missing_loops(plan: CapacityPlan, points: Sequence[Point], folder: Path) -> int:
+    """Return the number of loops of all runs that the folder does not have yet."""
+    campaign = plan.campaign()
+    store = Store(folder, points, plan.draws, campaign.chunk)
+    return sum(_loops(points[one.point]) * len(one.draws) for one in store.missing())
+
+
+def cpu_per_loop_s(points: Sequence[Point]) -> float:
+    """Return the processor time that a loop of a run takes, in seconds."""
+    point = min(points, key=lambda one: abs(_loops(one) - _MEASURED_LOOPS))
+    work, loops = point.work, _loops(point)
+    assert isinstance(work, SharedNetworkWork)
+    step_s = work.scenario.timing.plant_period_ns / NS_PER_S
+    steps = max(_MEASURED_STEPS // loops, 10)
+
+    def spent_s(horizon_s: float) -> float:
+        scenario = work.scenario.model_copy(update={"horizon_s": horizon_s})
+        begin_s = time.process_time()
+        replace(work, scenario=scenario).run(range(1))
+        return time.process_time() - begin_s
+
+    measured_s = min(steps * step_s, work.scenario.horizon_s)
+    spent_s(min(2 * step_s, measured_s))  # imports, and code that is compiled at first use
+    return spent_s(measured_s) / loops * work.scenario.horizon_s / measured_s
+
+
+def estimated_s(loops: int, cpu_s: float, workers: int) -> float:
+    """Return the time of runs with so many loops in all, if the workers' cores are idle."""
+    return _START_S + _OVERLOADED * loops * cpu_s / workers
+
+
+def time_text(seconds: float) -> str:
+    """Return a rough time as text."""
+    if seconds < 90:
+        return f"{max(round(seconds, -1), 10):.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.2g} h"
+
+
+def _loops(point: Point) -> int:
+    return sum(entry.count for entry in point.scenario.loops or ())

@@ -15,10 +15,9 @@ from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
 from cosim.record.run_record import load_run
 from cosim.studies.campaign.campaign_summary import GridPointResult
-from cosim.studies.campaign.draw_statistics import Estimate
-from cosim.studies.campaign.metrics import Metric, measured
+from cosim.studies.campaign.metrics import Estimate, Metric, measured
 from cosim.studies.campaign.random_draws import seeds_of
-from cosim.studies.campaign.shared_network_draws import SharedNetworkWork
+from cosim.studies.campaign.sampled_draws import SharedNetworkWork
 from cosim.studies.capacity.capacity_criteria import LIMITS
 from cosim.studies.capacity.capacity_plan import DISTURBANCE, LOOPS, OWN, POLICY, CapacityPlan
 from noack.core.errors import CallerError

@@ -34,10 +34,10 @@ from cosim.studies.capacity.capacity_plan import (
     DISTURBANCE,
     LOOPS,
     OWN,
+    PERIODIC,
     POLICY,
     CapacityPlan,
 )
-from cosim.studies.capacity.loop_mixture import PERIODIC
 from noack.core.file_access import write_whole
 from noack.core.number_format import number
 

@@ -24,7 +24,7 @@ from cosim.output.figure_description import (
 from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
 from cosim.output.page_kit import templates
-from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
+from cosim.studies.design.candidates import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus

@@ -13,16 +13,16 @@ import numpy as np
 from cosim.simulation.batch import Population
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.random_draws import Box, box_of
-from cosim.studies.design.candidate_measures import (
+from cosim.studies.design.candidates import (
     CandidateMeasures,
     DesignLimits,
+    DesignResult,
     Trial,
     bounds_of,
     measure,
     require_certifiable,
     require_draws,
 )
-from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError

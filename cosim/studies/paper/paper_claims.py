@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.studies.campaign.draw_statistics import quartiles
+from cosim.studies.campaign.metrics import quartiles
 from cosim.studies.paper.paper_campaign import BASE, EXACT_MODEL, OTHER_EXAMPLES, WIDE_BOX
 from cosim.studies.paper.paper_results import Results, number, percent
 from noack.core.linear_systems import Vector

@@ -19,7 +19,7 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.paper.draw_measures import MODES, open_loop_eigenvalues, resolved_draw
+from cosim.studies.paper.paper_campaign import MODES, open_loop_eigenvalues, resolved_draw
 from noack.config.named_models import lane_following
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario

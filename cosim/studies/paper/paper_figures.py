@@ -19,7 +19,7 @@ from cosim.output.figure_description import (
 )
 from cosim.output.signal_figures import states_figure
 from cosim.simulation.continuous import ContinuousRun, timeless
-from cosim.studies.paper.draw_measures import MODES, Mode
+from cosim.studies.paper.paper_campaign import MODES, Mode
 from cosim.studies.paper.paper_results import Results
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cosim.studies.campaign.draw_statistics import paired, quartiles
-from cosim.studies.paper.draw_measures import MODES, STEP_S
-from cosim.studies.paper.paper_campaign import BASE, OTHER_EXAMPLES, settings_of
+from cosim.studies.campaign.metrics import paired, quartiles
+from cosim.studies.paper.paper_campaign import BASE, MODES, OTHER_EXAMPLES, STEP_S, settings_of
 from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
 from cosim.studies.paper.paper_results import HORIZON_S, Results, number, percent, spread
 from noack.core.linear_systems import Vector

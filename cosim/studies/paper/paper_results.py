@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cosim.studies.campaign.draw_statistics import quartiles
-from cosim.studies.paper.draw_measures import MODES
-from cosim.studies.paper.paper_campaign import BASE, COLUMNS, EnsemblePart
+from cosim.studies.campaign.metrics import quartiles
+from cosim.studies.paper.paper_campaign import BASE, COLUMNS, MODES, EnsemblePart
 from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5

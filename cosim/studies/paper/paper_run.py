@@ -9,11 +9,10 @@ from rich.table import Table
 
 from cosim.output.figure_files import save_figure
 from cosim.simulation.continuous import run_continuous
-from cosim.studies.campaign.campaign_run import Progress
 from cosim.studies.campaign.campaign_workers import local
-from cosim.studies.campaign.draw_statistics import quartiles
-from cosim.studies.paper.draw_measures import MODES, resolved_draw
-from cosim.studies.paper.paper_campaign import BASE, load_campaign, run_parts
+from cosim.studies.campaign.chunk_store import Progress
+from cosim.studies.campaign.metrics import quartiles
+from cosim.studies.paper.paper_campaign import BASE, MODES, load_campaign, resolved_draw, run_parts
 from cosim.studies.paper.paper_claims import PaperVerdict, claims
 from cosim.studies.paper.paper_evidence import evidence
 from cosim.studies.paper.paper_figures import draw_figure, ensemble_figure

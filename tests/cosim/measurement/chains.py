@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.measurement.loss_likelihood import ChainRates
+from cosim.measurement.chain_fits import ChainRates
 from noack.traces.packet_trace import PacketTrace, packet_trace
 
 PERIOD_NS = 20_000_000

@@ -7,16 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.measurement.chain_fits import ChainFits
-from cosim.measurement.confidence_interval import (
+from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood
+from cosim.measurement.loss_bursts import (
     Minimum,
     binomial_estimate,
     exponential_estimate,
+    loss_bursts,
     poisson_estimate,
     profile_interval,
 )
-from cosim.measurement.loss_bursts import loss_bursts
-from cosim.measurement.loss_likelihood import ChainRates, LossLikelihood
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from tests.cosim.measurement.chains import chain_losses
 

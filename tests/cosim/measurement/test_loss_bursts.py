@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.measurement.burst_statistics import histogram, most_losses, quantile_m
-from cosim.measurement.loss_bursts import loss_bursts, outcomes
+from cosim.measurement.loss_bursts import histogram, loss_bursts, most_losses, outcomes, quantile_m
 from noack.traces.packet_trace import packet_trace
 
 flags = st.lists(st.booleans(), min_size=1, max_size=60)

@@ -11,12 +11,16 @@ from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
-from cosim.measurement.delay_statistics import autocorrelation, normal_scores
-from cosim.measurement.loss_likelihood import ChainRates
-from cosim.measurement.measurement_figures import measurement_figures
+from cosim.measurement.chain_fits import ChainRates
+from cosim.measurement.measurement_outputs import trace_csv
+from cosim.measurement.measurement_page import measurement_figures
 from cosim.measurement.measurement_tables import measurement_tables
-from cosim.measurement.network_file import trace_csv
-from cosim.measurement.network_measurement import Measurement, MeasurementOptions
+from cosim.measurement.network_measurement import (
+    Measurement,
+    MeasurementOptions,
+    autocorrelation,
+    normal_scores,
+)
 from noack.config import toml_file
 from noack.config.sections import NetworkSection
 from noack.traces.packet_trace import packet_trace

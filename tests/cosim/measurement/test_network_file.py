@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import noack
-from cosim.measurement.loss_likelihood import ChainRates
-from cosim.measurement.network_file import trace_csv
+from cosim.measurement.chain_fits import ChainRates
+from cosim.measurement.measurement_outputs import trace_csv
 from noack.config import toml_file
 from noack.config.sections import NetworkSection
 from noack.impairments.loss_prediction import read_files

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.measurement import outage_rule
+from cosim.measurement import outages as rule
+from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.loss_bursts import LossBursts, loss_bursts
-from cosim.measurement.loss_likelihood import ChainRates
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
-from cosim.measurement.outage_fit import fit_outages
-from cosim.measurement.outage_rule import find_outages
+from cosim.measurement.outages import find_outages, fit_outages
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 
@@ -78,7 +77,7 @@ def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -
     total, parts = lengths.sum(), len(lengths)
     divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), parts - 1)]
     exact = np.mean([np.max(one) >= lengths[0] for one in divisions])
-    bound = outage_rule._geometric(lengths)[0]
+    bound = rule._geometric(lengths)[0]
     assert exact == pytest.approx(bound)  # two parts of 7 or more do not fit into 11
 
 

@@ -8,8 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.measurement.run_source import updates_trace
-from cosim.measurement.trace_sources import SourceOptions, read_source
+from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
 from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
 from netem.fates import description

@@ -16,7 +16,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.candidate_measures import DesignLimits
+from cosim.studies.design.candidates import DesignLimits
 from cosim.studies.design.design_search import design
 from noack.config.resolution import resolve, steady_state
 from noack.config.scenario import Scenario

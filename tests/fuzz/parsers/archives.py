@@ -7,7 +7,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from cosim.studies.reproduction.run_archive import MANIFEST, unpack
+from cosim.studies.run_archive import MANIFEST, unpack
 from tests.fuzz.harness import refusal, workspace
 
 _NAMES = ("scenario.toml", "record/plant_step.parquet", "../evil", "loops/a/summary.json", "a\\b")

@@ -1,7 +1,6 @@
 """Datagrams at both ends of a live probe: valid ones with changed fields, and any bytes."""
 
-from cosim.measurement.live.probe_receiver import ProbeReceiver
-from cosim.measurement.live.probe_sender import ProbePlan, ProbeSender
+from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
 from noack.core.errors import PeerError
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from tests.fuzz.choices import Choices

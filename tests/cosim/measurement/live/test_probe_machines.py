@@ -8,9 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.measurement.live.probe_receiver import ProbeReceiver
-from cosim.measurement.live.probe_result import ProbeResult
-from cosim.measurement.live.probe_sender import ProbePlan, ProbeSender
+from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
 from noack.core.clock import NS_PER_S
 from noack.protocol.probe_format import PROBE_BYTES, ProbeDatagram, ProbeKind, encode_probe
 

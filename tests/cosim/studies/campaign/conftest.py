@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.chunk_store import Store, run_campaign
 
 Write = Callable[..., Path]
 Command = Callable[..., Result]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.studies.campaign.burst_frequency import burst_frequency
+from cosim.studies.campaign.metrics import burst_frequency
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 

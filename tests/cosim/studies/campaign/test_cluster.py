@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from cosim.studies.campaign import campaign_workers
-from cosim.studies.campaign.campaign_run import run_campaign
-from cosim.studies.campaign.campaign_workers import alone, cluster
-from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.worker_identity import arithmetic
+from cosim.studies.campaign.campaign_workers import alone, arithmetic, cluster
+from cosim.studies.campaign.chunk_store import Store, run_campaign
 from noack.core.errors import CallerError, PeerError
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_store import files

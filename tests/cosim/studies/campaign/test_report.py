@@ -29,12 +29,10 @@ from cosim.studies.campaign.campaign_figures import (
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
 from cosim.studies.campaign.campaign_report import SummaryRow, tables_of, write_report, written
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.draw_statistics import estimate
-from cosim.studies.campaign.metrics import METRICS, certified_error, measured
+from cosim.studies.campaign.chunk_store import Store, run_campaign
+from cosim.studies.campaign.metrics import METRICS, certified_error, estimate, measured
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load as load_scenario

@@ -10,8 +10,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.campaign_grid import grid, row_type
 from cosim.studies.campaign.random_draws import seeds_of
-from cosim.studies.campaign.sampled_draws import in_virtual_time
-from cosim.studies.campaign.shared_network_draws import LOOPS_ROW, SharedNetworkWork
+from cosim.studies.campaign.sampled_draws import LOOPS_ROW, SharedNetworkWork, in_virtual_time
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from tests.cosim.studies.campaign.conftest import Write

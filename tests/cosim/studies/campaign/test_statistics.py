@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from cosim.studies.campaign.draw_statistics import difference, estimate, interval_ranks
+from cosim.studies.campaign.metrics import difference, estimate, interval_ranks
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:

@@ -12,9 +12,8 @@ import pyarrow.dataset
 import pytest
 
 from cosim.studies.campaign.campaign_grid import base_of
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Chunk, Store, opened
+from cosim.studies.campaign.chunk_store import Chunk, Store, opened, run_campaign
 from noack.core import file_access
 from noack.core.errors import CallerError, MachineError
 from tests.cosim.studies.campaign.conftest import Few, Write, few_of

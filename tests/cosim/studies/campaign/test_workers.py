@@ -13,7 +13,6 @@ import psutil
 import pytest
 
 from cosim.studies.campaign import campaign_workers
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_workers import (
     Chunk,
     Finished,
@@ -22,7 +21,7 @@ from cosim.studies.campaign.campaign_workers import (
     alone,
     local,
 )
-from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.chunk_store import Store, run_campaign
 from tests.cosim.studies.campaign.conftest import Command, Write, few_of
 from tests.cosim.studies.campaign.test_store import files
 

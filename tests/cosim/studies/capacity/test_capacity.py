@@ -12,11 +12,10 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.studies.campaign.campaign_grid import Point, grid
-from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Store
-from cosim.studies.campaign.shared_network_draws import used_up
+from cosim.studies.campaign.chunk_store import Store, run_campaign
+from cosim.studies.campaign.sampled_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
 from cosim.studies.capacity.capacity_criteria import (
     PolicyCapacity,
@@ -25,7 +24,7 @@ from cosim.studies.capacity.capacity_criteria import (
     carried,
 )
 from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
-from cosim.studies.capacity.loop_mixture import kinds_of, policies_of, smallest_mixture
+from cosim.studies.capacity.capacity_plan import kinds_of, policies_of, smallest_mixture
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import Fate
 

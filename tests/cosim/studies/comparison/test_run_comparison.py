@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 import noack
 from cosim.cli import app
 from cosim.record.run_directory import write_environment
-from cosim.studies.comparison.run_comparison import KeyNumber, RunComparison, compare_runs
+from cosim.studies.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
 
 SETTINGS: list[dict[str, Any]] = [

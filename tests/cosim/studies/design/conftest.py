@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from cosim.studies.design.candidate_measures import DesignLimits
-from cosim.studies.design.design_result import DesignResult
+from cosim.studies.design.candidates import DesignLimits, DesignResult
 from cosim.studies.design.design_search import design
-from cosim.studies.design.loop_families import families_of
+from cosim.studies.design.design_space import families_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 

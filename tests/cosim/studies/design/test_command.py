@@ -12,9 +12,9 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from cosim.studies.design.candidates import DesignResult
 from cosim.studies.design.design_page import page
-from cosim.studies.design.design_result import DesignResult
-from cosim.studies.design.loop_families import lqr_gain
+from cosim.studies.design.design_space import lqr_gain
 from noack.config.scenario_file import load
 
 ONE = """

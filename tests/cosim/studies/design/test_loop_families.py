@@ -10,9 +10,9 @@ import pytest
 from cosim.simulation.batch import run_batch, setting_of
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidate_measures import DesignLimits, certificate_of
+from cosim.studies.design.candidates import DesignLimits, certificate_of
 from cosim.studies.design.design_search import design
-from cosim.studies.design.loop_families import families_of, lqr_gain
+from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.config.named_models import lane_following
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

@@ -9,8 +9,12 @@ import pytest
 
 from cosim.simulation.batch import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidate_measures import DesignLimits, measure, require_draws
-from cosim.studies.design.design_result import DesignResult
+from cosim.studies.design.candidates import (
+    DesignLimits,
+    DesignResult,
+    measure,
+    require_draws,
+)
 from cosim.studies.design.design_space import LEVELS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario

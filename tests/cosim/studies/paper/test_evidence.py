@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.studies.paper.draw_measures import resolved_draw
-from cosim.studies.paper.paper_campaign import BASE, load_campaign
+from cosim.studies.paper.paper_campaign import BASE, load_campaign, resolved_draw
 from cosim.studies.paper.paper_evidence import Numbers, evidence
 from cosim.studies.paper.paper_results import read_results, results_of
 from noack.config.named_models import lane_following

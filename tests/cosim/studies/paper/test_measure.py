@@ -7,16 +7,18 @@ import pytest
 from scipy.linalg import expm
 
 from cosim.simulation.continuous import run_continuous, summary
-from cosim.studies.paper.draw_measures import (
+from cosim.studies.paper.paper_campaign import (
+    BASE,
+    EXACT_MODEL,
     MODES,
     Draw,
     certified,
+    load_campaign,
     measure_draw,
     open_loop_eigenvalues,
     printed,
     resolved_draw,
 )
-from cosim.studies.paper.paper_campaign import BASE, EXACT_MODEL, load_campaign
 from noack.config.resolution import loop_of
 
 _, SCENARIOS = load_campaign()

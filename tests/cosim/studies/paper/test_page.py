@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app, command
 from cosim.output.figure_drawing import draw
-from cosim.studies.campaign.draw_statistics import paired, quartiles
+from cosim.studies.campaign.metrics import paired, quartiles
 from cosim.studies.paper import paper_run
 from cosim.studies.paper.paper_campaign import BASE, COLUMNS, load_campaign, parts
 from cosim.studies.paper.paper_claims import PaperVerdict, claims, judge

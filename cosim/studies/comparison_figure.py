@@ -25,7 +25,7 @@ from cosim.output.figure_description import (
 from cosim.output.figure_files import FIGURE_SUFFIXES, save_figure
 from cosim.output.page_kit import templates
 from cosim.record.align import AlignedRun, align_tables
-from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
+from cosim.studies.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole

@@ -107,7 +107,7 @@ class RunComparison:
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
         from cosim.output.figure_drawing import draw
-        from cosim.studies.comparison.overlay_figure import overlay_figure
+        from cosim.studies.comparison_figure import overlay_figure
 
         return draw(overlay_figure(self.runs))
 
@@ -122,7 +122,7 @@ class RunComparison:
             CallerError: the name has another ending, or there is no such width.
             MachineError: the file cannot be written.
         """
-        from cosim.studies.comparison.overlay_figure import write_overlay
+        from cosim.studies.comparison_figure import write_overlay
 
         write_overlay(self, path, width)
 

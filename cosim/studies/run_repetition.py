@@ -1,4 +1,4 @@
-"""The repetition of an archived run, and what differs."""
+"""The repetition of an archived run, and what differs, as a result and as a table."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.replay_result import difference, rows_differ
@@ -18,11 +21,11 @@ from cosim.output.run_tables import network_rows
 from cosim.record.record_source import Slice
 from cosim.record.run_directory import SCENARIO_FILE, Kind, all_changes_since, kind_of
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
-from cosim.studies.comparison.run_comparison import compare_runs
-from cosim.studies.reproduction.run_archive import MANIFEST, outside_files, unpack
+from cosim.studies.run_archive import MANIFEST, outside_files, unpack
+from cosim.studies.run_comparison import compare_runs
 from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
-from noack.core.errors import CallerError, MachineError, why
+from noack.core.errors import CallerError, MachineError, printable, why
 from noack.settings.user_files import file_tables
 
 _MOST_STEPS = 1_000_000
@@ -220,3 +223,37 @@ def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
 
 def _cell(value: float | None) -> str:
     return "-" if value is None else f"{value:.6g}"
+
+
+def print_repetition(console: Console, found: Repetition) -> None:
+    """Print what was compared, and what differs: bits, numbers, versions and machine.
+
+    Texts of the archive are printed without control characters.
+    """
+    what = "inputs replayed" if found.kind == "live" else "rows repeated"
+    verdict = ("bit-exact", "green") if found.bit_exact else ("not reproduced", "bold red")
+    if not found.compared:
+        verdict = "nothing to compare", "bold red"
+    lines = [
+        Text(
+            printable(f"{found.scenario}, {found.kind}: {verdict[0]}, {found.compared:,} {what}"),
+            verdict[1],
+        )
+    ]
+    lines += [Text(printable(f"first difference: {text}")) for text in found.differences]
+    lines += [Text(printable(f"record incomplete: {text}"), "yellow") for text in found.gaps]
+    for line in lines:
+        console.print(line, soft_wrap=True)
+    if found.numbers:
+        title = "numbers that differ"
+        if found.kind == "live":
+            title += ": the simulation has no lateness"
+        table = Table("quantity", "archived", "repeated", title=title)
+        for place in (1, 2):
+            table.columns[place].justify = "right"
+        for row in found.numbers:
+            table.add_row(*(Text(printable(cell)) for cell in row))
+        console.print(table)
+    for change in found.changes:
+        text = printable(f"differs from the archived run's machine: {change}")
+        console.print(Text(text), soft_wrap=True)

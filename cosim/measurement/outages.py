@@ -10,6 +10,8 @@ A burst is an outage if its length is implausible, at the level 0.001, in two te
 
 For k = 1, 2, … the k-th longest burst is tested among those that are not longer, and the largest k
 for which both tests reject counts (Rosner, 1975): several outages do not hide each other.
+
+In the model of outages they begin at a constant rate, and last for an exponential time.
 """
 
 from dataclasses import dataclass
@@ -17,9 +19,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from scipy.stats import expon, goodness_of_fit
 
 from cosim.measurement.chain_fits import ChainFits
-from cosim.measurement.loss_bursts import Flags, LossBursts
+from cosim.measurement.loss_bursts import (
+    Estimate,
+    Flags,
+    LossBursts,
+    exponential_estimate,
+    poisson_estimate,
+)
 
 LEVEL = 1e-3
 """Nominal probability with which a network without outages has one by this rule."""
@@ -81,3 +90,53 @@ def _elliott(bursts: LossBursts, left_out: Flags, length: int, count: int) -> fl
     fits = ChainFits(bursts, left_out)
     tail = fits.elliott_rates.survival(lost=True)(np.array([length]))[0]
     return float(-np.expm1(count * np.log1p(-min(tail, 1.0 - 1e-16))))
+
+
+FEWEST_OUTAGES = 8
+"""Number of outages below which the fit is not tested."""
+SEED = 20_170_601
+"""Of the Monte Carlo test, so that the same trace gives the same number."""
+
+
+@dataclass(frozen=True)
+class OutageFit:
+    """Estimates with exact 95 % intervals."""
+
+    count: int
+    rate_per_s: Estimate | None
+    """Outages per second of time without outage; None: no time was observed."""
+    duration_s: Estimate | None
+    """Mean duration; None: no outage ended within the trace."""
+    p_value: float | None
+    """Of the Anderson–Darling test for exponential durations; None: too few outages."""
+
+    @property
+    def text(self) -> str:
+        """The result of the test in words."""
+        if self.p_value is None:
+            return f"too few outages for a test of their durations (fewer than {FEWEST_OUTAGES})"
+        verdict = "rejected" if self.p_value < 0.01 else "not rejected"
+        return f"exponential durations {verdict}: Anderson–Darling, p = {self.p_value:.2g}"
+
+
+def fit_outages(
+    durations_s: NDArray[np.float64], complete: NDArray[np.bool_], observed_s: float
+) -> OutageFit:
+    """Fit outages.
+
+    Args:
+        durations_s: (n,) Their durations.
+        complete: (n,) Whether they ended within the trace.
+        observed_s: length of the trace.
+    """
+    without_s = observed_s - float(durations_s.sum())
+    rate = poisson_estimate(len(durations_s), without_s) if without_s > 0 else None
+    mean = exponential_estimate(int(complete.sum()), float(durations_s.sum()))
+    p_value = None
+    if len(durations_s) >= FEWEST_OUTAGES and complete.all():
+        tested = goodness_of_fit(
+            expon, durations_s, known_params={"loc": 0.0}, statistic="ad", n_mc_samples=999,
+            rng=np.random.default_rng(SEED),
+        )  # fmt: skip
+        p_value = float(tested.pvalue)
+    return OutageFit(len(durations_s), rate, mean, p_value)

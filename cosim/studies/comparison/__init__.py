@@ -1,1 +1,0 @@
-"""Comparison of two or more runs: numbers, settings, curves."""
