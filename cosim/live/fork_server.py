@@ -112,6 +112,7 @@ class ForkServer:
 
     def __init__(self, *, of_itself: bool = False) -> None:
         require_limits()
+        _open_standard_streams()
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
@@ -207,6 +208,13 @@ def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]
         raise MachineError(f"the fork server cannot be started: {error}") from None
     with closing(server):
         yield server
+
+
+def _open_standard_streams() -> None:
+    """Open those of the descriptors 0 to 2 that are closed, so that no socket has their numbers."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
 
 
 def _adopt_orphans(adopt: bool) -> None:

@@ -170,9 +170,9 @@ class LoopSection(ScenarioSection):
     first loop of the run."""
     scenario: str | Table | None = None
     """Another scenario file: the loop has its mode, model, plant, trigger, observer and controller
-    in place of those of the top level. A path relative to this file, or the name of a shipped
-    scenario. A network, certificate or changes in it must be those of this run; its other keys have
-    no effect. Loading the scenario replaces the name by the tables."""
+    in place of those of the top level. A name is relative to this file, or that of a shipped
+    scenario. The other keys of that file have no effect: the run has one network. Loading the
+    scenario replaces the name by the tables."""
     mode: Literal["model", "zoh"] | None = None
     """The loop's mode."""
     model: Table | None = None

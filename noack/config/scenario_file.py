@@ -7,9 +7,8 @@ speed, ports, real-time settings and recovery of the file have no effect.
 """
 
 import copy
-import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from os.path import commonprefix
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import tomli_w
-from pydantic import TypeAdapter, create_model
+from pydantic import create_model
 
 from noack.config import toml_file
 from noack.config.matrix_files import with_matrices
@@ -26,7 +25,7 @@ from noack.config.scenario import PARTS, Scenario, with_loop_tables
 from noack.config.scenario_checks import check_kept_loss
 from noack.config.sections import DirectionSection
 from noack.config.toml_file import keys as known_keys
-from noack.config.toml_file import nearest_key, show_value
+from noack.config.toml_file import nearest_key
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_folder
 from noack.settings.section import ScenarioSection
@@ -37,8 +36,6 @@ _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
 """Rows of numbers or names; the TOML writer puts each entry on its own line."""
 MOST_RECORDED_BYTES = 2**28
 """Largest size of a run's scenario file, which includes the losses and delays read from files."""
-_SHARED = ("network", "certificate", "clocks", "changes")
-"""Keys that a loop's file may set only as the run does."""
 
 
 def load(
@@ -116,7 +113,7 @@ def with_named_scenarios(
     """Return a scenario's content with the tables of the files that its loops name.
 
     Names are relative to ``folder``, or those of shipped scenarios. Raise CallerError, with one
-    line per mistake, if a file is no scenario of one loop, or does not fit the run.
+    line per mistake, if a file is no scenario of one loop.
     """
     if not isinstance(loops := content.get("loops"), list):
         return content
@@ -125,20 +122,18 @@ def with_named_scenarios(
         tables = {}
         if isinstance(entry, dict) and isinstance(name := entry.get("scenario"), str):
             named = printable(f'{source}: loops.{place}.scenario = "{name}"')
-            tables = {"scenario": _loop_tables(_path(name, folder, named), content, named)}
+            tables = {"scenario": _loop_tables(_path(name, folder, named), named)}
         read.append(entry | tables if tables else entry)
     return {**content, "loops": read}
 
 
-def _loop_tables(path: Path, run: Mapping[str, Any], named: str) -> dict[str, Any]:
+def _loop_tables(path: Path, named: str) -> dict[str, Any]:
     """Return the tables of a loop's file, which the setting ``named`` names."""
     content = toml_file.read(path, Scenario)
     if content.get("loops"):
         raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
     whole = with_matrices(content, path.parent, str(path))
     file = toml_file.validated(_loop_file_model(), whole, str(path))
-    for key in _SHARED:
-        _require_equal(key, file, run, named)
     tables = {
         where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)
     }
@@ -157,45 +152,6 @@ def _path(name: str, folder: Path, named: str) -> Path:
     names = [*sorted(shipped), *sorted(file.name for file in folder.glob("*.toml"))]
     hint = did_you_mean(name, names) or "`noack scenarios` lists the shipped ones"
     raise CallerError(f"{named}: no such file, nor a shipped scenario; {hint}")
-
-
-def _require_equal(key: str, file: ScenarioSection, run: Mapping[str, Any], named: str) -> None:
-    """Raise CallerError if a file sets a key to something else than the run."""
-    own = getattr(file, key)
-    if key not in file.model_fields_set or own is None:
-        return
-    try:
-        shared = Scenario.model_fields[key].get_default()
-        if key in run:
-            shared = _shared_section(key).validate_json(json.dumps(run[key]))
-    except (TypeError, ValueError):  # the run's own mistake is reported with its others
-        return
-    for where, theirs, ours in _set_pairs(key, own, shared):
-        if theirs != ours:
-            raise CallerError(
-                f"{named}: {where} is {show_value(theirs)} there and {show_value(ours)} in this "
-                "run; the loops of a run share it: leave it out of that file, or set the same"
-            )
-
-
-def _set_pairs(key: str, own: Any, shared: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield what the file sets, and what the run has; of a table, the keys that the file sets."""
-    theirs, ours = (TypeAdapter(Any).dump_python(value, mode="json") for value in (own, shared))
-    if not isinstance(own, ScenarioSection) or shared is None:
-        yield key, theirs, ours
-        return
-    for inner in type(own).model_fields:
-        if inner not in own.model_fields_set:
-            continue
-        value, other = theirs[inner], ours[inner]
-        if isinstance(value, dict) and isinstance(other, dict):
-            yield from ((f"{key}.{inner}.{k}", value[k], other.get(k)) for k in value)
-        yield f"{key}.{inner}", value, other
-
-
-@cache
-def _shared_section(key: str) -> TypeAdapter[Any]:
-    return TypeAdapter(Scenario.model_fields[key].rebuild_annotation())
 
 
 @cache

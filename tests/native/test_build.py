@@ -16,8 +16,13 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the folder native."""
-    return Path(shutil.copytree(ROOT / "native", tmp_path / "native"))
+    """A copy of the folder native that builds without optimisation, in a fifth of the time."""
+    native = Path(shutil.copytree(ROOT / "native", tmp_path / "native"))
+    program = (native / "build.py").read_text()
+    assert '"-O3"' in program
+    assert '"-O2"' in program
+    (native / "build.py").write_text(program.replace('"-O3"', '"-O0"').replace('"-O2"', '"-O0"'))
+    return native
 
 
 def build(

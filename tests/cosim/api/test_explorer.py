@@ -127,7 +127,7 @@ def test_sliders_change_the_explorer_and_the_other_way_round() -> None:
     assert ">0 (0 %)</td>" in facts.value
     explorer.set({"trigger.beta": 0.25})
     assert sliders["β, threshold at the start"].value == 0.25
-    sliders["model error: the plant's box, × the scenario's"].value = 18.0
+    sliders["model error, as a multiple of the scenario's uncertainty"].value = 18.0
     assert "no certificate" in facts.value
     assert "grows" in message.value
     (choice,) = [one.children[1] for one in rows if isinstance(one, ipywidgets.VBox)

@@ -114,34 +114,13 @@ def test_a_shipped_scenario_is_found_by_its_name(content: dict[str, Any], tmp_pa
 NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
 
 
-@pytest.mark.parametrize(
-    ("other", "what"),
-    [
-        ({"network": NETWORK | {"mansd": 3}}, "network.mansd is 3 there and 2 in this run"),
-        ({"network": NETWORK | {"loss": {"model": "lossless"}}},
-         'network.loss.model is "lossless" there and "bernoulli" in this run'),
-        ({"network": NETWORK | {"limit": 5}}, "network.limit is 5 there and 16384 in this run"),
-        ({"certificate": {"late_periods": 1}},
-         "certificate.late_periods is 1 there and 2 in this run"),
-        ({"clocks": {}}, "clocks is "),
-        ({"changes": [{"at_s": 1.0, "set": {"mansd": 1}}]}, "changes is "),
-    ],
-)  # fmt: skip
-def test_what_the_loops_share_cannot_differ(
-    content: dict[str, Any], tmp_path: Path, other: dict[str, Any], what: str
-) -> None:
-    with pytest.raises(CallerError) as refused:
-        loaded(tmp_path, content | {"network": NETWORK}, OTHER | other)
-    text = str(refused.value)
-    assert f'run.toml: loops.1.scenario = "parts/other.toml": {what}' in text
-    assert "the loops of a run share it" in text
-    assert "\n" not in text
-
-
-def test_a_file_may_say_what_the_run_says(content: dict[str, Any], tmp_path: Path) -> None:
-    shared = {"network": NETWORK, "certificate": {"late_periods": 1}}
-    scenario = loaded(tmp_path, content | shared, OTHER | shared)
-    assert len(loops_of(scenario)) == 2
+def test_what_the_loops_share_is_that_of_the_run(content: dict[str, Any], tmp_path: Path) -> None:
+    theirs = {
+        "network": NETWORK | {"mansd": 3, "limit": 5}, "certificate": {"late_periods": 1},
+        "changes": [{"at_s": 1.0, "set": {"mansd": 1}}], "horizon_s": 99.0,
+    }  # fmt: skip
+    own = content | {"network": NETWORK}
+    assert loaded(tmp_path, own, OTHER | theirs) == loaded(tmp_path, own, OTHER)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.analysis.value_reduction import decimate
+from cosim.analysis import value_reduction
 from cosim.live.finalize import finalize
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.recording import ViewError
@@ -71,7 +71,7 @@ def test_each_envelope_holds_all_samples_of_its_bin(
     write_environment(tmp_path, "live")
     write_run(alone(record), tmp_path)
     steps = record.count(PLANT_STEP)
-    monkeypatch.setattr(decimate, "_MOST_STEPS", steps // 2)
+    monkeypatch.setattr(value_reduction, "_MOST_STEPS", steps // 2)
     monkeypatch.setattr(run_record, "BATCH_ROWS", PART_STEPS)
     monkeypatch.setattr(RunRecord, "slice_columns", COLUMNS)
     finalize(RunEnding(tmp_path, 7, ExitStatus.OK, "horizon"), report=False)

@@ -11,6 +11,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from cosim.output.figure_description import Line, Rule
 from cosim.studies.campaign.campaign_grid import Point, grid
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
@@ -150,15 +151,16 @@ def test_a_long_queue_delays_what_it_does_not_drop(tmp_path: Path) -> None:
 
 def test_a_figure_shows_the_means_of_the_summary(tmp_path: Path) -> None:
     result = study(tmp_path, queue=100)
-    drawn = {name: figure for name, figure, _ in figures(result)}
-    assert [*drawn] == ["guarantee-own", "deadline-own", "cost-own"]
-    (axes,) = drawn["deadline-own"].axes
+    described = {figure.name: figure for figure in figures(result)}
+    assert [*described] == ["guarantee-own", "deadline-own", "cost-own"]
+    ((panel,),) = (row.panels for row in described["deadline-own"].rows)
     means = [one.estimates["updates_late"].mean for one in result.summary.found]
-    curve, fitting = axes.lines
-    assert np.asarray(curve.get_ydata()).tolist() == means
+    (curve,) = (item for item in panel.items if isinstance(item, Line))
+    (fitting,) = (item for item in panel.items if isinstance(item, Rule))
+    assert curve.y.tolist() == means
     assert means[:2] == [0.0, 0.0]
     assert means[2] > 0.5
-    assert np.asarray(fitting.get_xdata())[0] == pytest.approx(6.0, rel=1e-6)
+    assert fitting.at == pytest.approx(6.0, rel=1e-6)
     assert list(comparisons(result)) == []
 
 
