@@ -112,7 +112,6 @@ class ForkServer:
 
     def __init__(self, *, of_itself: bool = False) -> None:
         require_limits()
-        _open_standard_streams()
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.settimeout(_START_TIMEOUT_S)
         with its, ExitStack() as on_error:
@@ -131,12 +130,13 @@ class ForkServer:
     def _forked(self, its: socket.socket) -> ForkedProcess | None:
         """Fork the server; None if only a program of its own would work as every process must.
 
-        That is one thread, and UTF-8 for files and streams.
+        That is one thread, open standard streams, and UTF-8 for files and streams.
         """
         _import(_COMMON)
         _build_scenario()
         threads = len([*Path("/proc/self/task").iterdir()])
-        if threads > 1 or sys.getfilesystemencoding() != "utf-8":
+        is_closed = None in (sys.stdin, sys.stdout, sys.stderr)
+        if threads > 1 or is_closed or sys.getfilesystemencoding() != "utf-8":
             return None
         if (pid := os.fork()) > 0:
             return ForkedProcess(pid)
@@ -208,13 +208,6 @@ def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]
         raise MachineError(f"the fork server cannot be started: {error}") from None
     with closing(server):
         yield server
-
-
-def _open_standard_streams() -> None:
-    """Open those of the descriptors 0 to 2 that are closed, so that no socket has their numbers."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
 
 
 def _adopt_orphans(adopt: bool) -> None:
