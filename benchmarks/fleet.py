@@ -163,7 +163,7 @@ def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
     """Return the figures of a run; ``single_us`` is the CPU time of a step of one loop alone."""
     loops, network = found.loops, found.network
     nothing, step_us = Goal("==", 0), load_.step_us(found)
-    unequal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
+    equal = [one["replay"]["bit_exact"] for one in (network["network"], *loops)].count(True)
     late = {
         role: max(one["lateness_us"][role]["p99"] for one in loops) * 1e-3
         for role in WITH_DEADLINES
@@ -180,7 +180,7 @@ def figures(load_: Load, found: Measured, single_us: float) -> list[Row]:
             Row(f"{role} lateness p99, worst loop", late_ms, "ms", goal=_LATE_MS[load_.rate_hz])
             for role, late_ms in late.items()
         ),
-        Row("loops and network not replayed bit for bit", 1 + len(loops) - unequal, "",
+        Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
             goal=nothing),
         Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US,
             note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
