@@ -262,7 +262,7 @@ class Controller:
         return notices
 
     def note(self, controller: Any, note: Any) -> Notice:
-        """A controller asks for no lines."""
+        """Raise ValueError: the core's controller writes no notes."""
         raise ValueError("a controller writes no notes")
 
     def _call(

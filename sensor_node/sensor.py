@@ -59,8 +59,8 @@ class Observer:
         x: x̂ before the first measurement, (n,).
         reported: entries of a measurement that are inputs.
         period_ns: the plant's step.
-        knows_start: whether x̂ is the estimate at time 0; else at the first measurement.
-        restarted: a restarted sensor does not know the estimate of the sensor that it replaces.
+        knows_start: True: x̂ is the estimate at time 0; False: at the first measurement.
+        restarted: whether the sensor replaces one that died; the earlier estimate is lost.
     """
 
     settings: ObserverSettings
@@ -83,7 +83,7 @@ class Observer:
         sensor.plant_period_ns = self.period_ns
 
     def first_notice(self, t_ns: int) -> Sequence[Notice]:
-        """Return the line of a restarted observer at its first measurement."""
+        """Return the log line of a restarted observer, once: at its first measurement."""
         if not self.restarted:
             return ()
         self.restarted = False
@@ -110,7 +110,7 @@ class Sensor:
         schedule: the announced changes of its settings; None if they cannot change.
         timeout_ns: how long to wait for an acknowledgement; None: updates are not acknowledged.
         observer: estimates x from the measurements; None: they are x.
-        horizon_ns: no measurement is later; a message that is, is rejected.
+        horizon_ns: a measurement with a later time is rejected.
     """
 
     H: Matrix
@@ -203,13 +203,13 @@ class Sensor:
         return ()
 
     def inspect(self, rows: NDArray[np.void]) -> Sequence[Notice]:
-        """Return a line at the first measurement of a restarted observer."""
+        """Return a log line at the first measurement of a restarted observer."""
         if self.observer is None:
             return ()
         return self.observer.first_notice(int(rows["t_ns"][0]))
 
     def note(self, sensor: Any, note: Any) -> Notice:
-        """A sensor asks for no lines."""
+        """Raise ValueError: the core's sensor writes no notes."""
         raise ValueError("a sensor writes no notes")
 
     def _decide(self, sensor: Any) -> None:
@@ -227,7 +227,7 @@ class Sensor:
         sensor.machine.answered = 1
 
     def _start(self, sensor: Any, t_ns: int, x: Vector) -> None:
-        """Begin with the condition after an event at x, (n,)."""
+        """Restart the trigger's condition at an event at x, (n,)."""
         if self._trigger is not None:
             self._trigger.start(t_ns, x)
             return
@@ -239,7 +239,7 @@ class Sensor:
         )  # fmt: skip
 
     def _set_policy(self, sensor: Any, policy: Policy) -> None:
-        """Continue with a policy, as if it had been in force at the last event."""
+        """Set a policy as if it had been set at the last event."""
         n, memory = sensor.machine.n, self._memory
         if isinstance(policy, CodedPolicy):
             memory.fill(sensor.rule, {"weight": policy.weight})

@@ -20,6 +20,8 @@ PHRASES = (
     "updates outstanding", "× the scenario's", "certified for the missing",
     "certified from the newest", "largest certified value of each quantity",
     "that must pass enters", "100 % is normal", "so often\"",
+    "how far the run came", "that confirms itself", "has made of it", "asks for no lines",
+    "has the last word", "says what follows from what",
 )  # fmt: skip
 """The left columns of the project's list of words, as far as they are unambiguous."""
 PLACES = ("cosim", "noack", "netem", "plant_server", "sensor_node", "controller_node")

@@ -68,6 +68,8 @@ class Outcome:
     status: ExitStatus
     reason: str
     summary: RunSummary
+    loop: str | None = None
+    """Name of the loop, if this is the outcome of one loop of several."""
 
 
 def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
@@ -83,7 +85,9 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
         raise no_such_loop(loop, names)
     summary = outcome.summary.of_loop(loop)
     status = ExitStatus(summary.exit.status)
-    return Outcome(outcome.run_dir, status, summary.exit.reason, summary)
+    return Outcome(
+        outcome.run_dir, status, summary.exit.reason, summary, loop if len(names) > 1 else None
+    )
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same

@@ -1,8 +1,8 @@
-"""What a figure shows, as plain data: rows of panels, their axes, and what is drawn in them.
+"""The content of a figure as plain data: rows of panels, their axes and their items.
 
 Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
 (:mod:`cosim.output.figure_drawing`), the lab page by its chart library (:mod:`cosim.lab.chart`).
-Arrays may have any length, including 0, and values that are not finite, which are gaps.
+Arrays may have any length, including 0. Values that are not finite are drawn as gaps.
 """
 
 import math
@@ -27,13 +27,13 @@ SOLID: Dash = ()
 DASHED: Dash = (6, 2.5)
 DOTTED: Dash = (1, 1.6)
 DASHES: tuple[Dash, ...] = (SOLID, (6, 1.5), (2, 1.2), (6, 1.5, 1.5, 1.5))
-"""Dashes of series that are distinguished by them, too."""
+"""Dashes that distinguish series in addition to their colours."""
 MARKERS = "os^Dv<>PXph*"
-"""The same for markers, by matplotlib's names."""
+"""Markers that distinguish series in addition to their colours, by matplotlib's names."""
 Steps = Literal["", "pre", "mid", "post"]
 """Whether a curve is a staircase, and where its steps are."""
 BoundKind = Literal["certified", "identity", "printed"]
-"""Source of a bound: a certificate, identity (I1), or a formula of the paper."""
+"""Source of a bound: a certificate, identity (I1), or ("printed") a formula of the paper."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,7 +43,7 @@ class Line:
     x: Reals
     """(k,) ascending."""
     y: Reals
-    """(k,); on a logarithmic axis, 0 is a fall below the axis."""
+    """(k,); on a logarithmic axis, the curve leaves the axis at its lower end where y is 0."""
     colour: Colour
     label: str = ""
     width: float = 1.3
@@ -53,7 +53,7 @@ class Line:
     """A higher one is drawn in front."""
     marker: str = ""
     size: float = 5.0
-    """Of the marker."""
+    """Size of the marker."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,15 +173,15 @@ class Axis:
     ends: tuple[float | None, float | None] = (None, None)
     """None: where the data end."""
     about: Reals | None = None
-    """Measured values: bounds and bands that are far from them leave the axis."""
+    """Measured values; parts of bounds and bands far from them are outside the axis."""
     decades: int = 0
-    """So far below and above the largest measured value a logarithmic axis reaches."""
+    """Maximum decades of a logarithmic axis below and above the measured values; 0: no maximum."""
     whole: bool = False
     """Whether only whole numbers are written."""
     ticks: Mapping[float, str] | None = None
     """Texts instead of numbers."""
     numbers: bool = True
-    """Whether numbers are written; not where the panel below has the same axis."""
+    """Whether numbers are written; False if the panel below shows those of the same axis."""
     grid: bool = True
 
 
@@ -196,7 +196,7 @@ class Panel:
     legend: Sequence[str] | None = None
     """Labels in the legend, in order; None: all."""
     empty: str = "no data"
-    """What is written in a panel without data."""
+    """Text in a panel without data."""
     beside: "Panel | None" = None
     """A panel with the same vertical axis at the right: a histogram."""
 
@@ -215,14 +215,14 @@ class Row:
     widest_in: float = math.inf
     """Largest width of the axes of a panel."""
     left_in: float = 0.0
-    """Room for labels and numbers at the left of each panel; 0: the usual."""
+    """Space for labels and numbers at the left of each panel; 0: the default."""
     common: Literal["", "x", "xy"] = ""
-    """Axes that are the same for all panels: their numbers are written once."""
+    """Axes with the same ends in all panels; their numbers are written once."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColourScale:
-    """What the colours of a figure mean."""
+    """The values that the colours of a figure stand for."""
 
     low: float
     high: float

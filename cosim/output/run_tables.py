@@ -389,15 +389,14 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     network, flying = summary.network, summary.network.in_flight
     sent, reached_s = network.datagrams, summary.reached_s or math.inf
     lost = sum(network.drops_by_cause.values())
-    causes = "".join(
-        f", {n} {cause.replace('_', ' ')}" for cause, n in network.drops_by_cause.items()
-    )
+    by_cause = network.drops_by_cause.items() if set(network.drops_by_cause) - {"dropped"} else ()
+    causes = "".join(f", {n} {cause.replace('_', ' ')}" for cause, n in by_cause)
     rows = [
         ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
         longest_burst(summary.mansd, summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
-        ("in the network: mean, max", f"{flying.mean:.3g}, {flying.max} datagrams"),
+        ("datagrams in flight: mean, max", f"{flying.mean:.3g}, {flying.max}"),
     ]
     if network.rate_bps is not None and network.utilisation is not None:
         used = f"{100 * network.utilisation:.3g} % of {network.rate_bps:,} bit/s"

@@ -47,7 +47,7 @@ from cosim.output.run_tables import (
     short_numbers,
     timing_rows,
 )
-from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
+from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from noack.core.errors import ExitStatus
 from noack.core.number_format import NONE, percent
 from noack.runtime.life_cycle import HORIZON
@@ -141,6 +141,8 @@ class Remark(NamedTuple):
     text: str
     severe: bool = False
     """Whether a guarantee was broken."""
+    neutral: bool = False
+    """Whether it only reports what the user requested: a change of settings."""
 
 
 def remarks(summary: RunSummary) -> Iterator[Remark]:
@@ -158,6 +160,8 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
+    for when, what in changes_in(loop.changes):
+        yield Remark(f"{when}: {what}", neutral=True)
 
 
 def _has_clocks(loop: LoopSummary) -> bool:
@@ -191,8 +195,6 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
             yield f"{lost} (kernel): {where}"
     for restart in loop.restarts:
         yield f"{restart.process} was restarted, {away(restart)}; claims are void from then on"
-    for when, what in changes_in(loop.changes):
-        yield f"{when}: {what}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
@@ -201,7 +203,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     if causes and summary.kind == "live" and not loop.restarts:
         what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
-            f"{what} was late, so some claims were not judged to the end. To allow more "
+            f"{what} was late, so some claims were not checked to the end. To allow more "
             "lateness, raise certificate.late_periods."
         )
     if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
@@ -236,7 +238,8 @@ def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None
     else:
         print_numbers(console, run_title(summary), short_numbers(summary))
     for remark in remarks(summary):
-        start = f"[{BAD}]" if remark.severe else "[bold yellow]warning:[/] "
+        start = "" if remark.neutral else "[bold yellow]warning:[/] "
+        start = f"[{BAD}]" if remark.severe else start
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
 
 
@@ -290,9 +293,11 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
 
 
 def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
-    """Return why claims are void, the most frequent reasons first, with the number of loops."""
+    """Return why claims are void, with the number of loops; nothing if the verdict says it."""
     void = [{one.why for one in loop.claims if one.verdict == "void"} for loop in loops]
     reasons = Counter(why for whys in void for why in sorted(whys))
+    if len(reasons) == 1:
+        return []
     lines = [
         f"void: {why}" + (f" ({count} loops)" if count > 1 else "")
         for why, count in reasons.most_common(_MOST_REASONS)
@@ -400,17 +405,20 @@ def _event(number: int | None) -> str:
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     """Yield the files of a run, or one line with the commands that show them."""
-    run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
+    run_dir, loop = outcome.run_dir, outcome.loop
+    report = run_dir / file_of_loop(REPORT_FILE, loop)
+    of_loop = "" if loop is None else f" --loop {loop}"
     if shares_network(outcome.summary):
         yield f"one loop: {_program()} summary {run_dir} --loop NAME"
     if not verbose:
         page = f"{report} and " if report.is_file() else ""
-        yield f"more: {page}{_program()} summary {run_dir} --verbose"
+        yield f"more: {page}{_program()} summary {run_dir}{of_loop} --verbose"
         return
     yield f"run directory  {run_dir}"
     if report.is_file():
         yield f"report         {report}"
-    yield f"view           {_program()} view {run_dir / RECORDING_FILE}"
+    shown = run_dir / RECORDING_FILE if loop is None else f"{run_dir}{of_loop}"
+    yield f"view           {_program()} view {shown}"
 
 
 def _program() -> str:

@@ -8,10 +8,10 @@
    In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
    sensor waits for the acknowledgement until a timeout; then the current measurement is sent if the
-   rule still asks for it. The condition begins anew when an event is acknowledged. */
+   rule still requires it. An acknowledgement restarts the trigger's condition. */
 #include "loop.h"
 
-/* Whether a measurement is an event, by the rule or by the user's trigger; or ask the latter. */
+/* Whether a measurement is an event, by the rule or by the answer of the user's trigger. */
 static int64_t test(noack_sensor *sensor, int64_t t_ns, double sides[2]) {
     int64_t n = sensor->machine.n;
     if (!sensor->is_user)
@@ -62,7 +62,7 @@ static void advance_model(const noack_sensor *sensor, int64_t t_ns, double *x_s)
         copy(sensor->machine.n, sensor->acknowledged ? sensor->x_s : sensor->x, x_s);
 }
 
-/* Keep an update until it is acknowledged, and wait for that. */
+/* Keep a sent update until it is acknowledged, and start the timeout. */
 static void keep_sent(noack_sensor *sensor, int64_t t_ns) {
     int64_t n = sensor->machine.n;
     copy(n, sensor->x, sensor->sent_x + sensor->sent_count * n);
@@ -99,7 +99,7 @@ static int64_t measured(
     return NOACK_DONE;
 }
 
-/* The place of an update that waits for its acknowledgement; sent_count if it does not. */
+/* Index of an unacknowledged update; sent_count if there is none with this number. */
 static int64_t place_of(const noack_sensor *sensor, int64_t sequence) {
     int64_t place = 0;
     while (place < sensor->sent_count && sensor->sent[place] != sequence)

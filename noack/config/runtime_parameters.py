@@ -57,7 +57,7 @@ def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySetti
             short = [name for name, full in SHORT.items() if full in (*known, _PROBABILITY)]
             near = nearest_key(key, (*short, *known, _PROBABILITY))
             hint = near and f"did you mean {near}?"
-            all_known = f"what can is {_list(known)} (for short: {', '.join(short)})"
+            all_known = f"these can: {_list(known)} (for short: {', '.join(short)})"
             raise ValueError(f"{key}: cannot be changed during a run; {hint or all_known}")
         if _has_none(value):
             raise ValueError(f"{key}: needs a value")

@@ -11,7 +11,7 @@
    signals.
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
-The docstring of each folder says what follows from what. Labels such as eq:LossEv3 are those of the
+The docstring of each folder has its chain of arguments. Labels such as eq:LossEv3 are those of the
 paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
 the files. Modules are imported in the order bounds, paper, certificates, random_losses, margins:
 the paper's formulas need enclosed suprema, too.

@@ -7,9 +7,9 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
 1. ``contraction.py``: coordinates L in which G contracts, ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}. L comes
    from a Lyapunov equation or from eigenvectors; ν is computed from the final L, so nothing depends
    on how L was found.
-2. ``enclosure.py``: the suprema and integrals. Between two nodes a response is near its chord, by a
-   bound of its second derivative; beyond the last node ν bounds it. Why samples alone would not do:
-   docs/theory.md, "Why the suprema are enclosed, not sampled".
+2. ``enclosure.py``: the suprema and integrals. Between two nodes the distance of a response from
+   its chord is bounded by its second derivative; beyond the last node ν bounds the response. Why
+   samples are not sufficient: docs/theory.md, "Why the suprema are enclosed, not sampled".
 3. ``gains.py``: the names of these numbers. With K = U R the input error p = u − Kx acts through B
    U (docs/theory.md, "The loop", eq:miet_errdyn in the form of the three equations there):
 
@@ -20,13 +20,13 @@ an interval, for G = H + αI (the models) and G = A + BK + αI (the plant's loop
    disturbances in ``free``.
 4. ``box.py``: the same gains for every plant of an uncertainty box; the model error is one more
    input, bounded by a small-gain argument over its entries.
-5. ``terms.py``: the words of a certificate: what it assumes of the network, what a trigger
-   promises, what it states.
-6. ``trigger_bounds.py``: the promise of each trigger rule, and how e_s grows from it until the next
-   test, or from 0 after an event until the rule can transmit again (Volterra's inequality,
-   iterated).
+5. ``terms.py``: the data of a certificate: its assumptions on the network, the bound of ‖e_s‖ that
+   a trigger guarantees, and the certified bounds.
+6. ``trigger_bounds.py``: the bound of ‖e_s‖ after each test, for every trigger rule; and the growth
+   of e_s from this bound until the next test, or from 0 after an event until the rule can transmit
+   again (Volterra's inequality, iterated).
 7. ``disturbances.py``: bounded and normal disturbances and noise, and the error of an observer, as
    sums over their sources (docs/derivations.md, "Disturbances and noise", "The observer's error").
 
-Nothing in this folder knows how the bounds are combined; ``noack/theory/certificates`` does that.
+``noack/theory/certificates`` combines these bounds.
 """

@@ -1,22 +1,22 @@
-"""Certificates: what is guaranteed of a loop before it runs, under which conditions, and why.
+"""Certificates: the bounds that hold for a loop before it runs, their conditions and proof.
 
 From (I1) to a certificate (docs/theory.md, "Certificates"; docs/derivations.md, "Closing the
 loop"):
 
-1. ``inequalities.py``. (I1) bounds ‖C e_c‖ by D_C β̃: the present e_s, and at most N missing
-   events, each with what e^{(H+αI)τ} has made of it. N is the longest burst of losses, and ⌈d/δ⌉ in
-   flight. The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
+1. ``inequalities.py``. (I1) bounds ‖C e_c‖ by D_C β̃: the present e_s, plus at most N missing
+   events, each propagated by e^{(H+αI)τ}. N is the longest loss burst plus ⌈d/δ⌉ updates in flight.
+   The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
    input is of age ≤ σ. All these inequalities are linear in non-negative numbers. If the loop gain
    is below 1, their solution bounds the run at all times, by induction over time: Δ (of the size of
    eq:Normec, but without Proposition 1), X (eq:normXt) and β̃.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
-   the largest δ that confirms itself is used. Under the paper's conditions the bounds are sharpened
+   the largest consistent δ is used. Under the paper's conditions the bounds are sharpened
    by the flow between two deliveries, which ``delivery_flow.py`` computes: an ellipsoid that x
    never leaves.
-3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, what
-   decays and what persists are two parts. All inequalities are linear in functions of time, so the
-   bounds of the parts are added.
+3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, each
+   bound has a decaying part and a persistent part. All inequalities are linear in functions of
+   time, so the bounds of the two parts are added.
 4. ``scenario_certificates.py``. Which of these a scenario gets, for its own plant and for the box;
    and the largest sampling period, delay and age of inputs that are still certified.
 5. ``certified_bounds.py``. The guarantee as bounds over time; and sharper ones from the newest

@@ -1,8 +1,8 @@
 """The margin: whether a loop is stable for every loss pattern that a guarantee allows.
 
-Here the sensor is time-triggered, or has a longest time between two events. Nothing about the
-threshold is used, so the result is exact where certificates are sufficient only (docs/theory.md,
-"The margin of a time-triggered loop"; the paper's M is the only thing of it that remains).
+Here the sensor is time-triggered, or has a longest time between two events. The threshold is not
+used; of the paper's assumptions only M remains. The result is necessary and sufficient, whereas
+certificates are sufficient only (docs/theory.md, "The margin of a time-triggered loop").
 
 1. ``time_triggered_loop.py``. A delivered update removes all knowledge of older ones. So from one
    delivery to the next the loop is one linear map, z → Φ z, that depends on the number of lost
@@ -17,7 +17,7 @@ threshold is used, so the result is exact where certificates are sufficient only
    take into each other bound it from above (``invariant_polytopes.py``); where there are too many
    edges, quadratic norms do (``joint_spectral_radius.py``).
 
-How the polytopes, norms and cycles are found is a heuristic in floating point. What they prove is
-computed afterwards from what was found, with all rounding, by ``exact_matrices.py``. If the bounds
-are on both sides of 1, the result is "undecided".
+A heuristic in floating point searches for the polytopes, norms and cycles. ``exact_matrices.py``
+then verifies what they prove, with all rounding errors included. If the lower bound is below 1 and
+the upper bound above 1, the result is "undecided".
 """

@@ -1,4 +1,4 @@
-"""The paper's own results: what they assume, what follows, and what can be evaluated.
+"""The paper's own results: their assumptions, their chain of arguments, their evaluation.
 
 The loop (docs/theory.md, "The loop"). The plant is ẋ = Ax + Bu (eq:plant). Sensor and controller
 run the same model ẋ_s = H x_s, ẋ_c = H x_c between updates (eq:ModSensor, eq:ModCont), H = Â + B̂K,

@@ -1,13 +1,13 @@
-"""What holds of a loop whose losses are random and not limited: probabilities and moments.
+"""Loops whose losses are random and not limited: probabilities and moments instead of bounds.
 
-The paper and the certificates assume at most M − 1 consecutive losses. If nothing enforces that, a
-run keeps it with some probability, and other statements take the place of bounds (docs/theory.md,
-"Without a limit on the losses"). The losses are a Markov chain over the packets
+The paper and the certificates assume at most M − 1 consecutive losses. If nothing enforces this
+limit, a run stays within it with some probability (docs/theory.md, "Without a limit on the
+losses"). The losses are a Markov chain over the packets
 (``noack/impairments/loss_prediction.py``).
 
 1. A certificate for at most m consecutive losses holds for a whole run if no longer burst happens.
    Until then events are at least δ apart, so a run of T seconds has at most ⌊T/δ⌋ + 1 of them; the
-   chain gives the probability that so many packets keep the limit.
+   chain gives the probability that this many packets stay within the limit.
 2. Moments. Each update is lost with a probability of at most p̄, whatever happened before. In the
    inequalities of a certificate, (I1) then holds for (E‖·‖ʳ)^{1/r} with ρ = p̄^{1/r} in place of
    the number of missing events. They are linear, and solved in the same way. A moment that decays

@@ -117,7 +117,7 @@ def test_an_unknown_name_gives_one_line_with_a_suggestion(
 ) -> None:
     with pytest.raises(CallerError) as refused:
         changed(ticket.scenario, parsed([name, "1"]))
-    hint = f"did you mean {near}?" if near else "what can is network.loss, network.mansd, "
+    hint = f"did you mean {near}?" if near else "these can: network.loss, network.mansd, "
     assert f"{name}: cannot be changed during a run; {hint}" in str(refused.value)
     if near is None or name.startswith("network."):  # the option has it, or names the section's
         return

@@ -116,6 +116,7 @@ def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     for words in ((run_dir,), loop):
         shown = noack("summary", *words)
         assert shown.exit_code == 0, shown.output
+        assert shown.stdout.count("--loop periodic --verbose") == (words == loop)
         replayed = noack("replay", *words, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []

@@ -33,7 +33,7 @@ def scenario(content: dict[str, Any]) -> Scenario:
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"speed": 2.0}, "speed: cannot be changed during a run; what can is network.loss, "),
+        ({"speed": 2.0}, "speed: cannot be changed during a run; these can: network.loss, "),
         ({"network.loss.probability": 1.5}, "network.loss.probability = 1.5: should be less than"),
         ({"network.loss.p": 0.5}, "network.loss.p = 0.5: unknown key; the keys here are"),
         ({"network.loss.model": "gilbert"}, "must be one of .* did you mean gilbert_elliott"),
