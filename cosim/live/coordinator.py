@@ -452,7 +452,10 @@ class ChangeRequests:
         Raises:
             CallerError: the change is not valid for this run.
         """
-        for one in (self._schedule, *self._of_loops):
+        schedules = (self._schedule, *self._of_loops)
+        for one in schedules:
+            one.check(change, -1)
+        for one in schedules:
             one.announce("", change, 0, 0, -1)
         announcement = {
             "number": change.number,

@@ -281,7 +281,9 @@ def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
     waiting: list[Rows] = []
     count = 0
     for batch in batches:
-        begins = count and LOOP in (dtype.names or ()) and waiting[-1][LOOP][-1:] != batch[LOOP][:1]
+        if not len(batch):  # a loop without rows
+            continue
+        begins = count and LOOP in (dtype.names or ()) and waiting[-1][LOOP][-1] != batch[LOOP][0]
         if count >= _LEAST_GROUP_ROWS and begins:
             yield joined(waiting, dtype)
             waiting, count = [], 0

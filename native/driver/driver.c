@@ -379,9 +379,9 @@ static int64_t sleep_until_needed(
 }
 
 /* Receive at most a number of messages from a place on; return their number. After an ICMP error of
-   a datagram, it fails once. */
+   a datagram, it fails once. Of several loops, a message may have several datagrams. */
 static int64_t call_receive(driver_scratch *own, int fd, int64_t place, int64_t most) {
-    if (most > 1)
+    if (own->batch > 1)
         return recvmmsg(fd, &own->in_headers[place], (unsigned)most, MSG_DONTWAIT, NULL);
     socklen_t name_bytes = NOACK_NAME_BYTES;
     ssize_t size_bytes = recvfrom(

@@ -164,7 +164,7 @@ class ChangeSchedule:
         prepare: Callable[[Scenario], Any] = lambda scenario: None,
     ) -> None:
         self._prepare = prepare
-        self._results: dict[tuple[int, ...], tuple[Scenario, Any]] = {}
+        self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Any, Any]] = {}
         self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
@@ -174,7 +174,7 @@ class ChangeSchedule:
     def of_alike(self, scenario: Scenario) -> "ChangeSchedule":
         """Return a schedule for a loop that differs in its draws only.
 
-        What the changes so far, by their numbers, make of the scenario is computed once for both.
+        What the same changes make of the scenario is computed once for both.
         """
         schedule = ChangeSchedule(scenario, self._prepare)
         schedule._results = self._results
@@ -207,11 +207,13 @@ class ChangeSchedule:
         first = bisect(every, (since_ns, change.number), key=lambda one: (one.since_ns, one.number))
         every.insert(first, entry)
         for place in range(first, len(every)):
-            numbers = tuple(one.number for one in every[: place + 1])
-            if numbers not in self._results:
-                scenario = changed(every[place - 1].scenario, every[place].settings)
-                self._results[numbers] = scenario, self._prepare(scenario)
-            scenario, prepared = self._results[numbers]
+            # A change that was refused has left its number to another one.
+            key = tuple((one.number, id(one.settings)) for one in every[1 : place + 1])
+            if key not in self._results:
+                scenario, own = every[place - 1].scenario, every[place].settings
+                scenario = changed(scenario, own)
+                self._results[key] = scenario, self._prepare(scenario), own  # the id stays its own
+            scenario, prepared, _ = self._results[key]
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         return every
 

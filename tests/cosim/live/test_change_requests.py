@@ -14,12 +14,19 @@ from noack.core.errors import CallerError
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 
 
-def answer(loops: int, settings: dict[str, Any]) -> dict[str, Any]:
-    scenario = load(PATH, [f'loops=[{{ name = "p", count = {loops} }}]'])
+def requests_of(loops: int, *settings: str) -> ChangeRequests:
+    scenario = load(PATH, [f'loops=[{{ name = "p", count = {loops} }}]', *settings])
     ticket = SimpleNamespace(scenario=scenario, run_dir="here")
     plane = SimpleNamespace(announce_change=lambda announcement: None)
-    requests = ChangeRequests(cast("Any", ticket), cast("Any", plane))
+    return ChangeRequests(cast("Any", ticket), cast("Any", plane))
+
+
+def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:
     return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None)
+
+
+def answer(loops: int, settings: dict[str, Any]) -> dict[str, Any]:
+    return requested(requests_of(loops), settings)
 
 
 @pytest.mark.parametrize("loops", [1, 4])
@@ -33,3 +40,16 @@ def test_every_listed_parameter_can_be_changed(loops: int) -> None:
 def test_other_settings_are_refused() -> None:
     with pytest.raises(CallerError, match=r"plant\.rate_hz"):
         answer(4, {"plant.rate_hz": 100.0})
+
+
+def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
+    """It is valid now and with the last settings, but not with the first of those scheduled."""
+    requests = requests_of(2, 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]')
+    kept = {"model": "bernoulli", "probability": 0.8, "keep": True}
+    with pytest.raises(CallerError, match=r"network\.loss: loss 80% keep: impossible"):
+        requested(requests, {"network.mansd": 10, "network.loss": kept})
+    loss = kept | {"probability": 0.2}
+    assert requested(requests, {"network.loss": loss})["from_s"] > 0
+    found = requested(requests, {})["runtime_parameters"]
+    assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
+    assert [one["number"] for one in requests.announced] == [0, 1]

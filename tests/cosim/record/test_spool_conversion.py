@@ -11,6 +11,7 @@ import pytest
 from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, Rows, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
+from cosim.record.table_files import StoredTables, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.config.resolution import network_tables, run_tables
 from noack.config.scenario_file import validate
@@ -180,3 +181,16 @@ def test_a_loops_reports_count_its_own_rows_and_datagrams(
         assert report["channel"] == own[number]
         missing = record.reports["netem"]["rows"][NETEM_PACKET] - record.count(NETEM_PACKET)
         assert missing == 1
+
+
+def test_a_loop_without_rows_between_long_ones_is_empty(tmp_path: Path) -> None:
+    """Its rows do not begin a part of the file."""
+    dtype = np.dtype([(LOOP, "<u2"), ("input", "<i8")])
+    counts = (5000, 0, 5000, 10, 0, 40_000, 0)
+    batches = [np.zeros(count, dtype) for count in counts]
+    for number, rows in enumerate(batches):
+        rows[LOOP], rows["input"] = number, range(len(rows))
+    write_table(tmp_path / f"{PLANT_STEP}.parquet", batches, dtype, {})
+    stored = StoredTables(tmp_path, {PLANT_STEP: dtype}, 10**6)
+    assert stored.whole(PLANT_STEP).tobytes() == np.concatenate(batches).tobytes()
+    assert [stored.count_of_loop(PLANT_STEP, k) for k in range(len(counts))] == list(counts)

@@ -235,6 +235,23 @@ def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[
         assert sorted(live.rows.tables) == ["sensor_acknowledgement", SENSOR_MEASUREMENT]
 
 
+def test_acknowledgements_that_come_together_are_received_though_measurements_fill_the_room(
+    content: dict[str, Any],
+) -> None:
+    """Measurements leave room for one message, which has several acknowledgements."""
+    content["network"] |= {"protocol": "ack"}
+    with closing(Live("sensor", [scenario(content)] * 20, acknowledged=True)) as live:
+        answers = [Message(Flow.ACKNOWLEDGEMENT, 10, 5, NO_VECTOR, loop) for loop in range(10)]
+        data = [live.encoder.encode(one) for one in answers]
+        head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", len(data[0])))]
+        live.answers.connect(live.address)
+        live.send(*measurements(1, 14))
+        live.answers.sendmsg([b"".join(data)], head)
+        live.drive_until_accepted(14)
+        live.drive(lambda: live.driver.core.sources[1].received > 0)
+        assert live.driver.core.sources[1].received == len(answers)
+
+
 def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -> None:
     network = content["network"] | {"protocol": "ack"}
     with closing(Live("controller", [scenario(content, network=network)])) as live:
