@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli import command as cli
-from cosim.cli.command import console, print_json
 from noack.core.errors import CallerError
 
 if TYPE_CHECKING:
@@ -102,9 +101,9 @@ def run_processes(
 
 def _progress(scenario: "Scenario", session: str | None) -> "AbstractContextManager[Watcher]":
     """Give what shows the progress of a run; importing rich takes 0.05 s."""
-    from cosim.live.progress import PatientConsole, progress_line
+    from cosim.live.progress import error_console, progress_line
 
-    return progress_line(PatientConsole(stderr=True), scenario, session)
+    return progress_line(error_console(), scenario, session)
 
 
 @contextmanager
@@ -172,17 +171,14 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
 def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.finalize import finalize
     from cosim.live.launcher import log_end
-    from cosim.live.progress import PatientConsole
     from cosim.output.run_verdict import print_outcome
 
     # This takes minutes for a run of an hour.
-    with PatientConsole(stderr=True).status("replaying the run and checking its claims"):
+    with cli.status("replaying the run and checking its claims"):
         outcome = finalize(ending, report=output.report)
     log_end(outcome.status, outcome.reason, outcome.run_dir)
-    if output.json:
-        print_json(outcome.summary.to_json())
-    else:
-        print_outcome(console(), outcome, verbose=output.verbose)
+    document = outcome.summary.to_json
+    cli.show(output.json, document, print_outcome, outcome, verbose=output.verbose)
     return outcome.status
 
 

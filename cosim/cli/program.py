@@ -62,12 +62,8 @@ class Program(TyperGroup):
             if message := self._line(error, words):
                 failed(message, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
-            status = failed(
-                f"cannot write: {why(error)}",
-                ExitStatus.FAILED,
-                who=NAME,
-                as_json="--json" in words,
-            )
+            text, as_json = f"cannot write: {why(error)}", "--json" in words
+            status = failed(text, ExitStatus.FAILED, who=NAME, as_json=as_json)
         if standalone_mode:
             sys.exit(int(status or 0))
         return status
@@ -97,20 +93,20 @@ def examples_of(command: Any) -> list[str]:
     return [line for line in commands if line.startswith(f"{NAME} ")]
 
 
-def be_patient() -> None:
+def ignore_broken_pipes() -> None:
     """Discard output to a standard stream after its reader has closed it.
 
     Hence `noack run ... | head -1` runs to its end, with the run's exit status.
     """
-    sys.stdout, sys.stderr = patient_stream(sys.stdout), patient_stream(sys.stderr)
+    sys.stdout, sys.stderr = pipe_safe_stream(sys.stdout), pipe_safe_stream(sys.stderr)
 
 
-def patient_stream(stream: Any) -> Any:
+def pipe_safe_stream(stream: Any) -> Any:
     """Return a standard stream that discards output after its reader has closed it."""
     if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream
     return io.TextIOWrapper(
-        io.BufferedWriter(_Patient(stream.fileno(), "w", closefd=False)),
+        io.BufferedWriter(_PipeSafeFile(stream.fileno(), "w", closefd=False)),
         encoding=stream.encoding,
         errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
         # PYTHONUNBUFFERED requests more than lines; readers wait for lines.
@@ -118,7 +114,7 @@ def patient_stream(stream: Any) -> Any:
     )
 
 
-class _Patient(io.FileIO):
+class _PipeSafeFile(io.FileIO):
     """Raises one error if the disk is full; the rest, written at the end, is discarded."""
 
     _full = False

@@ -21,7 +21,7 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.config.scenario import loop_scenario
+from noack.config.scenario import loop_scenario, loop_sections
 from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
@@ -398,11 +398,12 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        loops = ticket.scenario.loops or ()
-        self._schedule, *self._of_loops = (
-            ChangeSchedule(one)
-            for one in (ticket.scenario, *(loop_scenario(ticket.scenario, one) for one in loops))
-        )
+        self._schedule = ChangeSchedule(ticket.scenario)
+        self._entries = {
+            one.name: ChangeSchedule(loop_scenario(ticket.scenario, one))
+            for one in loop_sections(ticket.scenario)
+        }
+        """The changes of the loops of each entry of [[loops]], by its name."""
         self.announced: list[dict[str, Any]] = []
         """Announcements of all changes so far."""
         for change in scheduled(ticket.scenario):
@@ -418,14 +419,14 @@ class ChangeRequests:
             PeerError: the message is not a change request.
         """
         settings = parse_message(ChangeRequest, request).get("settings", {})
-        from_s, now_ns = None, clock()
+        from_s, now_ns, before = None, clock(), self._parameters()
         if settings:
             if obstacle is not None:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
             # Before the time is chosen, as it may take long.
-            for one in (self._schedule, *self._of_loops):
+            for one in self._schedules:
                 changed(one.last, settings)
             now_ns = clock()
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
@@ -438,13 +439,23 @@ class ChangeRequests:
             requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
             self._plane.announce_change(self._add(change, now_ns, requested_at))
             from_s = t_ns / NS_PER_S
+        loops = self._parameters()
         return {
             "name": self._scenario.name,
             "run_dir": self._run_dir,
             "t_s": now_ns / NS_PER_S,
             "from_s": from_s,
             "runtime_parameters": current_parameters(self._schedule.last),
+            "loops": loops,
+            "changed_loops": [name for name in loops if loops[name] != before[name]],
         }
+
+    @property
+    def _schedules(self) -> tuple[ChangeSchedule, ...]:
+        return (self._schedule, *self._entries.values())
+
+    def _parameters(self) -> dict[str, dict[str, Any]]:
+        return {name: current_parameters(one.last) for name, one in self._entries.items()}
 
     def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:
         """Check and store a change; return its announcement.
@@ -452,10 +463,9 @@ class ChangeRequests:
         Raises:
             CallerError: the change is not valid for this run.
         """
-        schedules = (self._schedule, *self._of_loops)
-        for one in schedules:
+        for one in self._schedules:
             one.check(change, -1)
-        for one in schedules:
+        for one in self._schedules:
             one.announce("", change, 0, 0, -1)
         announcement = {
             "number": change.number,

@@ -25,11 +25,16 @@ _LINE_EVERY_S = 5.0
 """Time between two lines about the completed runs, if there is no terminal."""
 
 
-class PatientConsole(Console):
-    """A console that survives a closed pipe; rich would end the program, and with it the run."""
+class PipeSafeConsole(Console):
+    """A console that ignores a broken pipe; rich would end the program, and with it the run."""
 
     def on_broken_pipe(self) -> None:
         """Ignore it."""
+
+
+def error_console() -> Console:
+    """Return such a console on standard error."""
+    return PipeSafeConsole(stderr=True)
 
 
 @contextmanager
@@ -151,7 +156,7 @@ def _bar(
 @contextmanager
 def work_bar(what: str) -> Iterator[Callable[[float], None]]:
     """Show the completed share of some work."""
-    with _bar(PatientConsole(stderr=True), 1.0, what=what) as update:
+    with _bar(error_console(), 1.0, what=what) as update:
         yield lambda share: update(completed=share)
 
 
@@ -204,7 +209,7 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
     """Show the state of an adversary's search, on a terminal only."""
     began_s = time.monotonic()
-    with PatientConsole(stderr=True).status("searching") as status:
+    with error_console().status("searching") as status:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             def report(what: str, nodes: int, value: float) -> None:

@@ -46,6 +46,7 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     "controller": TypeAdapter(AnyController, config=_AT_FIRST_USE),
 }
 """The parts of a scenario that may change during a run."""
+_LONGEST_NS = 2**60
 _ROUNDING = 1e-9  # largest Âx_r + B̂u_r that is taken as 0, relative to the larger term
 
 
@@ -55,6 +56,11 @@ def check_sections(scenario: ScenarioTables) -> None:
     if timing.horizon_ns < timing.plant_period_ns:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
+        )
+    if timing.measurement_period_ns > _LONGEST_NS:
+        raise ValueError(
+            f"plant.measure_every: {timing.measurement_period_ns / NS_PER_S:g} s between "
+            f"measurements, at most {_LONGEST_NS / NS_PER_S:g} s"
         )
     _check_plant(scenario)
     m = scenario.model.dimensions[1]

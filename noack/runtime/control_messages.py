@@ -96,6 +96,10 @@ class ChangeReply(ControlMessage):
     """Simulated time from which the change applies; None if none was requested."""
     runtime_parameters: dict[str, JsonValue]
     """Values by scenario key, all announced changes included."""
+    loops: dict[str, dict[str, JsonValue]]
+    """The same for the loops of each entry of [[loops]], by its name."""
+    changed_loops: tuple[str, ...]
+    """The entries with another value than before the request."""
 
 
 class RunStart(ControlMessage):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
@@ -12,7 +13,7 @@ from noack.core.errors import CallerError
 
 InvitationOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--invitation",
         metavar="FILE",
         help="Join a run on another host, by the file that `noack record --listen` wrote.",
@@ -53,28 +54,22 @@ def record(
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
     _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS[:PORT]",
-            help="Let processes on other hosts join, at this address of this host.",
-        ),
-    ] = None,
-    invitation: Annotated[
-        Path, typer.Option(metavar="FILE", help="With --listen: where the invitation is written.")
-    ] = Path("invitation.json"),
-    invite: Annotated[
-        Invited, typer.Option(help="With --listen: which process the invitation is for.")
-    ] = Invited.ALL,
-    valid_minutes: Annotated[
-        float,
-        typer.Option(min=0.01, max=525_600, help="With --listen: how long one can join by it."),
-    ] = 60.0,
+    listen: Annotated[str | None, Option(metavar="ADDRESS[:PORT]")] = None,
+    invitation: Annotated[Path, Option(metavar="FILE")] = Path("invitation.json"),
+    invite: Invited = Invited.ALL,
+    valid_minutes: Annotated[float, Option(min=0.01, max=525_600)] = 60.0,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Open a run and record it; the other four processes join from other terminals or hosts."""
+    """Open a run and record it; the other four processes join from other terminals or hosts.
+
+    Options:
+        listen: Let processes on other hosts join, at this address of this host.
+        invitation: With --listen: where the invitation is written.
+        invite: With --listen: which process the invitation is for.
+        valid_minutes: With --listen: how long one can join by it.
+    """
     from noack.protocol.topology import RECORDER
 
     output, listening = RunOutput(report, verbose, json), None

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
@@ -26,14 +26,15 @@ _COMMENT = "# "
     ("noack scenarios --json", "list them as JSON"),
 ])  # fmt: skip
 def scenarios(
-    name: Annotated[
-        str | None,
-        typer.Argument(help="Print this scenario or campaign.", autocompletion=completion.shipped),
-    ] = None,
+    name: Annotated[str | None, Argument(autocompletion=completion.shipped)] = None,
     *,
     json: cli.JsonOption = False,
 ) -> int:
-    """List the shipped scenarios and campaigns, or print one of them."""
+    """List the shipped scenarios and campaigns, or print one of them.
+
+    Options:
+        name: Print this scenario or campaign.
+    """
     if name is not None:
         text = text_of(name)
         cli.print_json({"name": name, "toml": text}) if json else print(text, end="")
@@ -211,15 +212,16 @@ def _dependent_defaults(resolved: "Scenario") -> Iterator[str]:
 ])  # fmt: skip
 def schema(
     *,
-    netem: Annotated[
-        bool, typer.Option("--netem", help="Print the schema of the emulator's links files.")
-    ] = False,
-    campaign: Annotated[
-        bool, typer.Option("--campaign", help="Print the schema of campaign files.")
-    ] = False,
+    netem: Annotated[bool, Option("--netem")] = False,
+    campaign: Annotated[bool, Option("--campaign")] = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Print the JSON Schema of scenario files, for editors."""
+    """Print the JSON Schema of scenario files, for editors.
+
+    Options:
+        netem: Print the schema of the emulator's links files.
+        campaign: Print the schema of campaign files.
+    """
     if campaign:
         from cosim.studies.campaign.campaign_file import json_schema as campaign_schema
 

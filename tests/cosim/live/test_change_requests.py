@@ -14,8 +14,9 @@ from noack.core.errors import CallerError
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 
 
-def requests_of(loops: int, *settings: str) -> ChangeRequests:
-    scenario = load(PATH, [f'loops=[{{ name = "p", count = {loops} }}]', *settings])
+def requests_of(loops: int | str, *settings: str) -> ChangeRequests:
+    entries = loops if isinstance(loops, str) else f'[{{ name = "p", count = {loops} }}]'
+    scenario = load(PATH, [f"loops={entries}", *settings])
     ticket = SimpleNamespace(scenario=scenario, run_dir="here")
     plane = SimpleNamespace(announce_change=lambda announcement: None)
     return ChangeRequests(cast("Any", ticket), cast("Any", plane))
@@ -35,6 +36,17 @@ def test_every_listed_parameter_can_be_changed(loops: int) -> None:
     assert {"trigger.beta", "network.mansd", "controller.setpoint"} <= listed.keys()
     for key, value in listed.items():
         assert answer(loops, {key: value})["from_s"] > 0
+
+
+def test_each_entry_of_the_loops_has_its_own_values() -> None:
+    requests = requests_of('[{ name = "p", count = 3 }, { name = "q", trigger = { beta = 0.07 } }]')
+    before = requested(requests, {})
+    assert before["loops"]["q"]["trigger.beta"] == 0.07
+    assert before["loops"]["p"] == before["runtime_parameters"]
+    assert before["changed_loops"] == []
+    after = requested(requests, {"trigger.beta": 0.07})
+    assert after["changed_loops"] == ["p"]
+    assert after["loops"]["p"] == after["loops"]["q"]
 
 
 def test_other_settings_are_refused() -> None:

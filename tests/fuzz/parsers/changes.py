@@ -46,6 +46,8 @@ ANSWER = {
     "t_s": 0.5,
     "from_s": 0.7,
     "runtime_parameters": SETTINGS,
+    "loops": {"x": SETTINGS},
+    "changed_loops": ["x"],
 }
 RUN = {"name": "00", "run_dir": "runs/x", "session": None}
 KNOWN = Vocabulary(
