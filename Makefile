@@ -19,7 +19,7 @@ MINUTES ?= 10
 N ?= 1000000
 ARGS ?=
 LIVE ?=
-SETTABLE := PYTHON VENV SCENARIO CAMPAIGN SETTLING SESSION RUNS MINUTES N ARGS LIVE
+SETTABLE := PYTHON VENV CC SCENARIO CAMPAIGN SETTLING SESSION RUNS MINUTES N ARGS LIVE
 UNKNOWN := $(foreach v,$(filter-out $(SETTABLE) SHELL MAKE% -%,$(.VARIABLES)),$(if $(filter command,$(origin $v)),$v))
 $(if $(strip $(UNKNOWN)),$(error no such variable: $(strip $(UNKNOWN)); there are $(SETTABLE)))
 C_FILES := $(wildcard native/*.[ch] native/*/*.[ch])

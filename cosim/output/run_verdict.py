@@ -7,7 +7,7 @@ Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -90,8 +90,16 @@ def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     return (
         ending_line(summary.exit, summary.reached_s, summary.horizon_s),
         transmission_line(events, delivered, ideal),
-        _claims([claim for one in loops for claim in one.claims]),
+        _claims([claim for one in loops for claim in one.claims], _void_since_s(summary)),
     )
+
+
+def _void_since_s(summary: RunSummary) -> dict[str, float]:
+    """Return when each assumption was first violated; empty for several loops."""
+    if shares_network(summary):
+        return {}
+    violations = summary.loops[0].assumption_violations
+    return {one.what: one.t_s for one in reversed(violations) if one.cause in CAUSES}
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
@@ -112,8 +120,8 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(claims: Sequence[Claim]) -> VerdictLine:
-    """Count the claims by verdict, each with its first reason."""
+def _claims(claims: Sequence[Claim], void_since_s: Mapping[str, float]) -> VerdictLine:
+    """Count the claims by verdict, each with its first reason; of void ones since when."""
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
     counts = Counter(str(claim.verdict) for claim in claims)
@@ -121,18 +129,19 @@ def _claims(claims: Sequence[Claim]) -> VerdictLine:
     for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
         if counts[name]:
             style = colour if style == GOOD else style
-            parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
+            parts.append(f"{counts[name]} {name}{_reason(claims, name, void_since_s)}")
     return VerdictLine(", ".join(parts), style)
 
 
-def _reason(claims: Sequence[Claim], name: str) -> str:
+def _reason(claims: Sequence[Claim], name: str, void_since_s: Mapping[str, float]) -> str:
     """Return the first reason of a verdict, in brackets; with it, unless void, which claims."""
     concerned = [claim for claim in claims if claim.verdict == name]
     why = next((claim.why for claim in concerned if claim.why), "")
     what = [] if name == "void" else list(dict.fromkeys(claim.what for claim in concerned))
     more = [f"{len(what) - _NAMED} more"] if len(what) > _NAMED else []
     which = "; ".join([*what[:_NAMED], *more])
-    return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
+    since = f" from {void_since_s[why]:.3f} s on" if name == "void" and why in void_since_s else ""
+    return f"{since} ({': '.join(filter(None, (which, why)))})" if which or why else ""
 
 
 class Remark(NamedTuple):
@@ -148,7 +157,14 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    violations = loop.assumption_violations
+    stated = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
+    since_s = _void_since_s(summary)
+    # The verdict has the first violation that is the first reason of void claims.
+    violations = [
+        one
+        for one in loop.assumption_violations
+        if one.what != stated or since_s.get(one.what) != one.t_s
+    ]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
         severe = one.cause not in CAUSES  # the guarantee, or a change
