@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from cosim.live.fork_server import ForkServer
-    from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
+    from cosim.live.run_watcher import Watcher
     from cosim.output.figure_format import FigureFiles
     from cosim.record.run_directory import RunEnding
     from cosim.studies.campaign.campaign_file import Campaign
@@ -74,7 +74,8 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import RunLog, Watcher, joint_watcher, later_watcher, launch
+        from cosim.live.launcher import launch
+        from cosim.live.run_watcher import RunLog, Watcher, joint_watcher, later_watcher
         from noack.config.link_load import require_capacity
         from noack.protocol.topology import ROLES
 
@@ -170,7 +171,7 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
 
 def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.finalize import finalize
-    from cosim.live.launcher import log_end
+    from cosim.live.run_watcher import log_end
     from cosim.output.run_verdict import print_outcome
 
     # This takes minutes for a run of an hour.

@@ -22,6 +22,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
+from cosim.live.run_watcher import Watcher
 from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError
@@ -303,14 +304,10 @@ class RestartPolicy:
         scenario: Scenario,
         coordinator: Coordinator,
         children: ChildProcesses,
-        on_failure: Callable[[str, float, str | None], None],
-        on_restart: Callable[[str, float], None],
+        watcher: Watcher,
     ) -> None:
-        self._scenario = scenario
-        self._coordinator = coordinator
-        self._children = children
-        self._on_failure = on_failure
-        self._on_restart = on_restart
+        self._scenario, self._coordinator = scenario, coordinator
+        self._children, self._watcher = children, watcher
         self._failed: dict[str, _Failed] = {}
 
     def check(self) -> Failure | None:
@@ -330,7 +327,7 @@ class RestartPolicy:
         for role, ((status, why), until_s) in list(self._failed.items()):
             if self._coordinator.running_generation(role) is not None:
                 del self._failed[role]
-                self._on_restart(role, self._t_s())
+                self._watcher.restarted(role, self._t_s())
             elif role in exited:
                 return exited[role][0], f"{why}; restarted, {exited[role][1]}"
             elif time.monotonic() > until_s:
@@ -349,7 +346,7 @@ class RestartPolicy:
             self._failed[role] = _Failed((status, why), time.monotonic() + within_s)
             launched = role in self._children
             self._coordinator.allow_restart(role, why, dead=self._children.is_dead(role))
-            self._on_failure(why, self._t_s(), None if launched else role)
+            self._watcher.failed(why, self._t_s(), None if launched else role)
             if launched:
                 try:
                     self._children.restart(role)

@@ -29,10 +29,14 @@ from noack.core.process_limits import cores
 from noack.impairments.loss_prediction import found_probabilities
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
+    Admission,
     AdmissionRequest,
+    ChangeAnnouncement,
+    ChangeReply,
     ChangeRequest,
     JoinRequest,
     RunProgress,
+    RunStart,
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, header_of, next_payload
@@ -223,7 +227,7 @@ class Coordinator:
         if dead:
             self._members[role].apply(Event.END, failure)
 
-    def progress(self) -> dict[str, Any] | None:
+    def progress(self) -> RunProgress | None:
         """The recorder's newest progress report; None without a new one."""
         payload = next_payload(self._progress)
         if payload is None:
@@ -279,18 +283,17 @@ class Coordinator:
             PeerError: it cannot join.
         """
         request = parse_message(AdmissionRequest, _payload(query))
-        instance = request["instance"]
         if role not in ROLES:
             raise PeerError("a run has no such process")
-        self._require_pass(role, request.get("admission_pass", ""))
+        self._require_pass(role, request.admission_pass)
         before, failure = self._vacant(role), self._replaceable.get(role)
         if self._clock is not None and (before is None or failure is None):
             raise PeerError("the run has started without it")
         admission = _admission(before, failure, self._clock)
-        member = _Member(role, instance, admission["generation"])
-        member.address = admission["address"]
+        member = _Member(role, request.instance, admission.generation)
+        member.address = admission.address
         member.apply(Event.ADMIT)
-        self._admitted[role, instance] = member
+        self._admitted[role, request.instance] = member
         self.plane.answer(query, admission)
 
     def _require_pass(self, role: str, shown: str) -> None:
@@ -310,7 +313,7 @@ class Coordinator:
             PeerError: it cannot join.
         """
         request = parse_message(JoinRequest, _payload(query))
-        member = self._admitted.get((role, request["instance"]))
+        member = self._admitted.get((role, request.instance))
         current = self._members.get(role)
         if current is not member:
             current = self._vacant(role)
@@ -319,14 +322,14 @@ class Coordinator:
             and member.generation <= current.generation
         ):  # fmt: skip
             raise PeerError("it was not admitted")
-        if (request["address"] is None) == (role in LOOP_ROLES):
+        if (request.address is None) == (role in LOOP_ROLES):
             raise PeerError("a process of the loop needs an address, the recorder has none")
-        if self._clock is not None and request["address"] != member.address:
+        if self._clock is not None and request.address != member.address:
             raise PeerError("it must use the address of the process before it")
         member.apply(Event.JOIN)
         if current is not None and current is not member:
             current.apply(Event.REPLACE)
-        member.address, member.query = request["address"], query
+        member.address, member.query = request.address, query
         self._members[role] = member
         if self._clock is not None:
             self._replaceable.pop(role, None)
@@ -358,28 +361,27 @@ class Coordinator:
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
         self.joined[member.instance] = {"process": member.role, "generation": member.generation}
-        addresses = {role: self._members[role].address for role in LOOP_ROLES}
+        members = [self._members[role] for role in LOOP_ROLES]
+        addresses = {one.role: one.address for one in members if one.address is not None}
         query, member.query = member.query, None
         assert query is not None
-        self.plane.answer(query, {
-            "epoch_ns": self.epoch_ns, "addresses": addresses, "changes": self._changes.announced,
-        })  # fmt: skip
+        assert self._clock is not None
+        epoch_ns, changes = self._clock.epoch_ns, self._changes.announced
+        self.plane.answer(query, RunStart(epoch_ns=epoch_ns, addresses=addresses, changes=changes))
 
 
-def _admission(
-    before: _Member | None, failure: str | None, clock: RunClock | None
-) -> dict[str, Any]:
+def _admission(before: _Member | None, failure: str | None, clock: RunClock | None) -> Admission:
     """The admission of a process: to a run that has not started, or in the place of another."""
     if clock is None or before is None:
-        return {"generation": 0, "admitted_ns": 0, "from_ns": 0, "address": None, "replaces": None}
+        return Admission(generation=0, admitted_ns=0, from_ns=0, address=None, replaces=None)
     now_ns = clock.now_ns()
-    return {
-        "generation": before.generation + 1,
-        "admitted_ns": now_ns,
-        "from_ns": now_ns + int(_RESTART_DELAY_S * NS_PER_S * clock.speed),
-        "address": before.address,
-        "replaces": failure,
-    }
+    return Admission(
+        generation=before.generation + 1,
+        admitted_ns=now_ns,
+        from_ns=now_ns + int(_RESTART_DELAY_S * NS_PER_S * clock.speed),
+        address=before.address,
+        replaces=failure,
+    )
 
 
 def _sender(key_expr: object) -> tuple[str, str]:
@@ -404,21 +406,19 @@ class ChangeRequests:
             for one in loop_sections(ticket.scenario)
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
-        self.announced: list[dict[str, Any]] = []
+        self.announced: tuple[ChangeAnnouncement, ...] = ()
         """Announcements of all changes so far."""
         for change in scheduled(ticket.scenario):
             self._add(change, 0, "in the scenario")
 
-    def answer(
-        self, request: bytes, clock: Callable[[], int], obstacle: str | None
-    ) -> dict[str, Any]:
+    def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:
         """Announce the requested change, unless there is an obstacle; return the parameters.
 
         Raises:
             CallerError: the settings cannot be changed, or not now.
             PeerError: the message is not a change request.
         """
-        settings = parse_message(ChangeRequest, request).get("settings", {})
+        settings = parse_message(ChangeRequest, request).settings
         from_s, now_ns, before = None, clock(), self._parameters()
         if settings:
             if obstacle is not None:
@@ -440,15 +440,15 @@ class ChangeRequests:
             self._plane.announce_change(self._add(change, now_ns, requested_at))
             from_s = t_ns / NS_PER_S
         loops = self._parameters()
-        return {
-            "name": self._scenario.name,
-            "run_dir": self._run_dir,
-            "t_s": now_ns / NS_PER_S,
-            "from_s": from_s,
-            "runtime_parameters": current_parameters(self._schedule.last),
-            "loops": loops,
-            "changed_loops": [name for name in loops if loops[name] != before[name]],
-        }
+        return ChangeReply(
+            name=self._scenario.name,
+            run_dir=self._run_dir,
+            t_s=now_ns / NS_PER_S,
+            from_s=from_s,
+            runtime_parameters=current_parameters(self._schedule.last),
+            loops=loops,
+            changed_loops=tuple(name for name in loops if loops[name] != before[name]),
+        )
 
     @property
     def _schedules(self) -> tuple[ChangeSchedule, ...]:
@@ -457,7 +457,9 @@ class ChangeRequests:
     def _parameters(self) -> dict[str, dict[str, Any]]:
         return {name: current_parameters(one.last) for name, one in self._entries.items()}
 
-    def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:
+    def _add(
+        self, change: ParameterChange, requested_ns: int, requested_at: str
+    ) -> ChangeAnnouncement:
         """Check and store a change; return its announcement.
 
         Raises:
@@ -467,18 +469,14 @@ class ChangeRequests:
             one.check(change, -1)
         for one in self._schedules:
             one.announce("", change, 0, 0, -1)
-        announcement = {
-            "number": change.number,
-            "t_ns": change.t_ns,
-            "settings": dict(change.settings),
-            "requested_ns": requested_ns,
-            "requested_at": requested_at,
-            "kept_losses": found_probabilities(
-                *(
-                    one.network.link
-                    for one in self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
-                )
-            ),
-        }
-        self.announced.append(announcement)
+        later = self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
+        announcement = ChangeAnnouncement(
+            number=change.number,
+            t_ns=change.t_ns,
+            settings=dict(change.settings),
+            requested_ns=requested_ns,
+            requested_at=requested_at,
+            kept_losses=found_probabilities(*(one.network.link for one in later)),
+        )
+        self.announced += (announcement,)
         return announcement

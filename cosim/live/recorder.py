@@ -3,7 +3,6 @@
 :func:`main` drives a :class:`Recorder` to the end of its run, with a live viewer on request.
 """
 
-import json
 import math
 import sys
 import time
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.analysis.value_reduction import is_long
@@ -24,7 +24,7 @@ from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows
-from noack.config.parameter_changes import ParameterChange, change_notice
+from noack.config.parameter_changes import change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
@@ -40,6 +40,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
+from noack.runtime.control_messages import ChangeAnnouncement, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of
 from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
@@ -117,43 +118,32 @@ class ProcessTokens:
         return all(map(is_done, self._vanished_s.values()))
 
 
-class ProgressReport:
-    """Fields of :class:`noack.runtime.control_messages.RunProgress`.
+class ProgressReport(RunProgress):
+    """The recorder's progress report, as it grows."""
 
-    They are those of all loops together; ‖x‖ is the largest.
-    """
-
-    def __init__(self, live: str | None) -> None:
-        self._fields: dict[str, Any] = {
-            "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None,
-            "live": live, "warnings": [], "changes": [],
-        }  # fmt: skip
+    model_config = ConfigDict(frozen=False)
 
     def add_warning(self, text: str) -> None:
         """Add a line, e.g. about void claims; of many, the last says where the others are."""
-        lines = self._fields["warnings"]
-        if len(lines) < _MOST_LINES:
-            lines.append(text)
-        elif len(lines) == _MOST_LINES:
-            lines.append("further void claims and diverging loops are in the logs of the loops")
-
-    def add_change(self, text: str) -> None:
-        """Add a line about a change of runtime parameters."""
-        self._fields["changes"].append(text)
+        if len(self.warnings) < _MOST_LINES:
+            self.warnings.append(text)
+        elif len(self.warnings) == _MOST_LINES:
+            self.warnings.append(
+                "further void claims and diverging loops are in the logs of the loops"
+            )
 
     @np.errstate(all="ignore")  # a run may diverge
     def count(self, table: str, rows: Rows) -> None:
         """Count rows of a table."""
-        fields = self._fields
         if table == SENSOR_MEASUREMENT:
-            fields["t_s"] = int(rows["t_ns"][-1]) / NS_PER_S
-            fields["events"] += int((rows["event"] >= 0).sum())
+            self.t_s = int(rows["t_ns"][-1]) / NS_PER_S
+            self.events += int((rows["event"] >= 0).sum())
             # Of each loop, the newest state in the batch.
             _, from_end = np.unique(rows[LOOP][::-1], return_index=True)
             newest = rows["x"][len(rows) - 1 - from_end]
-            fields["x_norm"] = float(np.linalg.norm(newest, axis=1).max())
+            self.x_norm = float(np.linalg.norm(newest, axis=1).max())
         elif table == CONTROLLER_DELIVERY:
-            fields["deliveries"] += len(rows)
+            self.deliveries += len(rows)
             # Includes stale updates, which the emulator cannot know in advance.
             self._count_losses(rows["dropouts"])
         elif table == NETEM_PACKET:
@@ -161,12 +151,7 @@ class ProgressReport:
             self._count_losses(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _count_losses(self, consecutive: NDArray[np.int64]) -> None:
-        longest = int(consecutive.max(initial=0))
-        self._fields["longest_loss_burst"] = max(self._fields["longest_loss_burst"], longest)
-
-    def dumps(self) -> str:
-        """The report as JSON."""
-        return json.dumps(self._fields)
+        self.longest_loss_burst = max(self.longest_loss_burst, int(consecutive.max(initial=0)))
 
 
 class Recorder:
@@ -200,7 +185,9 @@ class Recorder:
         """Final reports by instance."""
         self._out_of_order = start.is_restart
         self._invalid = 0
-        self._progress = ProgressReport(live)
+        self._progress = ProgressReport(
+            t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=live
+        )
         if start.is_restart:
             self._monitor.stop("the recorder was restarted")
             self._store.load(self._progress.count)
@@ -263,14 +250,15 @@ class Recorder:
         """Store a line of the recorder's own for the run's log."""
         self._store.add_own_notice(notice)
 
-    def change(self, change: ParameterChange, announcement: Mapping[str, Any]) -> None:
+    def change(self, announced: ChangeAnnouncement) -> None:
         """Log a change of runtime parameters, with the time of its request."""
-        at_s, date = announcement["requested_ns"] / NS_PER_S, announcement["requested_at"]
-        notice = change_notice(change, f"; requested at {at_s:.3f} s, {date}")
+        at_s = announced.requested_ns / NS_PER_S
+        requested = f"; requested at {at_s:.3f} s, {announced.requested_at}"
+        notice = change_notice(announced.change, requested)
         self.note(notice)
-        self._progress.add_change(notice.text)
-        if not is_of_loss_alone(change.settings):
-            self._monitor.end_at(change.t_ns / NS_PER_S)
+        self._progress.changes.append(notice.text)
+        if not is_of_loss_alone(announced.settings):
+            self._monitor.end_at(announced.t_ns / NS_PER_S)
         if self._feed is not None:
             self._feed.log(notice.line())
 
@@ -367,7 +355,7 @@ class Recorder:
             )
 
     def _publish_progress(self) -> None:
-        self._plane.publish("progress", content=self._progress.dumps())
+        self._plane.publish("progress", content=message_json(self._progress))
 
     def _take_report(self, query: zenoh.Query) -> None:
         """Answer a final report with the rows that are missing."""
@@ -485,8 +473,8 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
         more = recorder.poll()
         if process.stopping:
             recorder.end_monitoring()
-        for change, announcement in process.updates.take():
-            recorder.change(change, announcement)
+        for announced in process.updates.take():
+            recorder.change(announced)
         now_s = time.monotonic()
         if shown_s is None or now_s - shown_s >= _SHOW_S:
             recorder.show()

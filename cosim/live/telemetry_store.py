@@ -59,7 +59,9 @@ class TelemetryStore:
         Raises:
             PeerError: the payload has something else.
         """
-        lines = [parse_message(LogLine, one) | {"process": role} for one in lines_in(payload)]
+        lines = [
+            parse_message(LogLine, one).fields() | {"process": role} for one in lines_in(payload)
+        ]
         self._writer.append(notices_of(role), notice_number(generation, first), payload)
         self._received[role, NOTICES, generation].add(first, first + len(lines))
         return lines

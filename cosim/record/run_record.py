@@ -478,6 +478,6 @@ def read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
-        return [parse_message(_Notice, line) for line in lines]
+        return [parse_message(_Notice, line).fields() for line in lines]
     except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None

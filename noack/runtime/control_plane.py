@@ -20,13 +20,12 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.address import text_of
-from noack.runtime.control_messages import ChangeAnnouncement, parse_message
+from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
 from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
@@ -136,7 +135,9 @@ def session_config(
     return config
 
 
-def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
+def answer_to(
+    session: zenoh.Session, key: str, question: str | bytes, timeout_s: float
+) -> str | None:
     """Send a request to the listening session and return its answer; None without one in time.
 
     Raise CallerError if the request was refused as wrong.
@@ -295,7 +296,7 @@ class ControlPlane:
         self.publish(
             "persisted",
             role,
-            content=json.dumps(content),
+            content=message_json(content),
             congestion_control=CongestionControl.DROP,
         )
 
@@ -305,7 +306,7 @@ class ControlPlane:
 
     def announce_change(self, content: object) -> None:
         """Announce a change of runtime parameters to all processes."""
-        self.publish("change", content=json.dumps(content), priority=Priority.REAL_TIME)
+        self.publish("change", content=message_json(content), priority=Priority.REAL_TIME)
 
     def next_change(self) -> bytes | None:
         """The next announced change; None if there is none."""
@@ -344,7 +345,7 @@ class ControlPlane:
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:
         """Answer a request."""
-        query.reply(query.key_expr, json.dumps(content))
+        query.reply(query.key_expr, message_json(content))
         query.drop()  # type: ignore[no-untyped-call]
 
     @staticmethod
@@ -377,7 +378,7 @@ class ControlPlane:
             PeerError: the answer was an error.
         """
         deadline_s = time.monotonic() + timeout_s
-        payload = json.dumps(content)
+        payload = message_json(content)
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
             wait_s = min(left_s, _REQUEST_AGAIN_S)
             replies = self.session.get(
@@ -401,23 +402,23 @@ class ParameterUpdates:
 
     def __init__(self, plane: ControlPlane) -> None:
         self._plane = plane
-        self._waiting: list[dict[str, Any]] = []
+        self._waiting: list[ChangeAnnouncement] = []
         self._next_number = 0
 
-    def extend(self, announcements: Iterable[dict[str, Any]]) -> None:
+    def extend(self, announcements: Iterable[ChangeAnnouncement]) -> None:
         """Add the changes that were announced before this process joined."""
         self._waiting.extend(announcements)
 
-    def take(self, at_most: int | None = None) -> list[tuple[ParameterChange, Mapping[str, Any]]]:
-        """Return waiting changes, at most a number of them, each with its announcement."""
+    def take(self, at_most: int | None = None) -> list[ChangeAnnouncement]:
+        """Return waiting changes, at most a number of them."""
         while (message := self._plane.next_change()) is not None:
             with suppress(PeerError):  # not from the coordinator
                 self._waiting.append(parse_message(ChangeAnnouncement, message))
-        taken: list[tuple[ParameterChange, Mapping[str, Any]]] = []
+        taken: list[ChangeAnnouncement] = []
         while self._waiting and (at_most is None or len(taken) < at_most):
-            one = self._waiting.pop(0)
-            remember(one.get("kept_losses", {}))
-            if one["number"] >= self._next_number:  # a late process receives some twice
-                self._next_number = one["number"] + 1
-                taken.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))
+            announced = self._waiting.pop(0)
+            remember(announced.kept_losses)
+            if announced.number >= self._next_number:  # a late process receives some twice
+                self._next_number = announced.number + 1
+                taken.append(announced)
         return taken

@@ -44,7 +44,15 @@ from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADL
 from noack.protocol.wire_format import Wire
 from noack.runtime.address import Address, text_of
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed, print_to_stderr
-from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
+from noack.runtime.control_messages import (
+    Admission,
+    AdmissionRequest,
+    ControlMessage,
+    JoinRequest,
+    M,
+    RunStart,
+    parse_message,
+)
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,
@@ -123,13 +131,14 @@ class RunProcess:
 
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
-        shown = {"admission_pass": self.ticket.admission_pass}
-        admission = self._request("admit", shown, Admission, _ADMISSION_TIMEOUT_S)
+        request = AdmissionRequest(
+            instance=self.plane.instance, admission_pass=self.ticket.admission_pass
+        )
+        admission = self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
-        self.start = Start(admission["generation"], admission["from_ns"])
-        if self.start.is_restart:
-            self._address, self.replaces = admission["address"], admission["replaces"]
-            self.admitted_ns = admission["admitted_ns"]
+        self.start = Start(admission.generation, admission.from_ns)
+        self._address, self.replaces = admission.address, admission.replaces
+        self.admitted_ns = admission.admitted_ns
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
@@ -142,26 +151,22 @@ class RunProcess:
             self._reference.wait_until_known(lambda: self.stopping)
         prepare_changes()
         self.life.apply(Event.JOIN)
-        begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
-        epoch_ns, speed = begin["epoch_ns"], self.scenario.speed
-        self.clock = RunClock(epoch_ns, speed)
+        request = JoinRequest(instance=self.plane.instance, address=address)
+        begin = self._request("join", request, RunStart, _JOIN_TIMEOUT_S)
+        self.clock = RunClock(begin.epoch_ns, self.scenario.speed)
         if (reference := self._reference) is not None:
-            self.clock = SlewedRunClock(epoch_ns, speed, reference.slewed)
-        addresses: Mapping[str, Address] = begin["addresses"]
-        self.updates.extend(begin.get("changes", ()))
-        if not addresses.keys() >= set(LOOP_ROLES):
+            self.clock = SlewedRunClock(begin.epoch_ns, self.scenario.speed, reference.slewed)
+        self.updates.extend(begin.changes)
+        if not begin.addresses.keys() >= set(LOOP_ROLES):
             raise PeerError("the coordinator did not send the addresses of all processes")
         self.life.apply(Event.START)
         if not self.ticket.launched:
             verb = f"replaces a process ({self.replaces})" if self.replaces else "started"
             print_to_stderr(f"noack {self.role}: {verb}")
-        return addresses
+        return begin.addresses
 
-    def _request(
-        self, what: str, more: dict[str, Any], answer: type[ControlMessage], timeout_s: float
-    ) -> Any:
-        """Send the coordinator a request of this process; return the answer's fields."""
-        request = {"pid": os.getpid(), "instance": self.plane.instance, **more}
+    def _request(self, what: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
+        """Send the coordinator a request of this process; return the answer."""
         try:
             message = self.plane.request(what, request, timeout_s=timeout_s, give_up=self._gives_up)
         except PeerError as error:
@@ -365,9 +370,9 @@ class RunProcess:
         if self.role not in CHANGEABLE:
             return ()
         outputs: list[Record | Notice] = []
-        for change, _ in self.updates.take(at_most):
+        for announced in self.updates.take(at_most):
             try:
-                outputs += machine.announce(change, now_ns)
+                outputs += machine.announce(announced.change, now_ns)
             except CallerError as error:  # not from the coordinator, which checks changes
                 print_to_stderr(f"noack {self.role}: ignored: {error}")
         return outputs

@@ -240,7 +240,7 @@ class TelemetryBuffer:
 def first_row(header: bytes) -> tuple[int, int]:
     """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
     found = parse_message(BatchHeader, header)
-    return found.get("generation", 0), found["first"]
+    return found.generation, found.first
 
 
 def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:
@@ -252,8 +252,7 @@ def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequenc
         acknowledged = parse_message(PersistedAck, message)
     except PeerError:  # not from the recorder
         return {}
-    rows: Mapping[str, Sequence[tuple[int, int]]] = acknowledged["rows"]
-    return rows if acknowledged["generation"] == generation else {}
+    return acknowledged.rows if acknowledged.generation == generation else {}
 
 
 def deliver_report(
@@ -266,7 +265,7 @@ def deliver_report(
     try:
         for _ in range(_REPORT_ATTEMPTS):
             answer = plane.request("report", report, timeout_s=_REPORT_TIMEOUT_S)
-            missing = parse_message(MissingRows, answer)["rows"]
+            missing = parse_message(MissingRows, answer).rows
             if not missing:
                 return True
             telemetry.resend(missing, plane.publish_telemetry_blocking)

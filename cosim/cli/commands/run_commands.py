@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from cosim.simulation.continuous import ContinuousRun
     from noack.config.scenario import Scenario
+    from noack.runtime.control_messages import ChangeReply
 
 _EVENTS_SHOWN = 40
 
@@ -223,11 +224,11 @@ def set_(
     wanted = parsed(settings or ())
     answer = request_change(find(session, run), wanted)
     if json:
-        cli.print_json(answer)
+        cli.print_json(answer.fields())
     elif wanted:
-        loops, entries = answer["changed_loops"], answer["loops"]
+        loops, entries = answer.changed_loops, answer.loops
         which = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
-        print(f"{answer['name']}: {text_of(wanted)} from {answer['from_s']:.3f} s on{which}")
+        print(f"{answer.name}: {text_of(wanted)} from {answer.from_s or 0.0:.3f} s on{which}")
     else:
         _print_parameters(cli.console(), answer)
     return ExitStatus.OK
@@ -258,15 +259,15 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
     return found
 
 
-def _print_parameters(console: "Console", answer: dict[str, Any]) -> None:
+def _print_parameters(console: "Console", answer: "ChangeReply") -> None:
     from rich.markup import escape
     from rich.table import Table
 
     from noack.config.runtime_parameters import SHORT, text_of
 
     short = {key: name for name, key in SHORT.items()}
-    table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
-    entries = answer["loops"]
+    table = Table(title=f"{answer.name}, at {answer.t_s:.1f} s")
+    entries = answer.loops
     for heading in ("key", "short", "value", *(["loops"] if len(entries) > 1 else [])):
         table.add_column(heading)
     for key in dict.fromkeys(key for values in entries.values() for key in values):
@@ -279,4 +280,4 @@ def _print_parameters(console: "Console", answer: dict[str, Any]) -> None:
             row = key, short.get(key, ""), escape(value), which
             table.add_row(*row[: len(table.columns)])
     console.print(table)
-    console.print(f"[dim]{escape(answer['run_dir'])}[/]", soft_wrap=True)
+    console.print(f"[dim]{escape(answer.run_dir)}[/]", soft_wrap=True)

@@ -23,7 +23,7 @@ def requests_of(loops: int | str, *settings: str) -> ChangeRequests:
 
 
 def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:
-    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None)
+    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None).fields()
 
 
 def answer(loops: int, settings: dict[str, Any]) -> dict[str, Any]:
@@ -43,9 +43,9 @@ def test_each_entry_of_the_loops_has_its_own_values() -> None:
     before = requested(requests, {})
     assert before["loops"]["q"]["trigger.beta"] == 0.07
     assert before["loops"]["p"] == before["runtime_parameters"]
-    assert before["changed_loops"] == []
+    assert before["changed_loops"] == ()
     after = requested(requests, {"trigger.beta": 0.07})
-    assert after["changed_loops"] == ["p"]
+    assert after["changed_loops"] == ("p",)
     assert after["loops"]["p"] == after["loops"]["q"]
 
 
@@ -64,4 +64,4 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     assert requested(requests, {"network.loss": loss})["from_s"] > 0
     found = requested(requests, {})["runtime_parameters"]
     assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
-    assert [one["number"] for one in requests.announced] == [0, 1]
+    assert [one.number for one in requests.announced] == [0, 1]

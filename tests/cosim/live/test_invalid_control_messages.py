@@ -49,7 +49,7 @@ def test_an_invalid_request_is_refused_and_the_others_join(
             plane.put(question, Query(f"noack/0/{question}/{role}", request))
             barrier.poll()
     assert barrier.epoch_ns is not None
-    assert plane.answers[-1]["addresses"].keys() == set(LOOP_ROLES)
+    assert plane.answers[-1].addresses.keys() == set(LOOP_ROLES)
 
 
 def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(

@@ -9,7 +9,6 @@ from unittest.mock import patch
 from cosim.live import coordinator
 from noack.config.parameter_changes import (
     ChangeSchedule,
-    ParameterChange,
     settings_bytes,
     settings_of,
 )
@@ -64,9 +63,7 @@ def one_input(data: bytes) -> None:
             _announce(_bytes(choices, ANNOUNCED))
         case 2:
             with refusal("not a valid change reply"):
-                assert isinstance(
-                    parse_message(ChangeReply, _bytes(choices, ANSWER))["run_dir"], str
-                )
+                assert isinstance(parse_message(ChangeReply, _bytes(choices, ANSWER)).run_dir, str)
         case _:
             _find(_bytes(choices, RUN))
 
@@ -84,11 +81,9 @@ def _request(content: bytes) -> None:
     assert query.error is None or query.error.strip()
     for announced in plane.announced:
         one = parse_message(ChangeAnnouncement, json.dumps(announced))
-        ChangeSchedule(_TICKET.scenario).announce(
-            "t", ParameterChange(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
-        )
+        ChangeSchedule(_TICKET.scenario).announce("t", one.change, 0, 0, -1)
     try:
-        settings = parse_message(ChangeRequest, content).get("settings", {})
+        settings = parse_message(ChangeRequest, content).settings
     except PeerError:
         assert not plane.announced
     else:
@@ -100,10 +95,9 @@ def _announce(content: bytes) -> None:
     with refusal("not a valid change announcement"):
         one = parse_message(ChangeAnnouncement, content)
         schedule = ChangeSchedule(_TICKET.scenario)
-        change = ParameterChange(one["number"], one["t_ns"], one["settings"])
         with refusal(("the change", "a change"), lines=True):
-            schedule.announce("t", change, 0, 0, -1)
-            assert settings_of(settings_bytes(one["settings"])) == one["settings"]
+            schedule.announce("t", one.change, 0, 0, -1)
+            assert settings_of(settings_bytes(one.settings)) == one.settings
             return
         assert schedule.last is _TICKET.scenario
 
