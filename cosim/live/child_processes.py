@@ -98,11 +98,7 @@ class Hosts(ScenarioSection):
 
 
 def load_hosts(path: Path) -> Hosts:
-    """Read a file of hosts.
-
-    Raises:
-        CallerError: it is wrong, or no ssh client is installed.
-    """
+    """Read a file of hosts; raise CallerError if it is wrong, or no ssh client is installed."""
     hosts = toml_file.validated(Hosts, toml_file.read(path, Hosts), str(path))
     if shutil.which("ssh") is None:
         raise CallerError("--hosts: no ssh client is installed; install openssh-client")
@@ -120,8 +116,7 @@ class RemoteStart(NamedTuple):
 def start_over_ssh(role: str, host: Host, invitation: str, log: IO[str]) -> subprocess.Popen[str]:
     """Start a process on another host, which ends by itself, with the run.
 
-    Raises:
-        OSError: ssh cannot be started.
+    Raise OSError if ssh cannot be started.
     """
     remote = f"{host.command} {role} --invitation - --runs {shlex.quote(host.runs)}"
     child = subprocess.Popen(
@@ -166,8 +161,7 @@ class ChildProcesses:
     def started(self, *, live: bool) -> Iterator[None]:
         """Start the processes; end all of them with the context.
 
-        Raises:
-            MachineError: a process cannot be started.
+        Raise MachineError if a process cannot be started.
         """
         try:
             for role in self._roles:
@@ -180,8 +174,7 @@ class ChildProcesses:
     def restart(self, role: str) -> None:
         """End a process and start another of its role.
 
-        Raises:
-            MachineError: it cannot be started.
+        Raise MachineError if it cannot be started.
         """
         _end(self._children[role])
         self._children[role] = self._start(role, live=False)

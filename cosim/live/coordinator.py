@@ -277,11 +277,7 @@ class Coordinator:
             self.plane.answer(query, answer)
 
     def _admit(self, role: str, query: zenoh.Query) -> None:
-        """Admit a process to the run.
-
-        Raises:
-            PeerError: it cannot join.
-        """
+        """Admit a process to the run; raise PeerError if it cannot join."""
         request = parse_message(AdmissionRequest, _payload(query))
         if role not in ROLES:
             raise PeerError("a run has no such process")
@@ -309,8 +305,7 @@ class Coordinator:
     def _join(self, role: str, query: zenoh.Query) -> None:
         """Let a process wait at the start barrier; pass it if the run has started.
 
-        Raises:
-            PeerError: it cannot join.
+        Raise PeerError if it cannot join.
         """
         request = parse_message(JoinRequest, _payload(query))
         member = self._admitted.get((role, request.instance))
@@ -338,8 +333,7 @@ class Coordinator:
     def _vacant(self, role: str) -> _Member | None:
         """Return the process that had the role before, which must be over.
 
-        Raises:
-            PeerError: it is not over.
+        Raise PeerError if it is not over.
         """
         before = self._members.get(role)
         if before is not None and before.state is State.UNREACHABLE:
@@ -414,9 +408,8 @@ class ChangeRequests:
     def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:
         """Announce the requested change, unless there is an obstacle; return the parameters.
 
-        Raises:
-            CallerError: the settings cannot be changed, or not now.
-            PeerError: the message is not a change request.
+        Raise CallerError if the settings cannot be changed, or not now; PeerError if the message is
+        not a change request.
         """
         settings = parse_message(ChangeRequest, request).settings
         from_s, now_ns, before = None, clock(), self._parameters()
@@ -462,8 +455,7 @@ class ChangeRequests:
     ) -> ChangeAnnouncement:
         """Check and store a change; return its announcement.
 
-        Raises:
-            CallerError: the change is not valid for this run.
+        Raise CallerError if the change is not valid for this run.
         """
         for one in self._schedules:
             one.check(change, -1)

@@ -374,8 +374,7 @@ def needed_bytes(resolved: Scenario) -> int:
 def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
-    Raises:
-        MachineError: the record needs more than the free space.
+    Raise MachineError if the record needs more than the free space.
     """
     folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
     if folder is None:

@@ -265,8 +265,7 @@ class Recorder:
     def acknowledge(self) -> None:
         """Confirm to each process which of its rows are on disk, so that it can drop them.
 
-        Raises:
-            MachineError: stored rows are no longer on disk.
+        Raise MachineError if stored rows are no longer on disk.
         """
         for role, content in self._store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
@@ -289,8 +288,7 @@ class Recorder:
     def report(self) -> None:
         """Write the final reports of the processes, as the last step.
 
-        Raises:
-            MachineError: they cannot be written.
+        Raise MachineError if they cannot be written.
         """
         write_reports(self._run_dir, self._reports.values())
 

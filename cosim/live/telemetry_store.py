@@ -56,8 +56,7 @@ class TelemetryStore:
     ) -> list[dict[str, Any]]:
         """Store a batch of lines of the log; return the fields of each.
 
-        Raises:
-            PeerError: the payload has something else.
+        Raise PeerError if the payload has something else.
         """
         lines = [
             parse_message(LogLine, one).fields() | {"process": role} for one in lines_in(payload)
@@ -133,8 +132,7 @@ class TelemetryStore:
     def acknowledgements(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield, for the newest process of each role, which of its rows are on disk.
 
-        Raises:
-            MachineError: files of the spool were deleted or moved.
+        Raise MachineError if files of the spool were deleted or moved.
         """
         self.require_present()
         newest: dict[str, int] = {}
@@ -151,8 +149,7 @@ class TelemetryStore:
     def require_present(self) -> None:
         """Check that the spool's files are still in place.
 
-        Raises:
-            MachineError: files of the spool were deleted or moved.
+        Raise MachineError if files of the spool were deleted or moved.
         """
         self._writer.require_present()
 

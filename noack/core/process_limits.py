@@ -20,10 +20,8 @@ _OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't star
 def require_limits() -> None:
     """Check the limits before a run; raise the limit of open files if that is permitted.
 
-    Libraries abort, print stack traces or wait for ever when they reach a limit.
-
-    Raises:
-        MachineError: a limit is too low.
+    Libraries abort, print stack traces or wait for ever when they reach a limit. Raise MachineError
+    if a limit is too low.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if _is_less(soft, _FILES):

@@ -54,8 +54,7 @@ class LogFormat(StrEnum):
 class JsonLog(io.TextIOBase):
     """A text stream that writes a JSON object for each line to another stream.
 
-    Raises:
-        OSError: the other stream cannot be written.
+    Raise OSError if the other stream cannot be written.
     """
 
     encoding = "utf-8"

@@ -62,16 +62,14 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
 def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
     """Give a session with a coordinator on another host, in a run with this key.
 
-    Raises:
-        NoAnswerError: that fails.
-        MachineError: the link to the coordinator cannot be started.
-        CallerError: other users have access to the user's runtime directory.
+    Raise NoAnswerError if that fails, MachineError if the link to the coordinator cannot be
+    started, CallerError if other users have access to the user's runtime directory.
     """
     # Processes on the coordinator's host need neither TLS nor asyncio.
     from noack.runtime.coordinator_link import Destination, coordinator_link
 
     destination = Destination(
-        remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
+        remote.host, remote.port, remote.coordinator, remote.certificate, remote.private_key,
         key.hex(),
     )  # fmt: skip
     address = text_of((remote.host, remote.port))
@@ -206,11 +204,9 @@ def run_name(run_id: int) -> str:
 class ControlPlane:
     """The connection of a process (``role``) to the control plane of a run.
 
-    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator.
-
-    Raises:
-        NoAnswerError: the coordinator cannot be reached, or the socket cannot be listened on.
-        CallerError: other users have access to the user's runtime directory.
+    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator. Raise
+    NoAnswerError if the coordinator cannot be reached, or the socket cannot be listened on;
+    CallerError if other users have access to the user's runtime directory.
     """
 
     def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
@@ -371,11 +367,8 @@ class ControlPlane:
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
-        request twice. The wait ends early when ``give_up()`` is true.
-
-        Raises:
-            NoAnswerError: no answer came.
-            PeerError: the answer was an error.
+        request twice. The wait ends early when ``give_up()`` is true. Raise NoAnswerError if no
+        answer came, PeerError if the answer was an error.
         """
         deadline_s = time.monotonic() + timeout_s
         payload = message_json(content)

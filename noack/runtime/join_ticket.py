@@ -43,7 +43,7 @@ class RemoteAccess(ScenarioSection):
 
     host: NumericHost
     port: Annotated[int, Field(ge=1, le=65_535)]
-    authority: str  # certificates, and the key of this one, as PEM text
+    coordinator: str  # its certificate, and that of those that join with its key, as PEM text
     certificate: str
     private_key: str
     valid_until: str  # for people; the coordinator measures the time itself
@@ -149,10 +149,8 @@ def wait_for_ticket(
 def invitation_file(path: Path, ticket: Ticket) -> Iterator[None]:
     """Write an invitation that only its owner can read; replace an older one.
 
-    At the end it is removed, unless that of another run has replaced it.
-
-    Raises:
-        CallerError: it cannot be written.
+    At the end it is removed, unless that of another run has replaced it. Raise CallerError if it
+    cannot be written.
     """
     write_invitation(path, ticket)
     try:
@@ -166,8 +164,7 @@ def invitation_file(path: Path, ticket: Ticket) -> Iterator[None]:
 def write_invitation(path: Path, ticket: Ticket) -> None:
     """Write an invitation that only its owner can read; replace an older one.
 
-    Raises:
-        CallerError: it cannot be written.
+    Raise CallerError if it cannot be written.
     """
     try:
         with new_file(path, make_folder=False, mode=0o600) as file:
@@ -184,12 +181,9 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     """Return the ticket of an invitation, as this host uses it.
 
     Sockets of loop data listen on the address from which this host reaches the coordinator. Rows
-    that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name.
-
-    Raises:
-        CallerError: it cannot be read, other users can read it, or it is no invitation; or
-            ``runs`` cannot be written.
-        PeerError: there is no route to the coordinator.
+    that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name. Raise
+    CallerError if it cannot be read, other users can read it, or it is no invitation; or ``runs``
+    cannot be written; PeerError if there is no route to the coordinator.
     """
     content = _bytes_of(path)
     try:

@@ -59,9 +59,7 @@ class PrivateFolder:
     def open(self, name: str) -> int:
         """Open a file for reading; return its descriptor.
 
-        Raises:
-            CallerError: it is not a file of the user's.
-            FileNotFoundError: there is none.
+        Raise CallerError if it is not a file of the user's, FileNotFoundError if there is none.
         """
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:

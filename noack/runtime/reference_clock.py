@@ -99,8 +99,7 @@ class ReferenceClock:
     ) -> None:
         """Exchange times until the error is small enough to begin.
 
-        Raises:
-            PeerError: it is not after ``wait_s``, or ``give_up`` is true.
+        Raise PeerError if it is not after ``wait_s``, or ``give_up`` is true.
         """
         until_ns = self._clocks.monotonic_ns() + round(wait_s * NS_PER_S)
         while True:
@@ -185,8 +184,7 @@ def reads_other_clock(ticket: Ticket) -> bool:
 def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
-    Raises:
-        PeerError: it is another clock, and nobody answers requests for its time.
+    Raise PeerError if it is another clock, and nobody answers requests for its time.
     """
     if not reads_other_clock(ticket):
         return None

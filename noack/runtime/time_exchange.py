@@ -259,10 +259,8 @@ _HOST_CLOCKS = HostClocks()
 class TimeReference:
     """Answers requests with times of this host's monotonic clock.
 
-    Its clock has a random number. A client that sees another number begins again.
-
-    Raises:
-        CallerError: the address cannot be used.
+    Its clock has a random number. A client that sees another number begins again. Raise CallerError
+    if the address cannot be used.
     """
 
     def __init__(self, listen: Address, key: bytes, clocks: HostClocks = _HOST_CLOCKS) -> None:
@@ -330,8 +328,7 @@ def answering(reference: TimeReference) -> Iterator[TimeReference]:
 class TimeClient:
     """Exchanges timestamps with a reference and enters them into ``offset``.
 
-    Raises:
-        CallerError: the address cannot be used.
+    Raise CallerError if the address cannot be used.
     """
 
     def __init__(

@@ -237,8 +237,7 @@ def set_(
 def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
     """Return the settings that words give as KEY VALUE or KEY=VALUE.
 
-    Raises:
-        CallerError: a value is missing, or a key is given twice.
+    Raise CallerError if a value is missing, or a key is given twice.
     """
     found: dict[str, Any] = {}
     from noack.config.runtime_parameters import full_key
