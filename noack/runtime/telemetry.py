@@ -23,8 +23,7 @@ from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP
 from noack.runtime.control_messages import BatchHeader, MissingRows, PersistedAck, parse_message
-from noack.runtime.control_plane import ControlPlane, run_name
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.spool import (
     KEPT_KEY,
     KEPT_REPORT,
@@ -316,12 +315,6 @@ class OwnSpool:
         """Write the final report; raise MachineError if it cannot be written."""
         text = json.dumps({**report, "process": self._role})
         self._files.append(KEPT_REPORT, 0, text.encode())
-
-
-def own_spool(ticket: Ticket, role: str, secret: str) -> OwnSpool:
-    """Return the spool of a process: the recorder reads it, or `noack collect` on another host."""
-    kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-    return OwnSpool(Path(ticket.run_dir), role, secret, kept_of)
 
 
 def _kept_folder(run_dir: Path, name: str) -> Path:
