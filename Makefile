@@ -180,7 +180,11 @@ $(VENV)/bin/python:
 
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 	@echo "installing pinned dependencies ..."
-	@$(PIP) -r requirements.lock
+	@# On another core meanwhile the library in C; the target core reports what fails of it.
+	@$(BIN)/python native/build.py --library > /dev/null 2>&1 & \
+		$(PIP) --no-compile -r requirements.lock; status=$$?; wait; exit $$status
+	@# pip would do it on one core.
+	@$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
 	@touch $@
 
 # It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
@@ -192,7 +196,7 @@ core: $(VENV)/.dependencies
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(EDITABLE)
 	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
-	@$(BIN)/python -m compileall -q noack netem cosim plant_server sensor_node controller_node
+	@$(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed
