@@ -8,6 +8,7 @@ change of runtime parameters is checked, given a time, and announced.
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -52,8 +53,6 @@ _EXIT_GRACE_S = 5.0
 _CHANGE_DELAY_S = 0.2
 """Wall time from a change's announcement to its effect: processes look every 0.05 s."""
 _MILLISECOND_NS = 1_000_000
-
-
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The
 longer one is for processes on other hosts, and for a loaded machine."""
@@ -187,18 +186,15 @@ class Coordinator:
 
     def is_over(self, role: str) -> bool:
         """Whether the process of a role has joined, and has ended or is lost."""
-        member = self._members.get(role)
-        return member is not None and member.is_over
+        return role in self._members and self._members[role].is_over
 
     def has_ended(self, role: str) -> bool:
         """Whether the process of a role has reported its end; one that is lost has not."""
-        member = self._members.get(role)
-        return member is not None and member.state is State.GONE
+        return role in self._members and self._members[role].state is State.GONE
 
     def is_exiting(self, role: str) -> bool:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
-        member = self._members.get(role)
-        return member is not None and member.state is State.GONE and member.age_s() < _EXIT_GRACE_S
+        return self.has_ended(role) and self._members[role].age_s() < _EXIT_GRACE_S
 
     def reported_failure(self, role: str) -> str | None:
         """Why a process ended early, by its own report; None without a report."""
@@ -229,13 +225,10 @@ class Coordinator:
 
     def progress(self) -> RunProgress | None:
         """The recorder's newest progress report; None without a new one."""
-        payload = next_payload(self._progress)
-        if payload is None:
-            return None
-        try:
-            return parse_message(RunProgress, payload)
-        except PeerError:  # not from the recorder
-            return None
+        with suppress(PeerError):  # not from the recorder
+            if (payload := next_payload(self._progress)) is not None:
+                return parse_message(RunProgress, payload)
+        return None
 
     def _apply(self, key_expr: object, event: Event, reason: str | None = None) -> None:
         if (member := self._admitted.get(_sender(key_expr))) is not None:

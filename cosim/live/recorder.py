@@ -168,12 +168,13 @@ class Recorder:
     ) -> None:
         self._run_dir = run_dir
         self._plane = plane
-        self._store = TelemetryStore(scenario, run_dir, plane.instance, start)
+        self.store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
         self._feed: LoopFeed | NetworkFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._blind_reported = self._monitoring_ended = False
+        self._blind_reported = self.is_stopping = False
+        """Whether the processes of the run end one by one: no more assumptions are checked."""
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"),
@@ -183,14 +184,15 @@ class Recorder:
         self._tokens = ProcessTokens(plane, restarted=start.is_restart)
         self._reports: dict[str, dict[str, Any]] = {}
         """Final reports by instance."""
-        self._out_of_order = start.is_restart
+        self.view_is_incomplete = start.is_restart
+        """Whether batches came late or out of order, so that the view must be written again."""
         self._invalid = 0
         self._progress = ProgressReport(
             t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=live
         )
         if start.is_restart:
             self._monitor.stop("the recorder was restarted")
-            self._store.load(self._progress.count)
+            self.store.load(self._progress.count)
 
     @cached_property
     def _monitor(self) -> "ClaimMonitor":
@@ -202,7 +204,7 @@ class Recorder:
     @property
     def finished(self) -> bool:
         """Whether every process of the loop has handed over its rows, or is gone."""
-        return self._tokens.all_done(self._reports.keys(), stopping=self._monitoring_ended)
+        return self._tokens.all_done(self._reports.keys(), stopping=self.is_stopping)
 
     @property
     def without_report(self) -> list[str]:
@@ -232,10 +234,6 @@ class Recorder:
         self._tokens.update()
         return more
 
-    def end_monitoring(self) -> None:
-        """Check no more assumptions: the run is stopping, and its processes end one by one."""
-        self._monitoring_ended = True
-
     def show(self) -> None:
         """Bring the view and the progress report up to date."""
         self._monitor_assumptions(self._monitor.advance)
@@ -246,16 +244,12 @@ class Recorder:
             except MachineError as error:
                 self.give_up_view(error)
 
-    def note(self, notice: Notice) -> None:
-        """Store a line of the recorder's own for the run's log."""
-        self._store.add_own_notice(notice)
-
     def change(self, announced: ChangeAnnouncement) -> None:
         """Log a change of runtime parameters, with the time of its request."""
         at_s = announced.requested_ns / NS_PER_S
         requested = f"; requested at {at_s:.3f} s, {announced.requested_at}"
         notice = change_notice(announced.change, requested)
-        self.note(notice)
+        self.store.add_own_notice(notice)
         self._progress.changes.append(notice.text)
         if not is_of_loss_alone(announced.settings):
             self._monitor.end_at(announced.t_ns / NS_PER_S)
@@ -267,7 +261,7 @@ class Recorder:
 
         Raise MachineError if stored rows are no longer on disk.
         """
-        for role, content in self._store.acknowledgements():
+        for role, content in self.store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
 
     def finish(self) -> None:
@@ -275,10 +269,10 @@ class Recorder:
         self._monitor_assumptions(self._monitor.end)
         self._publish_progress()
         try:
-            self._store.require_present()
+            self.store.writer.require_present()
         except MachineError as error:
             self.lost = error
-        self._store.close()
+        self.store.writer.close()
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
@@ -286,20 +280,8 @@ class Recorder:
                 self.give_up_view(error)
 
     def report(self) -> None:
-        """Write the final reports of the processes, as the last step.
-
-        Raise MachineError if they cannot be written.
-        """
+        """Write the final reports of the processes; raise MachineError if that fails."""
         write_reports(self._run_dir, self._reports.values())
-
-    def abandon(self) -> None:
-        """Keep the spool as it is."""
-        self._store.close()
-
-    @property
-    def view_is_incomplete(self) -> bool:
-        """Whether batches came late or out of order, so that the view must be written again."""
-        return self._out_of_order
 
     def _take(self, sample: zenoh.Sample) -> None:
         role, table = str(sample.key_expr).split("/")[-2:]
@@ -309,12 +291,12 @@ class Recorder:
                 raise PeerError("it was sent with another key")
             generation, first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
-                lines = self._store.add_notices(role, generation, first, payload)
+                lines = self.store.add_notices(role, generation, first, payload)
                 if self._feed is not None:
                     for line in lines:
                         self._feed.log(line)
             else:
-                rows, follows = self._store.add_rows(role, table, generation, first, payload)
+                rows, follows = self.store.add_rows(role, table, generation, first, payload)
                 self._take_rows(table, rows, follows=follows)
         except (PeerError, ValueError) as error:
             if not self._invalid:
@@ -324,7 +306,7 @@ class Recorder:
     def _take_rows(self, table: str, rows: Rows, *, follows: bool) -> None:
         """Count, check and show rows that are stored."""
         if not follows:
-            self._out_of_order = True
+            self.view_is_incomplete = True
             self._monitor.stop("telemetry is missing or arrived out of order")
             return
         self._progress.count(table, rows)
@@ -334,7 +316,7 @@ class Recorder:
 
     def _monitor_assumptions(self, check: "Callable[[], list[Finding]]") -> None:
         """Report violated assumptions in the log, the view and the progress report."""
-        if self._monitoring_ended:
+        if self.is_stopping:
             return
         try:
             findings = check()
@@ -342,7 +324,7 @@ class Recorder:
             findings = []
             self._monitor.stop(repr(error))
         for notice, text in findings:
-            self.note(notice)
+            self.store.add_own_notice(notice)
             self._progress.add_warning(text)
             if self._feed is not None:
                 self._feed.log(notice.line())
@@ -362,24 +344,24 @@ class Recorder:
         try:
             if role not in LOOP_ROLES:
                 raise PeerError(f"{role} has nothing to report")
-            fields = report_of(role, payload, self._store.types)
+            fields = report_of(role, payload, self.store.types)
         except PeerError as error:
             self._plane.refuse(query, str(error))
             return
         report: dict[str, Any] = {"generation": 0, "instance": ""} | fields | {"process": role}
-        if stored := self._store.add_stored(report):
+        if stored := self.store.add_stored(report):
             text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
-            self.note(Notice(report.get("reached_ns") or 0, "info", text))
+            self.store.add_own_notice(Notice(report.get("reached_ns") or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
         self._await_rows(report)
-        missing = self._store.missing(report)
+        missing = self.store.missing(report)
         if not missing:
             self._reports[report["instance"]] = report
         self._plane.answer(query, {"rows": missing})
 
     def _await_rows(self, report: dict[str, Any]) -> None:
         deadline_s = time.monotonic() + _ROWS_IN_FLIGHT_S
-        while self._store.missing(report) and time.monotonic() < deadline_s:
+        while self.store.missing(report) and time.monotonic() < deadline_s:
             sample = self._batches.try_recv()
             if sample is None:
                 time.sleep(0.005)
@@ -390,7 +372,7 @@ class Recorder:
         """Show the run no longer; the view is written again at the end."""
         print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
         self._feed = None
-        self._out_of_order = True
+        self.view_is_incomplete = True
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
@@ -417,7 +399,9 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     status = live_view.status if live_view else None
     recorder = Recorder(process.scenario, run_dir, process.plane, status, start=process.start)
     if process.replaces is not None:
-        recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
+        recorder.store.add_own_notice(
+            Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}")
+        )
     process.join(None)
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
@@ -430,7 +414,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             recorder.give_up_view(error)
     if not _poll_to_the_end(process, recorder):
         # The other processes spool their last rows now; `noack summary` completes the record.
-        recorder.abandon()
+        recorder.store.writer.close()
         if view is not None:
             view.close()
         return
@@ -469,8 +453,7 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
     acknowledged_s = time.monotonic()
     while not recorder.finished:
         more = recorder.poll()
-        if process.stopping:
-            recorder.end_monitoring()
+        recorder.is_stopping = process.stopping
         for announced in process.updates.take():
             recorder.change(announced)
         now_s = time.monotonic()

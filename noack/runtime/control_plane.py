@@ -43,8 +43,6 @@ _POLL_S = 0.01
 """Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
 RUNS = "runs"
 """Folder of the active runs in the user's runtime directory: sockets, lock files."""
-
-
 _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
 """Time between two looks for a reply: at first, and as a share of the time waited so far."""
 
@@ -55,7 +53,7 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
     The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. Raise
     zenoh.ZError if that fails, CallerError if other users have access to the folder.
     """
-    return zenoh.open(session_config(endpoint_of(kind, name), listen=listen))
+    return zenoh.open(session_config(socket_path(kind, name), listen=listen))
 
 
 @contextmanager
@@ -68,24 +66,17 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
     # Processes on the coordinator's host need neither TLS nor asyncio.
     from noack.runtime.coordinator_link import Destination, coordinator_link
 
-    destination = Destination(
-        remote.host, remote.port, remote.coordinator, remote.certificate, remote.private_key,
-        key.hex(),
-    )  # fmt: skip
+    own = remote.coordinator, remote.certificate, remote.private_key
+    destination = Destination(remote.host, remote.port, *own, key.hex())
     address = text_of((remote.host, remote.port))
     with ExitStack() as stack:
         try:
             path = stack.enter_context(coordinator_link(destination))
-            session = zenoh.open(session_config(f"unixsock-stream/{path}", listen=False))
+            session = zenoh.open(session_config(path, listen=False))
         except (NoAnswerError, zenoh.ZError) as error:
             reason = error if isinstance(error, NoAnswerError) else cause_of(error)
             raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
         yield session
-
-
-def endpoint_of(kind: str, name: str) -> str:
-    """Return the zenoh endpoint of a socket, in the words of this process."""
-    return f"unixsock-stream/{socket_path(kind, name)}"
 
 
 def socket_path(kind: str, name: str) -> str:
@@ -101,9 +92,9 @@ def socket_path(kind: str, name: str) -> str:
 
 
 def session_config(
-    endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
+    path: str, *, listen: bool, more: Mapping[str, Any] | None = None
 ) -> zenoh.Config:
-    """Return the zenoh configuration of a listening or of a connecting session.
+    """Return the zenoh configuration of a session that listens on a socket, or connects to it.
 
     ``more`` has further zenoh settings by key.
     """
@@ -111,7 +102,7 @@ def session_config(
     side, other = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
-        f"{side}/endpoints": [endpoint],
+        f"{side}/endpoints": [f"unixsock-stream/{path}"],
         f"{other}/endpoints": [],
         f"{side}/exit_on_failure": True,
         f"{side}/timeout_ms": _CONNECT_MS,
@@ -224,24 +215,19 @@ class ControlPlane:
         except zenoh.ZError as error:
             what = "start the control plane" if listen else "reach the run's coordinator"
             raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
-        self._token = self.session.liveliness().declare_token(
-            self.key("alive", role, self.instance)
-        )
-        self._stops = self.session.declare_subscriber(self.key("stop"), RingChannel(8))
-        self._stop_reason: str | None = None
-        self._coordinator = self.session.liveliness().declare_subscriber(
-            self.key("alive", COORDINATOR, "*"), RingChannel(8), history=True
+        session, key = self.session, self.key
+        self._token = session.liveliness().declare_token(key("alive", role, self.instance))
+        self._coordinator = session.liveliness().declare_subscriber(
+            key("alive", COORDINATOR, "*"), RingChannel(8), history=True
         )
         self._coordinator_gone_s: float | None = None
+        self._stops = session.declare_subscriber(key("stop"), RingChannel(8))
+        self._stop_reason: str | None = None
         # Room for all possible changes: none is ever pushed out.
-        self._changes = self.session.declare_subscriber(
-            self.key("change"), RingChannel(MOST_CHANGES)
-        )
-        self._dones = self.session.declare_subscriber(self.key("done", "*"), RingChannel(8))
+        self._changes = session.declare_subscriber(key("change"), RingChannel(MOST_CHANGES))
+        self._dones = session.declare_subscriber(key("done", "*"), RingChannel(8))
         self._done: set[str] = set()
-        self._persisted = self.session.declare_subscriber(
-            self.key("persisted", role), RingChannel(1)
-        )
+        self._persisted = session.declare_subscriber(key("persisted", role), RingChannel(1))
 
     def __enter__(self) -> Self:
         return self
@@ -261,10 +247,8 @@ class ControlPlane:
 
     def stop_requested(self) -> str | None:
         """The reason of the coordinator's stop request; None without a request."""
-        if self._stop_reason is None:
-            reason = next_payload(self._stops)
-            if reason is not None:
-                self._stop_reason = reason.decode(errors="replace") or "stopped"
+        if self._stop_reason is None and (reason := next_payload(self._stops)) is not None:
+            self._stop_reason = reason.decode(errors="replace") or "stopped"
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
@@ -289,12 +273,8 @@ class ControlPlane:
 
     def acknowledge_rows(self, role: str, content: object) -> None:
         """Confirm to a process which of its rows are on disk."""
-        self.publish(
-            "persisted",
-            role,
-            content=message_json(content),
-            congestion_control=CongestionControl.DROP,
-        )
+        drop = CongestionControl.DROP
+        self.publish("persisted", role, content=message_json(content), congestion_control=drop)
 
     def persisted(self) -> bytes | None:
         """The recorder's newest confirmation of rows of this process; None without a new one."""
@@ -325,18 +305,13 @@ class ControlPlane:
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        self.publish(
-            "telemetry", self.role, table,
-            content=payload, header=header,
-            congestion_control=CongestionControl.DROP, priority=Priority.BACKGROUND,
-        )  # fmt: skip
+        how = {"congestion_control": CongestionControl.DROP, "priority": Priority.BACKGROUND}
+        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        self.publish(
-            "telemetry", self.role, table,
-            content=payload, header=header, congestion_control=CongestionControl.BLOCK,
-        )  # fmt: skip
+        how = {"congestion_control": CongestionControl.BLOCK}
+        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:

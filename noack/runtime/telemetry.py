@@ -244,14 +244,11 @@ def first_row(header: bytes) -> tuple[int, int]:
 
 def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:
     """Ranges of this process's rows that are on disk, by table; empty without a new message."""
-    message = plane.persisted()
-    if message is None:
-        return {}
-    try:
-        acknowledged = parse_message(PersistedAck, message)
-    except PeerError:  # not from the recorder
-        return {}
-    return acknowledged.rows if acknowledged.generation == generation else {}
+    with suppress(PeerError):  # not from the recorder
+        if (message := plane.persisted()) is not None:
+            acknowledged = parse_message(PersistedAck, message)
+            return acknowledged.rows if acknowledged.generation == generation else {}
+    return {}
 
 
 def deliver_report(

@@ -157,7 +157,7 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
 def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> None:
     plane = RecordingPlane()
     recorder = recorder_of(run.scenario, tmp_path, plane)
-    recorder.end_monitoring()
+    recorder.is_stopping = True
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     recorder.show()
