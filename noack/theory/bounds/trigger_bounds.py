@@ -2,8 +2,8 @@
 
 Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
 
-* a comparison promises ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.error_promise`);
-* one of the integral, ∫‖e_s‖_W ≤ δ, promises ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
+* a comparison bounds ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.comparison_bound`);
+* one of the integral, ∫‖e_s‖_W ≤ δ, bounds ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
 * until a dwell time has passed, and up to a deadline, e_s has grown from 0.
 
 :class:`TriggerBounds` states these bounds. :class:`ErrorGrowth` is how e_s grows from them until
@@ -23,7 +23,7 @@ from noack.core.linear_systems import Matrix
 from noack.core.number_format import number
 from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.trigger.error_promise import ErrorPromise, error_promise
+from noack.trigger.comparison_bound import ComparisonBound, comparison_bound
 from noack.trigger.trigger_rule import TriggerRule
 
 _AVERAGED = 2.0 ** np.arange(-6, 5)
@@ -52,14 +52,14 @@ class TriggerBounds:
     """Rate of the model's fastest mode."""
 
     @cached_property
-    def promise(self) -> ErrorPromise | None:
-        """What the comparison promises; None if nothing."""
-        return error_promise(self.rule, self.weight)
+    def comparison(self) -> ComparisonBound | None:
+        """What follows from the comparison; None if nothing."""
+        return comparison_bound(self.rule, self.weight)
 
     @property
     def beta(self) -> float:
         """β of a threshold βe^{−αt}; 0 without one."""
-        return 0.0 if self.promise is None else self.promise.size * self.rule.level
+        return 0.0 if self.comparison is None else self.comparison.size * self.rule.level
 
     @property
     def alpha_per_s(self) -> float:
@@ -69,16 +69,16 @@ class TriggerBounds:
     @property
     def floor(self) -> float:
         """ε: the constant, or the floor, of the threshold; 0 without one."""
-        if self.promise is None or self.rule.integrates:
+        if self.comparison is None or self.rule.integrates:
             return 0.0
-        return self.promise.size * self.rule.floor
+        return self.comparison.size * self.rule.floor
 
     @property
     def area(self) -> float:
         """δ of ∫‖e_s‖_W ≤ δ; 0 if the rule does not integrate."""
-        if self.promise is None or not self.rule.integrates:
+        if self.comparison is None or not self.rule.integrates:
             return 0.0
-        return self.promise.size * self.rule.floor
+        return self.comparison.size * self.rule.floor
 
     @property
     def is_homogeneous(self) -> bool:
@@ -93,7 +93,7 @@ class TriggerBounds:
     @property
     def outputs(self) -> Mapping[str, Matrix]:
         """S of each share sup‖S x‖ of the threshold, by name."""
-        shares = () if self.promise is None else self.promise.shares
+        shares = () if self.comparison is None else self.comparison.shares
         return {f"share {number}": S for number, S in enumerate(shares)}
 
     @property
@@ -138,9 +138,9 @@ class TriggerBounds:
         idle_s = self._after(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         bounds: list[TriggerBound] = []
-        if self.promise is not None:
+        if self.comparison is not None:
             if reached is not None:
-                reached = reached * self.promise.least / self.promise.size or None
+                reached = reached * self.comparison.least / self.comparison.size or None
             shares = dict.fromkeys(self.outputs, 1.0)
             for ago_s, beta, least in self._levels(conditions, level, reached):
                 bounds.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
@@ -149,7 +149,7 @@ class TriggerBounds:
         if not bounds:
             raise NoCertificateError(_NONE)
         is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
-        grows_first = level > 0 and self.promise is not None and self.promise.least > 0
+        grows_first = level > 0 and self.comparison is not None and self.comparison.least > 0
         if not is_separated and not grows_first:
             raise NoCertificateError(_ACCUMULATE)
         if self.is_homogeneous:
@@ -176,21 +176,21 @@ class TriggerBounds:
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
     def text(self) -> str:
-        """Return in words what the rule promises about e_s."""
-        promises = []
-        if (promise := self.promise) is not None:
+        """Return in words how the rule bounds e_s."""
+        bounds = []
+        if (comparison := self.comparison) is not None:
             shares = " + ".join(
                 f"{number(float(np.linalg.norm(S @ np.linalg.inv(self.weight), 2)))} ‖x‖"
-                for S in promise.shares
+                for S in comparison.shares
             )
             level = "" if self.is_homogeneous else "the threshold"
             bounded = "∫‖e_s‖ dt" if self.rule.integrates else "‖e_s‖"
             total = " + ".join(filter(None, [level, shares]))
-            promises.append(f"after each test {bounded} ≤ {total or '0'}")
+            bounds.append(f"after each test {bounded} ≤ {total or '0'}")
         if self.has_due_time:
             longest_s = self.rule.longest_ns / NS_PER_S
-            promises.append(f"the next event at the latest {longest_s:g} s after the last one")
-        return "; ".join(promises)
+            bounds.append(f"the next event at the latest {longest_s:g} s after the last one")
+        return "; ".join(bounds)
 
     def _levels(
         self, conditions: NetworkConditions, level: float, reached: float | None
@@ -198,8 +198,8 @@ class TriggerBounds:
         """Return (T, β, least ‖e_s‖_W at an event): ‖e_s‖_W ≤ β at some time of the last T."""
         if not self.area:
             return [(0.0, level, reached)]
-        assert self.promise is not None
-        least = self.promise.least * self.rule.floor
+        assert self.comparison is not None
+        least = self.comparison.least * self.rule.floor
         test_s, longest_s = conditions.spacing_s, conditions.sampling_s
         times_s = _AVERAGED / self.fastest_per_s
         if test_s:  # the trapezoidal sum of the last k tests

@@ -24,7 +24,7 @@ from noack.theory.certificates import scenario_certificates, solution
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
-from noack.trigger.error_promise import ErrorPromise
+from noack.trigger.comparison_bound import ComparisonBound
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
 from tests.noack.theory.certificate_kinds.shares import Case, shares_of
@@ -316,16 +316,16 @@ Conditions = NetworkConditions
 @dataclass(frozen=True)
 class NoShares(TriggerBounds):
     @property
-    def promise(self) -> ErrorPromise | None:  # type: ignore[override]
-        found = super().promise
+    def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
+        found = super().comparison
         return None if found is None else found._replace(shares=())
 
 
 @dataclass(frozen=True)
 class NoCrossTerm(TriggerBounds):
     @property
-    def promise(self) -> ErrorPromise | None:  # type: ignore[override]
-        found = super().promise
+    def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
+        found = super().comparison
         return None if found is None else found._replace(shares=found.shares[:1])
 
 
