@@ -162,21 +162,17 @@ def warn_of_other_runs() -> None:
 
 def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
-    try:
-        return _finalize_run(ending, output)
-    except KeyboardInterrupt as error:
-        error.add_note(f"`noack summary {ending.run_dir}` completes its record")
-        raise
-
-
-def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.finalize import finalize
     from cosim.live.run_watcher import log_end
     from cosim.output.run_verdict import print_outcome
 
-    # This takes minutes for a run of an hour.
-    with cli.status("replaying the run and checking its claims"):
-        outcome = finalize(ending, report=output.report)
+    try:
+        # This takes minutes for a run of an hour.
+        with cli.status("replaying the run and checking its claims"):
+            outcome = finalize(ending, report=output.report)
+    except KeyboardInterrupt as error:
+        error.add_note(f"`noack summary {ending.run_dir}` completes its record")
+        raise
     log_end(outcome.status, outcome.reason, outcome.run_dir)
     document = outcome.summary.to_json
     cli.show(output.json, document, print_outcome, outcome, verbose=output.verbose)

@@ -79,16 +79,12 @@ def request_change(run: OpenRun, settings: Mapping[str, Any]) -> ChangeReply:
 
     Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
+    request = message_json(ChangeRequest(settings=dict(settings)))
     try:
-        plane = open_session(RUNS, run.name, listen=False)
+        with open_session(RUNS, run.name, listen=False) as plane:
+            answer = answer_to(plane, f"noack/{run.name}/runtime_parameters", request, _ANSWER_S)
     except zenoh.ZError as error:
         raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
-    try:
-        request = message_json(ChangeRequest(settings=dict(settings)))
-        key = f"noack/{run.name}/runtime_parameters"
-        answer = answer_to(plane, key, request, _ANSWER_S)
-    finally:
-        plane.close()  # type: ignore[no-untyped-call]
     if answer is None:
         raise PeerError(f"{run.run_dir}: the run does not answer")
     return parse_message(ChangeReply, answer)

@@ -87,9 +87,9 @@ class SpoolWriter:
         return self._folder / f"{table}.{self._writer}"
 
     def _open(self, table: str) -> BinaryIO:
-        file = self._files.get(table)
-        if file is None:
-            file = self._files[table] = _appended(self._path(table))
+        if (file := self._files.get(table)) is None:
+            file = os.fdopen(open_append(self._path(table)), "ab", buffering=0)
+            self._files[table] = file
         return file
 
     def close(self) -> None:
@@ -97,10 +97,6 @@ class SpoolWriter:
         for file in self._files.values():
             file.close()
         self._files.clear()
-
-
-def _appended(path: Path) -> BinaryIO:
-    return os.fdopen(open_append(path), "ab", buffering=0)
 
 
 def _write_complete(file: BinaryIO, chunk: bytes) -> None:

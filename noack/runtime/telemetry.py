@@ -126,12 +126,7 @@ class TelemetryBuffer:
 
     def append(self, record: Record) -> None:
         """Add a row; a full batch is published."""
-        table = record.table
-        index = self._filled[table]
-        self._rows[table][index] = record.row
-        self._filled[table] = index + 1
-        if index + 1 == _BATCH_ROWS:
-            self.flush()  # all tables: a reader merges them in the order of publication
+        self.extend_table(record.table, np.array([record.row], self._rows[record.table].dtype))
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table; many are published at once."""
@@ -145,7 +140,7 @@ class TelemetryBuffer:
         self._rows[table][begin : begin + len(rows)] = rows
         self._filled[table] = begin + len(rows)
         if begin + len(rows) == _BATCH_ROWS:
-            self.flush()
+            self.flush()  # all tables: a reader merges them in the order of publication
 
     def notice(self, notice: Notice) -> None:
         """Add a line for the run's log; many are published together."""

@@ -40,7 +40,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from typing import NamedTuple
@@ -256,6 +256,18 @@ class ArrivalSocket:
 _HOST_CLOCKS = HostClocks()
 
 
+def _open_socket(
+    address: Address, use: Callable[[socket.socket, Address], None], what: str
+) -> socket.socket:
+    endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
+    try:
+        use(endpoint, address)
+    except OSError as error:
+        endpoint.close()
+        raise CallerError(f"cannot {what} {text_of(address)}: {why(error)}") from None
+    return endpoint
+
+
 class TimeReference:
     """Answers requests with times of this host's monotonic clock.
 
@@ -265,12 +277,7 @@ class TimeReference:
 
     def __init__(self, listen: Address, key: bytes, clocks: HostClocks = _HOST_CLOCKS) -> None:
         self._format = TimeFormat(key)
-        self._endpoint = socket.socket(family_of(listen), socket.SOCK_DGRAM)
-        try:
-            self._endpoint.bind(listen)
-        except OSError as error:
-            self._endpoint.close()
-            raise CallerError(f"cannot listen on {text_of(listen)}: {why(error)}") from None
+        self._endpoint = _open_socket(listen, socket.socket.bind, "listen on")
         self.address: Address = self._endpoint.getsockname()[:2]
         self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, clocks)
         self._clocks = clocks
@@ -341,12 +348,7 @@ class TimeClient:
         clocks: HostClocks = _HOST_CLOCKS,
     ) -> None:
         self._format = TimeFormat(key)
-        self._endpoint = socket.socket(family_of(reference), socket.SOCK_DGRAM)
-        try:
-            self._endpoint.connect(reference)
-        except OSError as error:
-            self._endpoint.close()
-            raise CallerError(f"cannot send to {text_of(reference)}: {why(error)}") from None
+        self._endpoint = _open_socket(reference, socket.socket.connect, "send to")
         self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, clocks)
         self._clocks = clocks
         self._offset = offset
