@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from typer import Argument, Option
 
@@ -10,9 +10,6 @@ from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @cli.command(cli.RUNS, 92, [
@@ -133,6 +130,7 @@ def compare(
         directories: Two to seven run directories, live or simulated; RUN:NAME is a loop.
         out: File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).
     """
+    from cosim.output.result_tables import ResultTable, terminal_table
     from cosim.studies.run_comparison import compare_runs
 
     with cli.status("comparing"):
@@ -146,21 +144,10 @@ def compare(
         console.print(f"{run.label}  {run.title}  {run.directory}",
                       markup=False, highlight=False, soft_wrap=True)  # fmt: skip
     labels = [run.label for run in found.runs]
-    console.print(_table("key numbers (in brackets: difference to A)", labels, found.rows))
+    tables = {"key numbers (in brackets: difference to A)": found.rows}
     if found.settings:
-        console.print(_table("settings that differ", labels, found.setting_rows))
+        tables["settings that differ"] = found.setting_rows
+    for title, rows in tables.items():
+        console.print(terminal_table(ResultTable("", title, ("", *labels), rows)))
     console.print(f"overlay: {out}", markup=False, highlight=False, soft_wrap=True)
     return ExitStatus.OK
-
-
-def _table(title: str, labels: list[str], rows: list[tuple[str, ...]]) -> "Table":
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=title)
-    table.add_column("")
-    for label in labels:
-        table.add_column(label, justify="right")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table

@@ -144,10 +144,10 @@ def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
 def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np
-    from rich.table import Table
     from rich.text import Text
 
     from cosim.analysis.summary_model import ExitPart
+    from cosim.output.result_tables import ResultTable, terminal_table
     from cosim.output.run_tables import (
         interval_rows,
         longest_burst,
@@ -173,20 +173,21 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
     )
     title = title_of(found["scenario"], found["mode"], mansd, (), found["kind"])
     print_numbers(console, title, rows)
-    table = Table(title="events")
-    for heading in ("event", "t, s", "inter-event time, s", "fate", "‖x‖", "‖e_c‖ before"):
-        table.add_column(heading, justify="right")
     since_s = np.diff(run.event_s, prepend=0.0)
-    for i, state in enumerate(run.before[:_EVENTS_SHOWN]):
-        table.add_row(
+    events = [
+        (
             str(i),
             f"{state.t_s:.9f}",
             f"{since_s[i]:.9f}" if i else "",
-            "delivered" if run.delivered[i] else "[red]lost[/]",
             number(float(np.linalg.norm(state.x)), 4),
             number(float(run.system.norms(state.e_c[None])[0]), 4),
+            "delivered" if run.delivered[i] else "lost",
         )
-    console.print(table)
+        for i, state in enumerate(run.before[:_EVENTS_SHOWN])
+    ]
+    headings = ("event", "t, s", "inter-event time, s", "‖x‖", "‖e_c‖ before", "fate")
+    table = ResultTable("events", "events", headings, events)
+    console.print(terminal_table(table, left=(), styles={"lost": "red"}))
     if len(run.before) > _EVENTS_SHOWN:
         console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
 
@@ -259,16 +260,11 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
 
 
 def _print_parameters(console: "Console", answer: "ChangeReply") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
+    from cosim.output.result_tables import ResultTable, terminal_table
     from noack.config.runtime_parameters import SHORT, text_of
 
     short = {key: name for name, key in SHORT.items()}
-    table = Table(title=f"{answer.name}, at {answer.t_s:.1f} s")
-    entries = answer.loops
-    for heading in ("key", "short", "value", *(["loops"] if len(entries) > 1 else [])):
-        table.add_column(heading)
+    entries, rows = answer.loops, []
     for key in dict.fromkeys(key for values in entries.values() for key in values):
         names: dict[str, list[str]] = {}
         for name, values in entries.items():
@@ -276,7 +272,8 @@ def _print_parameters(console: "Console", answer: "ChangeReply") -> None:
                 names.setdefault(text_of({"": values[key]}).removeprefix(" = "), []).append(name)
         for value, loops in names.items():
             which = "all" if len(loops) == len(entries) else ", ".join(loops)
-            row = key, short.get(key, ""), escape(value), which
-            table.add_row(*row[: len(table.columns)])
-    console.print(table)
-    console.print(f"[dim]{escape(answer.run_dir)}[/]", soft_wrap=True)
+            rows.append((key, short.get(key, ""), which, value))
+    title = f"{answer.name}, at {answer.t_s:.1f} s"
+    table = ResultTable("", title, ("key", "short", "loops", "value"), rows)
+    console.print(terminal_table(table, left=range(4)))
+    console.print(answer.run_dir, style="dim", markup=False, soft_wrap=True)
