@@ -11,7 +11,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
@@ -91,13 +91,8 @@ def socket_path(kind: str, name: str) -> str:
     return f"/proc/self/fd/{known}/{name}.sock"
 
 
-def session_config(
-    path: str, *, listen: bool, more: Mapping[str, Any] | None = None
-) -> zenoh.Config:
-    """Return the zenoh configuration of a session that listens on a socket, or connects to it.
-
-    ``more`` has further zenoh settings by key.
-    """
+def session_config(path: str, *, listen: bool) -> zenoh.Config:
+    """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, Any] = {
@@ -119,7 +114,7 @@ def session_config(
         # A batch without room is dropped at once: the loop must not wait.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
-    for key, value in (settings | dict(more or {})).items():
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
