@@ -7,7 +7,7 @@ Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,25 +81,25 @@ class VerdictLine(NamedTuple):
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     """Return how the run ended, the transmissions of its loops, and their claims."""
     loops = summary.loops
-    events, delivered = (
-        sum(getattr(one, key) for one in loops) for key in ("events", "deliveries")
-    )
+    events, delivered = sum(one.events for one in loops), sum(one.deliveries for one in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
     return (
         ending_line(summary.exit, summary.reached_s, summary.horizon_s),
         transmission_line(events, delivered, ideal),
-        _claims([claim for one in loops for claim in one.claims], _void_since_s(summary)),
+        _claims([claim for one in loops for claim in one.claims], _first_violation(summary)),
     )
 
 
-def _void_since_s(summary: RunSummary) -> dict[str, float]:
-    """Return when each assumption was first violated; empty for several loops."""
+def _first_violation(summary: RunSummary) -> tuple[str, float] | None:
+    """Return the first reason of the void claims of a single loop, and since when it holds."""
     if shares_network(summary):
-        return {}
-    violations = summary.loops[0].assumption_violations
-    return {one.what: one.t_s for one in reversed(violations) if one.cause in CAUSES}
+        return None
+    (loop,) = summary.loops
+    why = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
+    found = (one for one in loop.assumption_violations if one.what == why and one.cause in CAUSES)
+    return next(((one.what, one.t_s) for one in found), None)
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
@@ -120,7 +120,7 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(claims: Sequence[Claim], void_since_s: Mapping[str, float]) -> VerdictLine:
+def _claims(claims: Sequence[Claim], violation: tuple[str, float] | None) -> VerdictLine:
     """Count the claims by verdict, each with its first reason; of void ones since when."""
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
@@ -129,19 +129,19 @@ def _claims(claims: Sequence[Claim], void_since_s: Mapping[str, float]) -> Verdi
     for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
         if counts[name]:
             style = colour if style == GOOD else style
-            parts.append(f"{counts[name]} {name}{_reason(claims, name, void_since_s)}")
+            since = f" from {violation[1]:.3f} s on" if violation and name == "void" else ""
+            parts.append(f"{counts[name]} {name}{since}{_reason(claims, name)}")
     return VerdictLine(", ".join(parts), style)
 
 
-def _reason(claims: Sequence[Claim], name: str, void_since_s: Mapping[str, float]) -> str:
+def _reason(claims: Sequence[Claim], name: str) -> str:
     """Return the first reason of a verdict, in brackets; with it, unless void, which claims."""
     concerned = [claim for claim in claims if claim.verdict == name]
     why = next((claim.why for claim in concerned if claim.why), "")
     what = [] if name == "void" else list(dict.fromkeys(claim.what for claim in concerned))
     more = [f"{len(what) - _NAMED} more"] if len(what) > _NAMED else []
     which = "; ".join([*what[:_NAMED], *more])
-    since = f" from {void_since_s[why]:.3f} s on" if name == "void" and why in void_since_s else ""
-    return f"{since} ({': '.join(filter(None, (which, why)))})" if which or why else ""
+    return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
 
 
 class Remark(NamedTuple):
@@ -157,22 +157,14 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    stated = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
-    since_s = _void_since_s(summary)
-    # The verdict has the first violation that is the first reason of void claims.
-    violations = [
-        one
-        for one in loop.assumption_violations
-        if one.what != stated or since_s.get(one.what) != one.t_s
-    ]
+    stated = _first_violation(summary)  # by the verdict
+    violations = [one for one in loop.assumption_violations if (one.what, one.t_s) != stated]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
         severe = one.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
-    if len(violations) > _MOST_VIOLATIONS:
-        yield Remark(
-            f"{len(violations) - _MOST_VIOLATIONS} more violations of this kind", severe=True
-        )
+    if (more := len(violations) - _MOST_VIOLATIONS) > 0:
+        yield Remark(f"{more} more violations of this kind", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
