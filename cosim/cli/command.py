@@ -306,13 +306,13 @@ def register_commands(wanted: str = "") -> None:
     It is found by its source, since importing all of them takes 0.05 s.
     """
     folder = Path(commands.__path__[0])
-    modules = [one.name for one in pkgutil.iter_modules([str(folder)])]
+    modules = [module.name for module in pkgutil.iter_modules([str(folder)])]
     texts = {module: (folder / f"{module}.py").read_text("utf-8") for module in modules}
     declarations = f"\ndef {wanted}(", f'\n_join("{wanted}",'
     own = [module for module in modules if any(line in texts[module] for line in declarations)]
     for module in own or modules:
         import_module(f"{commands.__name__}.{module}")
-    app.registered_commands.sort(key=lambda one: _order[one.callback])
+    app.registered_commands.sort(key=lambda command: _order[command.callback])
 
 
 def find_scenario(name: str) -> Path:

@@ -138,9 +138,12 @@ def warn_of_violations(scenario: "Scenario") -> None:
         print(f"noack: warning: {line}", file=sys.stderr)
     for section in loop_sections(scenario):
         whose = f"{section.name}: " if shares else ""
-        for one in assumptions(resolve(loop_scenario(scenario, section))):
-            if one.verdict == AssumptionStatus.VIOLATED and one.source == "Theorem 2":
-                print(f"noack: warning: {whose}violated: {one.what}: {one.why}", file=sys.stderr)
+        for assumption in assumptions(resolve(loop_scenario(scenario, section))):
+            if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
+                print(
+                    f"noack: warning: {whose}violated: {assumption.what}: {assumption.why}",
+                    file=sys.stderr,
+                )
 
 
 def warn_of_other_runs() -> None:

@@ -30,16 +30,18 @@ class Program(TyperGroup):
         if self._words and not self._words[0].startswith("-"):
             return []
         found: list[Any] = super().get_params(ctx)
-        for one in found:
-            one.hidden = one.hidden or one.name in _COMPLETION
+        for parameter in found:
+            parameter.hidden = parameter.hidden or parameter.name in _COMPLETION
         return found
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, a section for each panel."""
         commands: Mapping[str, Any] = self.commands
-        for panel, some in groupby(commands.values(), lambda one: one.rich_help_panel):
+        for panel, some in groupby(commands.values(), lambda command: command.rich_help_panel):
             with formatter.section(panel):
-                formatter.write_dl([(one.name, one.get_short_help_str(200)) for one in some])
+                formatter.write_dl(
+                    [(command.name, command.get_short_help_str(200)) for command in some]
+                )
 
     def main(
         self,

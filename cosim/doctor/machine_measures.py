@@ -317,7 +317,7 @@ def _control() -> float:
 
 
 def _disk(runs: Path, needed: int) -> Disk:
-    folder = next(one for one in (runs, *runs.absolute().parents) if one.is_dir())
+    folder = next(path for path in (runs, *runs.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             block = bytes(1024 * 1024)

@@ -241,7 +241,9 @@ class ChildProcesses:
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.
-        logged = next((one.removeprefix(own) for one in lines[::-1] if one.startswith(own)), None)
+        logged = next(
+            (line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None
+        )
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
 
@@ -358,7 +360,11 @@ class RestartPolicy:
         }
         if self._is_past_horizon() and RECORDER in running:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
-        return {role: one for role, one in (failures | exited).items() if role not in self._failed}
+        return {
+            role: failure
+            for role, failure in (failures | exited).items()
+            if role not in self._failed
+        }
 
     def _is_past_horizon(self) -> bool:
         return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns

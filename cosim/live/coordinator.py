@@ -349,7 +349,9 @@ class Coordinator:
             member.apply(Event.START)
         self.joined[member.instance] = {"process": member.role, "generation": member.generation}
         members = [self._members[role] for role in LOOP_ROLES]
-        addresses = {one.role: one.address for one in members if one.address is not None}
+        addresses = {
+            member.role: member.address for member in members if member.address is not None
+        }
         query, member.query = member.query, None
         assert query is not None
         assert self._clock is not None
@@ -389,8 +391,8 @@ class ChangeRequests:
         self._plane = plane
         self._schedule = ChangeSchedule(ticket.scenario)
         self._entries = {
-            one.name: ChangeSchedule(loop_scenario(ticket.scenario, one))
-            for one in loop_sections(ticket.scenario)
+            section.name: ChangeSchedule(loop_scenario(ticket.scenario, section))
+            for section in loop_sections(ticket.scenario)
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
         self.announced: tuple[ChangeAnnouncement, ...] = ()
@@ -412,8 +414,8 @@ class ChangeRequests:
             if len(self.announced) >= MOST_CHANGES:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
             # Before the time is chosen, as it may take long.
-            for one in self._schedules:
-                changed(one.last, settings)
+            for schedule in self._schedules:
+                changed(schedule.last, settings)
             now_ns = clock()
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
@@ -441,7 +443,7 @@ class ChangeRequests:
         return (self._schedule, *self._entries.values())
 
     def _parameters(self) -> dict[str, dict[str, Any]]:
-        return {name: current_parameters(one.last) for name, one in self._entries.items()}
+        return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
 
     def _add(
         self, change: ParameterChange, requested_ns: int, requested_at: str
@@ -450,10 +452,10 @@ class ChangeRequests:
 
         Raise CallerError if the change is not valid for this run.
         """
-        for one in self._schedules:
-            one.check(change, -1)
-        for one in self._schedules:
-            one.announce("", change, 0, 0, -1)
+        for schedule in self._schedules:
+            schedule.check(change, -1)
+        for schedule in self._schedules:
+            schedule.announce("", change, 0, 0, -1)
         later = self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
         announcement = ChangeAnnouncement(
             number=change.number,
@@ -461,7 +463,9 @@ class ChangeRequests:
             settings=dict(change.settings),
             requested_ns=requested_ns,
             requested_at=requested_at,
-            kept_losses=found_probabilities(*(one.network.link for one in later)),
+            kept_losses=found_probabilities(
+                *(changed_scenario.network.link for changed_scenario in later)
+            ),
         )
         self.announced += (announcement,)
         return announcement

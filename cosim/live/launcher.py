@@ -376,7 +376,7 @@ def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
 
     Raise MachineError if the record needs more than the free space.
     """
-    folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
+    folder = next((path for path in (runs, *runs.absolute().parents) if path.is_dir()), None)
     if folder is None:
         return
     free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))

@@ -110,7 +110,7 @@ class ProcessTokens:
         def is_done(known: Mapping[str, float]) -> bool:
             if not known:
                 return discovered
-            waiting = [vanished for one, vanished in known.items() if one not in reported]
+            waiting = [vanished for instance, vanished in known.items() if instance not in reported]
             if len(waiting) < len(known):
                 return math.inf not in waiting
             return all(now_s - max(vanished, self._connected_s) > away_s for vanished in waiting)

@@ -37,11 +37,11 @@ def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
 
     def call(name: str) -> Callable[..., None]:
         def each(*arguments: object) -> None:
-            for one in [*left]:
+            for watcher in [*left]:
                 try:
-                    getattr(one, name)(*arguments)
+                    getattr(watcher, name)(*arguments)
                 except OSError:  # nobody reads its output any more
-                    left.remove(one)
+                    left.remove(watcher)
 
         return each
 

@@ -59,7 +59,7 @@ class TelemetryStore:
         Raise PeerError if the payload has something else.
         """
         lines = [
-            parse_message(LogLine, one).fields() | {"process": role} for one in lines_in(payload)
+            parse_message(LogLine, line).fields() | {"process": role} for line in lines_in(payload)
         ]
         self.writer.append(notices_of(role), notice_number(generation, first), payload)
         self._received[role, NOTICES, generation].add(first, first + len(lines))

@@ -209,6 +209,6 @@ def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
         from scipy.linalg import solve_continuous_lyapunov
 
         return np.asarray(solve_continuous_lyapunov(M, Q))
-    one = np.eye(n)
-    equations = np.kron(M, one) + np.kron(one, M)
+    identity = np.eye(n)
+    equations = np.kron(M, identity) + np.kron(identity, M)
     return np.asarray(np.linalg.solve(equations, Q.ravel()).reshape(n, n))

@@ -47,7 +47,7 @@ def exhausted_limit(error: BaseException) -> str | None:
         return f"too many open files: at most {soft} are permitted; see `ulimit -n`"
     text = one_line(error)
     known = isinstance(error, ImportError | RuntimeError)
-    known = known and any(one in text.lower() for one in _OUT_OF_MEMORY)
+    known = known and any(phrase in text.lower() for phrase in _OUT_OF_MEMORY)
     if not (known or isinstance(error, MemoryError) or number == errno.ENOMEM):
         return None
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)

@@ -366,8 +366,8 @@ async def _connect(destination: Destination) -> Streams:
 
 
 def _main() -> None:
-    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(one, signal.SIG_IGN)  # it ends after the process that it serves
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends after the process that it serves
     destination = Destination(*json.loads(sys.stdin.buffer.readline()))
     prepared: list[Streams] = []
 

@@ -151,7 +151,7 @@ class ReferenceClock:
         if self._client.accepted > self._accepted:
             self._accepted, self._answered_ns = self._client.accepted, now_ns
         lost = self._why_lost(restarts, now_ns)
-        since_ns = min([self._since_ns, *(one.since_ns for one in restarts)])
+        since_ns = min([self._since_ns, *(restart.since_ns for restart in restarts)])
         self._since_ns = now_ns
         return ClockReport(
             since_ns, now_ns, slewed.now_ns(now_ns) - now_ns,

@@ -394,7 +394,7 @@ class TimeClient:
             other = self._offset.begin_again(received_ns)
         self._clock = reply.clock
         exchange = Exchange(sent_ns, reply.received_ns, reply.sent_ns, received_ns)
-        return [one for one in (other, self._offset.add(exchange)) if one is not None]
+        return [restart for restart in (other, self._offset.add(exchange)) if restart is not None]
 
     def _send(self) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES)

@@ -109,7 +109,7 @@ def capacity(
     document = result.document() | about | {"files": [str(file) for file in files]}
     cli.show(json, lambda: document, capacity_page.print_result, result)
     cli.print_paths(files, json=json)
-    agree = all(one.status == ExitStatus.OK and not one.outside for one in points)
+    agree = all(point.status == ExitStatus.OK and not point.outside for point in points)
     return ExitStatus.OK if agree else ExitStatus.FAILED
 
 
@@ -155,7 +155,8 @@ def _plan(
     if rate_bps is not None:
         given = plans.with_rate(given, rate_bps)
         stages = [
-            one.model_dump(mode="json", exclude_none=True) for one in given.network.impairments
+            impairment.model_dump(mode="json", exclude_none=True)
+            for impairment in given.network.impairments
         ]
         settings["network.impairments"] = stages
     plans.bottleneck(given)
@@ -199,6 +200,6 @@ def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, di
 
 def _counts(text: str) -> list[int]:
     try:
-        return [int(one) for one in text.split(",")]
+        return [int(count) for count in text.split(",")]
     except ValueError:
         raise CallerError(f"--loops {text}: write it as N,N,..., e.g. 5,10,20") from None

@@ -172,8 +172,8 @@ def _result(
 def _is_one_way_sender(sources: list[str] | None, listen: str | None, live: "LiveOptions") -> bool:
     from cosim.measurement.live.live_measurement import is_address
 
-    one = sources is not None and len(sources) == 1 and is_address(sources[0])
-    return one and listen is None and not live.round_trip
+    is_probe = sources is not None and len(sources) == 1 and is_address(sources[0])
+    return is_probe and listen is None and not live.round_trip
 
 
 def _share(text: str) -> float:

@@ -111,7 +111,7 @@ def report(
         shown = opened if loop is None else opened.loops[loop]
         figures = shown.save_figures(figure_format, width)
     if json:
-        written = {"figures": [str(one) for one in figures]} if figures else {}
+        written = {"figures": [str(figure) for figure in figures]} if figures else {}
         cli.print_json({"report": str(path)} | written)
     else:
         print(path, *figures, sep="\n")
@@ -225,7 +225,7 @@ def export(
     with cli.status("exporting"):
         written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
     if json:
-        cli.print_json({"files": [str(one) for one in written]})
+        cli.print_json({"files": [str(path) for path in written]})
     else:
         print(*written, sep="\n")
     return ExitStatus.OK

@@ -42,7 +42,7 @@ def scenarios(
     shipped = {kind: all_shipped(kind) for kind in KINDS}
     if json:
         cli.print_json({
-            kind: [one._asdict() | {"path": str(one.path)} for one in some]
+            kind: [file._asdict() | {"path": str(file.path)} for file in some]
             for kind, some in shipped.items()
         })  # fmt: skip
         return ExitStatus.OK
@@ -55,18 +55,18 @@ def scenarios(
 
 def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
     """Print one line per file to a pipe, or a wrapped table to a terminal."""
-    width = max(len(one.name) for one in some)
+    width = max(len(file.name) for file in some)
     if not console.is_terminal:
-        for one in some:
-            print(f"{one.name:{width}}  {one.description}")
+        for file in some:
+            print(f"{file.name:{width}}  {file.description}")
         return
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2))
     table.add_column(min_width=width, no_wrap=True, style="cyan")
     table.add_column()
-    for one in some:
-        table.add_row(one.name, one.description)
+    for file in some:
+        table.add_row(file.name, file.description)
     console.print(table)
 
 
