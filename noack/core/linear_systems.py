@@ -178,12 +178,12 @@ class ModelFlow:
         """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
         if not self.moved:
             return self.propagate(x, to_ns - from_ns)
-        place = bisect_right(self._since_ns, from_ns)
-        while place < len(self._since_ns) and self._since_ns[place] < to_ns:
-            x = self._about(self._setpoints[place], x, self._since_ns[place] - from_ns)
-            from_ns = self._since_ns[place]
-            place += 1
-        return self._about(self._setpoints[place], x, to_ns - from_ns)
+        index = bisect_right(self._since_ns, from_ns)
+        while index < len(self._since_ns) and self._since_ns[index] < to_ns:
+            x = self._about(self._setpoints[index], x, self._since_ns[index] - from_ns)
+            from_ns = self._since_ns[index]
+            index += 1
+        return self._about(self._setpoints[index], x, to_ns - from_ns)
 
     def _about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
         if setpoint is None or dt_ns == 0:

@@ -58,8 +58,8 @@ def contain(ranges: Ranges, first: int, end: int) -> bool:
 
 def overlap(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether the ranges have one of the numbers from ``first`` to before ``end``."""
-    place = bisect_right(ranges, first, key=lambda known: known[1])
-    return place < len(ranges) and ranges[place][0] < end
+    index = bisect_right(ranges, first, key=lambda known: known[1])
+    return index < len(ranges) and ranges[index][0] < end
 
 
 class ReceivedRows:
