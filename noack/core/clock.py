@@ -250,10 +250,7 @@ class RunClock:
     """
 
     def __init__(
-        self,
-        epoch_ns: int,
-        speed: float = 1.0,
-        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        self, epoch_ns: int, speed: float = 1.0, monotonic_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         if not speed > 0:
             raise ValueError(f"speed must be positive, not {speed}")

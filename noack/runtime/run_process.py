@@ -65,12 +65,7 @@ from noack.runtime.join_ticket import (
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
 from noack.runtime.reference_clock import ClockRecord, ReferenceClock, reference_clock
-from noack.runtime.telemetry import (
-    OwnSpool,
-    TelemetryBuffer,
-    deliver_report,
-    persisted_rows,
-)
+from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
 
 _JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
@@ -279,11 +274,7 @@ class RunProcess:
         )
 
     def _drive(
-        self,
-        driver: Driver,
-        channel: Channel,
-        machine: Reconfigurable,
-        telemetry: TelemetryBuffer,
+        self, driver: Driver, channel: Channel, machine: Reconfigurable, telemetry: TelemetryBuffer
     ) -> int:
         """Run the loop; return the simulated time up to which the machines have done their work."""
         has_table = clock_table(self.role) in run_tables(self.scenario)

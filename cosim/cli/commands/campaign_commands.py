@@ -76,10 +76,7 @@ def campaign(
     ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
-    *,
-    draws: int = 1000,
-    out: Path = cli.DEFAULT_RUNS / "paper",
-    json: cli.JsonOption = False,
+    *, draws: int = 1000, out: Path = cli.DEFAULT_RUNS / "paper", json: cli.JsonOption = False
 ) -> int:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts.
 

@@ -148,12 +148,7 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
 
     from cosim.analysis.summary_model import ExitPart
     from cosim.output.result_tables import ResultTable, terminal_table
-    from cosim.output.run_tables import (
-        interval_rows,
-        longest_burst,
-        lost_row,
-        title_of,
-    )
+    from cosim.output.run_tables import interval_rows, longest_burst, lost_row, title_of
     from cosim.output.run_verdict import ending_line, print_numbers, transmission_line
 
     ending = ending_line(ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"])

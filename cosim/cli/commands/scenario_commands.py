@@ -123,12 +123,7 @@ def _make_trigger(resolved: "Scenario") -> None:
 
 def _check_loops(scenario: "Scenario", *, json: bool) -> int:
     """Check each loop and the bottleneck; print the scenario, which is not resolved."""
-    from noack.config.link_load import (
-        link_loads,
-        load_warnings,
-        require_capacity,
-        update_delay,
-    )
+    from noack.config.link_load import link_loads, load_warnings, require_capacity, update_delay
     from noack.config.resolution import resolved_loops
     from noack.config.scenario import phases_ns
     from noack.config.scenario_file import dumps as scenario_toml
