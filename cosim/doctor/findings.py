@@ -222,8 +222,7 @@ def _control(machine: MachineFacts) -> MachineFinding:
         means = "the processes of a run cannot join it"
         remedy = "set XDG_RUNTIME_DIR to a folder of yours that is closed to others"
         return MachineFinding(what, BAD, found, means, remedy)
-    text = f"zenoh over a Unix socket answers in {duration(found)}"
-    return MachineFinding(what, GOOD, text)
+    return MachineFinding(what, GOOD, f"zenoh over a Unix socket answers in {duration(found)}")
 
 
 def _disk(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:

@@ -329,8 +329,7 @@ def _disk(runs: Path, needed: int) -> Disk:
             taken_s = time.perf_counter() - begun_s
     except OSError as error:
         raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
-    free = shutil.disk_usage(folder).free
-    return Disk(str(folder), free, needed, _WRITE_BYTES / taken_s)
+    return Disk(str(folder), shutil.disk_usage(folder).free, needed, _WRITE_BYTES / taken_s)
 
 
 def _runtime_folder() -> str | None:

@@ -101,8 +101,7 @@ class TelemetryStore:
 
     def add_own_notice(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the log."""
-        payload = json.dumps(notice.line()).encode()
-        self.writer.append(notices_of(RECORDER), 0, payload)
+        self.writer.append(notices_of(RECORDER), 0, json.dumps(notice.line()).encode())
 
     def load(self, on_rows: Callable[[str, Rows], None]) -> None:
         """Read what an earlier recorder of this run has stored."""

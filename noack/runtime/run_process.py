@@ -225,8 +225,7 @@ class RunProcess:
         """
         telemetry = self._telemetry()
         if self.replaces is not None:
-            text = f"restarted: {self.replaces}"
-            telemetry.notice(Notice(self.start.from_ns, RESTART, text))
+            telemetry.notice(Notice(self.start.from_ns, RESTART, f"restarted: {self.replaces}"))
         reached_ns: int | None = None
         try:
             reached_ns = self._drive(driver, channel, machine, telemetry)

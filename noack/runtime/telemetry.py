@@ -227,8 +227,7 @@ class TelemetryBuffer:
         self._held_bytes = sum(len(batch[3]) for batch in held)
 
     def _header(self, first: int, rows: int) -> bytes:
-        header = {"first": first, "rows": rows, "generation": self._generation}
-        return json.dumps(header).encode()
+        return json.dumps({"first": first, "rows": rows, "generation": self._generation}).encode()
 
 
 def first_row(header: bytes) -> tuple[int, int]:
@@ -305,8 +304,7 @@ class OwnSpool:
 
     def keep_report(self, report: Mapping[str, object]) -> None:
         """Write the final report; raise MachineError if it cannot be written."""
-        text = json.dumps({**report, "process": self._role})
-        self._files.append(KEPT_REPORT, 0, text.encode())
+        self._files.append(KEPT_REPORT, 0, json.dumps({**report, "process": self._role}).encode())
 
 
 def _kept_folder(run_dir: Path, name: str) -> Path:
