@@ -176,17 +176,12 @@ class ReferenceClock:
         return None
 
 
-def reads_other_clock(ticket: Ticket) -> bool:
-    """Whether this process's monotonic clock is not that of the run's coordinator."""
-    return ticket.clock != clock_identity()
-
-
 def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
     Raise PeerError if it is another clock, and nobody answers requests for its time.
     """
-    if not reads_other_clock(ticket):
+    if ticket.clock == clock_identity():
         return None
     if ticket.time_reference is None:
         raise PeerError(
