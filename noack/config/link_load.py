@@ -266,10 +266,9 @@ def _demand(loop: Scenario, count: int) -> Demand:
 
 def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
     """Return the least and the largest time between two events that the trigger permits."""
-    policy, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
-    if isinstance(policy, CodedPolicy):  # it may transmit at every measurement, or never
+    rule, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
+    if isinstance(rule, CodedPolicy):  # it may transmit at every measurement, or never
         return measured_ns, math.inf
-    rule = policy.trigger_rule(loop.model.dimensions[0])
     least_ns = max(measured_ns, rule.idle_ns)
     if rule.forecast is not None:
         least_ns = max(least_ns, rule.shortest_ns)

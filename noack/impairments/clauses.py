@@ -185,12 +185,13 @@ class Clause:
         needed, optional = values[: self.least], values[self.least :]
         nested = "".join(f"[{symbol} " for symbol in optional).rstrip() + "]" * len(optional)
         options = [f"[{part.grammar}]" for part in self._options]
-        return " ".join(filter(None, [not self.is_bare and self.word, *needed, nested, *options]))
+        first = "" if self.is_bare else self.word
+        return " ".join(filter(None, [first, *needed, nested, *options]))
 
     def described(self, before: str = "") -> Iterator[Word]:
         """Yield the clause's words, given those before it; the first word comes first."""
         needed = [part.grammar for part in self._values[: self.least]]
-        after = " ".join(filter(None, [before, not self.is_bare and self.word, *needed]))
+        after = " ".join(filter(None, [before, "" if self.is_bare else self.word, *needed]))
         yield Word(self.word, self.example, before, f"{before} {self.grammar}".strip())
         for synonym in self.synonyms:
             yield Word(synonym, self.example, before)

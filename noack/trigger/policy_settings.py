@@ -58,7 +58,7 @@ class PolicySettings(ScenarioSection):
 
     @abstractmethod
     def trigger_policy(self, model: ModelMatrices) -> Policy:
-        """Return the behaviour that these settings describe.
+        """Return what these settings describe: a rule as data, or code.
 
         Raises:
             CallerError: the policy cannot be used with this model.

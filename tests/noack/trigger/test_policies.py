@@ -10,19 +10,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import norm as exact_norm
-from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.deadline import DeadlineTrigger
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.dwell import DwellTrigger
-from noack.trigger.dynamic import DynamicTrigger
-from noack.trigger.lyapunov import LyapunovTrigger
-from noack.trigger.mixed import MixedTrigger
-from noack.trigger.periodic_trigger import PeriodicTrigger
-from noack.trigger.quadratic import QuadraticTrigger
-from noack.trigger.relative import relative_trigger
-from noack.trigger.self_triggered import SelfTrigger
 from noack.trigger.trigger_rule import Forecast, Policy
 from tests.noack.trigger.core_trigger import CoreTrigger
+from tests.trigger_rules import (
+    absolute_rule,
+    decaying_rule,
+    dynamic_rule,
+    lyapunov_rule,
+    mixed_rule,
+    periodic_rule,
+    quadratic_rule,
+    self_triggered_rule,
+    with_deadline,
+    with_dwell_time,
+)
 
 Vector = NDArray[np.float64]
 MS = 1_000_000
@@ -44,23 +45,23 @@ Rule = Callable[[float, Vector, Vector, Vector], float]
 
 STATIC: dict[str, tuple[Policy, Rule]] = {
     "decaying": (
-        DecayingTrigger(0.5, 0.25, 0.01, W),
+        decaying_rule(0.5, 0.25, 0.01, W),
         lambda t, x, e, x_k: norm(W @ e) - max(0.5 * math.exp(-0.25 * t), 0.01),
     ),
-    "absolute": (AbsoluteTrigger(0.3, W), lambda t, x, e, x_k: norm(W @ e) - 0.3),
+    "absolute": (absolute_rule(0.3, W), lambda t, x, e, x_k: norm(W @ e) - 0.3),
     "relative": (
-        relative_trigger(0.2, W), lambda t, x, e, x_k: norm(W @ e) - 0.2 * norm(W @ x)
+        mixed_rule(0.2, 0.0, W), lambda t, x, e, x_k: norm(W @ e) - 0.2 * norm(W @ x)
     ),
     "mixed": (
-        MixedTrigger(0.2, 0.1),
+        mixed_rule(0.2, 0.1),
         lambda t, x, e, x_k: norm(e) ** 2 - (0.2 * norm(x)) ** 2 - 0.1**2,
     ),
     "quadratic": (
-        QuadraticTrigger(FORM, MS, 0.05),
+        quadratic_rule(FORM, MS, 0.05),
         lambda t, x, e, x_k: (z := np.concatenate([x, e])) @ FORM @ z - 0.05,
     ),
     "lyapunov": (
-        LyapunovTrigger(np.linalg.cholesky(P).T, 0.7),
+        lyapunov_rule(np.linalg.cholesky(P).T, 0.7),
         lambda t, x, e, x_k: x @ P @ x - (x_k @ P @ x_k) * math.exp(-0.7 * t),
     ),
 }  # fmt: skip
@@ -89,7 +90,7 @@ def test_the_dynamic_rule_integrates_its_variable(
     samples: list[tuple[Vector, Vector]], theta_s: float
 ) -> None:
     """η between samples as the solution of η̇ = −λη + w with w held."""
-    policy = DynamicTrigger(0.3, theta_s, 0.8, P, Q, BK, initial_dynamic_variable=0.2)
+    policy = dynamic_rule(0.3, theta_s, 0.8, P, Q, BK, eta_0=0.2)
     trigger, eta, w = CoreTrigger(policy, 2), 0.2, 0.0
     trigger.start(0, np.zeros(2))
     for number, (x, e) in enumerate(samples, 1):
@@ -121,33 +122,31 @@ def silent(t_ms: int, since_ms: int) -> float:
 
 
 def test_periodic_transmits_at_a_fixed_period() -> None:
-    assert list(events_ms(PeriodicTrigger(70 * MS), growing)) == list(range(70, 1001, 70))
+    assert list(events_ms(periodic_rule(70 * MS), growing)) == list(range(70, 1001, 70))
 
 
 def test_a_deadline_only_adds_an_event_after_silence() -> None:
-    rule = AbsoluteTrigger(0.1)  # after 71 ms of growth
-    assert list(events_ms(DeadlineTrigger(rule, 200 * MS), silent)) == list(range(200, 1001, 200))
-    assert list(events_ms(DeadlineTrigger(rule, 200 * MS), growing)) == list(
-        events_ms(rule, growing)
-    )
-    assert next(events_ms(DeadlineTrigger(rule, 50 * MS), growing)) == 50
+    rule = absolute_rule(0.1)  # after 71 ms of growth
+    assert list(events_ms(with_deadline(rule, 200 * MS), silent)) == list(range(200, 1001, 200))
+    assert list(events_ms(with_deadline(rule, 200 * MS), growing)) == list(events_ms(rule, growing))
+    assert next(events_ms(with_deadline(rule, 50 * MS), growing)) == 50
 
 
 def test_a_dwell_time_only_delays_events() -> None:
-    rule = AbsoluteTrigger(0.1)
+    rule = absolute_rule(0.1)
     assert next(events_ms(rule, growing)) == 71
-    assert list(events_ms(DwellTrigger(rule, 100 * MS), growing)) == list(range(100, 1001, 100))
-    assert list(events_ms(DwellTrigger(rule, 50 * MS), growing)) == list(events_ms(rule, growing))
-    assert next(events_ms(DwellTrigger(PeriodicTrigger(30 * MS), 50 * MS), silent)) == 50
-    assert list(events_ms(DwellTrigger(rule, 50 * MS), silent)) == []
+    assert list(events_ms(with_dwell_time(rule, 100 * MS), growing)) == list(range(100, 1001, 100))
+    assert list(events_ms(with_dwell_time(rule, 50 * MS), growing)) == list(
+        events_ms(rule, growing)
+    )
+    assert next(events_ms(with_dwell_time(periodic_rule(30 * MS), 50 * MS), silent)) == 50
+    assert list(events_ms(with_dwell_time(rule, 50 * MS), silent)) == []
 
 
 def test_periodic_event_triggering_tests_on_its_grid_and_has_a_heartbeat() -> None:
     Q = np.diag([0.0, 0.0, 1.0, 1.0])
-    assert list(events_ms(QuadraticTrigger(Q, 50 * MS, 0.01), growing)) == list(
-        range(100, 1001, 100)
-    )
-    silent_events = list(events_ms(QuadraticTrigger(Q, 50 * MS, 0.01, heartbeat=6), silent))
+    assert list(events_ms(quadratic_rule(Q, 50 * MS, 0.01), growing)) == list(range(100, 1001, 100))
+    silent_events = list(events_ms(quadratic_rule(Q, 50 * MS, 0.01, heartbeat=6), silent))
     assert silent_events == [300, 600, 900]
 
 
@@ -159,7 +158,7 @@ def test_a_self_triggered_error_stays_below_the_threshold(
     L: float, a: float, b: float, x: Vector, floor: float, t_s: float
 ) -> None:
     """The extreme error d|e|/dt = L|e| + a|x| + b reaches it at the event, and not before."""
-    policy = SelfTrigger(Forecast(0.5, 0.25, floor, L, a, b), 1000, 10 * S)
+    policy = self_triggered_rule(Forecast(0.5, 0.25, floor, L, a, b), 1000, 10 * S)
     trigger, t_ns = CoreTrigger(policy, len(x)), round(t_s * 1e9)
     trigger.start(t_ns, x)
     tau_s, t_s = (trigger.latest_ns - t_ns) * 1e-9, t_ns * 1e-9
@@ -181,7 +180,7 @@ def test_a_self_triggered_error_stays_below_the_threshold(
 @given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=2).map(np.array), vectors)
 def test_the_compared_error_has_the_bits_of_its_norm(e_s: Vector, x: Vector) -> None:
     """Also if a run diverges: its squares overflow."""
-    trigger = CoreTrigger(AbsoluteTrigger(0.1), 2)
+    trigger = CoreTrigger(absolute_rule(0.1), 2)
     trigger.start(0, x)
     with np.errstate(over="ignore"):
         assert trigger.test(MS, x, e_s).left == exact_norm(e_s)

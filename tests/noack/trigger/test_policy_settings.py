@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.config.resolution import LoopMatrices, loop_of, policy_of, resolve
+from noack.config.resolution import LoopMatrices, loop_of, resolve, rule_of
 from noack.config.scenario_file import validate
 from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
@@ -42,7 +42,7 @@ def test_the_core_decides_as_the_rule_is_stated(
     table = EXAMPLES[name].model_dump(mode="json", exclude_none=True)
     scenario = resolve(validate(content | {"trigger": table}, "here"))
     loop, start = loop_of(scenario), np.array([0.5, -0.3])
-    trigger, stated = CoreTrigger(policy_of(scenario), N), stated_rule(table, loop)
+    trigger, stated = CoreTrigger(rule_of(scenario), N), stated_rule(table, loop)
     trigger.start(0, start)
     stated.event(0, start)
     stated.measured(0, start, np.zeros(N))

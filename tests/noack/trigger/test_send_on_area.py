@@ -10,17 +10,16 @@ from scipy.integrate import solve_ivp
 from cosim.simulation.batch import run_batch, run_events
 from cosim.simulation.continuous import ContinuousRun
 from cosim.simulation.exact_simulation import OK
-from noack.trigger.dwell import DwellTrigger
-from noack.trigger.send_on_area import SendOnAreaTrigger
 from tests.cosim.simulation.batch.exact import one, random_population, random_setting, reference
 from tests.noack.trigger.core_trigger import CoreTrigger
+from tests.trigger_rules import area_rule, with_dwell_time
 
 MS = 1_000_000
 W = np.array([[2.0, 0.5], [0.0, 1.0]])
 
 
 def test_a_live_sensor_sums_trapezoids_and_restarts_at_an_event() -> None:
-    trigger, x = CoreTrigger(SendOnAreaTrigger(0.1, W), 2), np.ones(2)
+    trigger, x = CoreTrigger(area_rule(0.1, W), 2), np.ones(2)
     trigger.start(0, x)
     since_ms, area, last, events = 0, 0.0, 0.0, []
     for t_ms in range(2, 2000, 2):
@@ -78,7 +77,7 @@ def test_a_batch_has_the_events_of_the_exact_simulator(dwell: bool) -> None:
     for seed in range(6):
         setting, draw = drawn(seed, 0.01)
         if dwell:
-            setting = replace(setting, trigger=DwellTrigger(setting.trigger, 120 * MS))
+            setting = replace(setting, trigger=with_dwell_time(setting.trigger, 120 * MS))
         run, found = reference(setting, draw, 3000), run_events(setting, draw)
         np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
         assert found.delivered.tolist() == run.delivered.tolist()
@@ -91,6 +90,6 @@ def test_a_batch_has_the_events_of_the_exact_simulator(dwell: bool) -> None:
 def drawn(seed: int, delta_s: float):
     rng = np.random.default_rng([seed, 7])
     setting = random_setting(rng, 2, 1)
-    trigger = SendOnAreaTrigger(delta_s, setting.trigger.weight)
+    trigger = area_rule(delta_s, setting.trigger.weight)
     setting = replace(setting, trigger=trigger, most_events=3000)
     return setting, one(random_population(rng, setting, 1), 0)
