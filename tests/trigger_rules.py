@@ -1,7 +1,10 @@
 """Trigger rules of n states by numbers, which tests need without a model."""
 
+from typing import Any
+
 import numpy as np
 
+from noack.config.sections import POLICIES
 from noack.core.linear_systems import Matrix
 from noack.trigger.deadline import with_deadline as with_deadline
 from noack.trigger.dwell import with_dwell_time as with_dwell_time
@@ -17,6 +20,13 @@ from noack.trigger.trigger_rule import (
     no_form,
     quadratic_form,
 )
+
+EXAMPLES: dict[str, dict[str, Any]] = {
+    name: example.model_dump(mode="json", exclude_none=True)
+    for name, made in POLICIES.items()
+    if (example := made.example(2)) is not None
+}
+"""The table of each policy that is a rule, for two states."""
 
 
 def decaying_rule(

@@ -27,6 +27,7 @@ from tests.cosim.simulation.batch.exact import (
 )
 from tests.trigger_rules import (
     absolute_rule,
+    area_rule,
     decaying_rule,
     dynamic_rule,
     lyapunov_rule,
@@ -83,6 +84,8 @@ POLICIES: dict[str, Make] = {
     "absolute": lambda rng, n, W: absolute_rule(0.01, W, n),
     "relative": lambda rng, n, W: mixed_rule(rng.uniform(0.01, 0.05), 0.0, W, n),
     "mixed": mixed,
+    "send_on_area": lambda rng, n, W: area_rule(0.01, W, n),
+    "dwell of send_on_area": lambda rng, n, W: with_dwell_time(area_rule(0.01, W, n), 120 * MS),
     "lyapunov": lyapunov,
     "dynamic": dynamic,
     "quadratic": quadratic,

@@ -1,12 +1,14 @@
-"""Every policy in continuous time, against an integrator with separately written rules."""
+"""Policies in continuous time: known events, and published bounds.
+
+Each event of every policy is checked by an integrator in ../batch/test_policies.py.
+"""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 from scipy.linalg import expm
 
 from cosim.simulation.continuous import (
@@ -47,37 +49,6 @@ def loop_of(*, zoh: bool, mismatch: float = 0.1) -> LoopMatrices:
     )  # fmt: skip
 
 
-POLICIES: dict[str, TriggerRule] = {
-    "relative": mixed_rule(0.05),
-    "mixed": mixed_rule(0.05, 0.02, np.array([[1.0, 0.2], [0.0, 2.0]])),
-    "dynamic": dynamic_rule(0.1, 0.5, 0.3, P, Q, B @ K, 1.0),
-    "dynamic, at once": dynamic_rule(0.1, 0.5, 0.0, P, Q, B @ K),
-    "deadline": with_deadline(mixed_rule(0.05, 0.1), 500 * MS),
-}
-"""Policies with events at the zero of a continuous function or at a given time; the paper's is in
-``test_continuous.py``."""
-Excess = Callable[[float, Vector, float], float]
-"""Positive at an event: a function of the time, z = (x, e_s), and η."""
-
-
-def excess_of(name: str) -> Excess:
-    def dynamic(t: float, z: Vector, eta: float) -> float:
-        return -(eta + 0.5 * gain(z))
-
-    W = np.array([[1.0, 0.2], [0.0, 2.0]])
-    rules: dict[str, Excess] = {
-        "relative": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2,
-        "mixed": lambda t, z, eta: norm(W @ z[2:]) ** 2 - (0.05 * norm(W @ z[:2])) ** 2 - 0.02**2,
-        "deadline": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2 - 0.1**2,
-    }
-    return rules.get(name, dynamic)
-
-
-def gain(z: Vector) -> float:
-    """W of the dynamic rule."""
-    return float(0.1 * z[:2] @ Q @ z[:2] - 2 * z[:2] @ P @ B @ K @ z[2:])
-
-
 def norm(v: Vector) -> float:
     return float(np.linalg.norm(v))
 
@@ -88,46 +59,6 @@ def run_of(policy: TriggerRule, *, zoh: bool, lost: int, horizon_s: float = 6.0)
         ContinuousLoop(loop, policy), horizon_s=horizon_s, known_start=True,
         delivered=lambda event: event % (lost + 1) == lost, max_events=5000,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(("zoh", "lost"), [(False, 2), (True, 0)])
-@pytest.mark.parametrize("name", POLICIES)
-def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> None:
-    """From each event of the run, an integrator with event detection finds the next one."""
-    policy, excess = POLICIES[name], excess_of(name)
-    run = run_of(policy, zoh=zoh, lost=lost)
-    loop, dynamic = run.system.loop, policy.dynamic_variable
-    decay = dynamic.decay_per_s if dynamic else 0.0
-    assert len(run.before) >= 3
-    eta = policy.initial_dynamic_variable
-    for start in (run.start, *run.after):
-        z0 = np.concatenate([start.x, start.x + start.e_s, start.x + start.e_c, [eta]])
-
-        def flow(t: float, y: Vector) -> Vector:
-            x, x_s, x_c = y[:2], y[2:4], y[4:6]
-            z = np.concatenate([x, x_s - x])
-            return np.concatenate(
-                [loop.A @ x + loop.B @ (loop.K @ x_c), loop.H @ x_s, loop.H @ x_c,
-                 [-decay * y[6] + gain(z)]]
-            )  # fmt: skip
-
-        def crossing(t: float, y: Vector) -> float:
-            return excess(t, np.concatenate([y[:2], y[2:4] - y[:2]]), y[6])
-
-        crossing.terminal, crossing.direction = True, 1  # type: ignore[attr-defined]
-        end_s = run.horizon_s
-        if name == "deadline":
-            end_s = min(end_s, start.t_s + 0.5)
-        if end_s - start.t_s < 1e-6:
-            continue
-        found = solve_ivp(
-            flow, (start.t_s, end_s), z0, "DOP853", events=crossing, rtol=1e-11, atol=1e-13,
-            max_step=0.02,
-        )  # fmt: skip
-        expected_s = found.t_events[0][0] if len(found.t_events[0]) else end_s
-        following = next((one.t_s for one in run.before if one.t_s > start.t_s), run.horizon_s)
-        assert following == pytest.approx(expected_s, abs=1e-7)
-        eta = float(found.y[6, -1])
 
 
 @pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
