@@ -51,7 +51,6 @@ _SPIN_NS = 50_000
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for running and recording a relay."""
     group = parser.add_argument_group("relay")
     group.add_argument(
         "--segment", action="store_true",
@@ -224,7 +223,6 @@ _SWITCH_S = 0.0002
 
 
 def _add_watching_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for watching and changing a relay to a command line."""
     group = parser.add_argument_group("statistics and changes during operation")
     group.add_argument(
         "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
@@ -264,8 +262,7 @@ def check_watching_options(options: argparse.Namespace) -> None:
 class AttachedRelay(NamedTuple):
     """The relay thread's access to the threads that watch the relay."""
 
-    commands: CommandQueue
-    """To be run in the relay's thread, at least every 50 ms."""
+    commands: CommandQueue  # To be run in the relay's thread, at least every 50 ms
     screen: Screen | None
 
     @property
@@ -307,7 +304,6 @@ def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRela
 
 @contextmanager
 def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
-    """Serve metrics within the context."""
     require_package()
     from netem.control.emulator_metrics import EmulatorMetrics
 

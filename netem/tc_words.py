@@ -75,8 +75,7 @@ class LinkWords(NamedTuple):
     """Settings in words."""
 
     settings: LinkSettings
-    seed: int | None
-    """Seed of the random streams, if the words contain one."""
+    seed: int | None  # Seed of the random streams, if the words contain one
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:

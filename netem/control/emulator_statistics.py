@@ -68,8 +68,7 @@ class Snapshot(NamedTuple):
 
     links: Sequence[LinkReport]
     in_force: Mapping[tuple[str, Direction], AppliedSettings]
-    elapsed_ns: int
-    """Time since the relay started."""
+    elapsed_ns: int  # Time since the relay started
     unix_ns: int
 
 

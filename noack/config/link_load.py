@@ -47,17 +47,14 @@ class Demand(NamedTuple):
 
     loops: int
     payload_bytes: int
-    least_s: float
-    """Least time between two transmissions of a loop."""
-    largest_s: float
-    """Largest time between two transmissions; infinite if there is none."""
+    least_s: float  # Least time between two transmissions of a loop
+    largest_s: float  # Largest time between two transmissions; infinite if there is none
 
 
 class _Stage(NamedTuple):
     """A part of the run, between two changes of settings."""
 
-    begin: str
-    """Where it begins, in words; empty: at the start of the run."""
+    begin: str  # Where it begins, in words; empty: at the start of the run
     direction: DirectionSection
     loops: Sequence[Demand]
 
@@ -178,7 +175,6 @@ def _window(direction: DirectionSection) -> LossWindow:
 
 
 def _share(window: LossWindow) -> float:
-    """Return the share of datagrams that must pass."""
     return (window.packets - window.losses) / window.packets
 
 

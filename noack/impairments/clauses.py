@@ -87,8 +87,7 @@ def flag(word: str, example: str, key: str, value: bool) -> Part:
 class FileOr(Part):
     """The name of a file; or a word, and the value that a file may have."""
 
-    expected: str = ""
-    """The file, in words."""
+    expected: str = ""  # The file, in words
 
     @property
     def grammar(self) -> str:

@@ -84,8 +84,7 @@ class RecordedDecision:
     """A recorded decision for a packet: the fields of ``noack_recorded``."""
 
     fate: int
-    delay_ns: int
-    """Time from arrival to departure; −1: it never left."""
+    delay_ns: int  # Time from arrival to departure; −1: it never left
     copy_delay_ns: int
     bit: int
     copy_bit: int

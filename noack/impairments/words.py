@@ -44,13 +44,10 @@ _SPACES = " \t\r\n"
 class Quantity(Generic[T]):
     """A kind of quantity."""
 
-    expected: str
-    """Description of a word, with an example: ``a time, e.g. 10ms``."""
+    expected: str  # Description of a word, with an example: ``a time, e.g. 10ms``.
     convert: Callable[[str], T]
-    text: Callable[[T], str] = str
-    """Writes a value as a word that is read as the same value."""
-    signs: str = ""
-    """The signs that its word may begin with, where it may be left out."""
+    text: Callable[[T], str] = str  # Writes a value as a word that is read as the same value
+    signs: str = ""  # The signs that its word may begin with, where it may be left out
 
     def read(self, word: str) -> T:
         """Read a word.

@@ -53,8 +53,7 @@ class CapturedDatagram(NamedTuple):
     t_ns: int
     flow: CapturedFlow
     payload: bytes
-    is_cut: bool
-    """Whether only its beginning was captured."""
+    is_cut: bool  # Whether only its beginning was captured
     is_outbound: bool
 
 
@@ -62,10 +61,8 @@ class Datagrams(NamedTuple):
     """The complete datagrams of a capture, sorted by time."""
 
     t_ns: Int64s
-    hashes: Int64s
-    """Of the payloads."""
-    flow: Int64s
-    """Places of the flows in :attr:`Capture.flows`."""
+    hashes: Int64s  # Of the payloads
+    flow: Int64s  # Places of the flows in :attr:`Capture.flows`
 
     def where(self, flags: NDArray[np.bool_]) -> "Datagrams":
         """Return those that are flagged."""
@@ -372,11 +369,9 @@ def _unwrapped(number: Int64s, bits: int) -> NDArray[np.int64]:
 class CaptureOptions:
     """How to read captures."""
 
-    flow: int = 1
-    """Which flow, by its number of datagrams; 1 is the largest."""
+    flow: int = 1  # Which flow, by its number of datagrams; 1 is the largest
     sequence_at: SequenceField | None = None
-    clocks_differ: bool | None = None
-    """None: only if there are two captures."""
+    clocks_differ: bool | None = None  # None: only if there are two captures
     most_packets: int = MAX_PACKETS
 
 

@@ -31,38 +31,27 @@ NEVER_NS = math.inf
 class QuadraticForm(NamedTuple):
     """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
 
-    up: Matrix
-    """P, shape (p, 2n)."""
-    down: Matrix
-    """N, shape (q, 2n); q = 0 for none."""
+    up: Matrix  # P, shape (p, 2n)
+    down: Matrix  # N, shape (q, 2n); q = 0 for none
 
 
 class DynamicVariable(NamedTuple):
     """Girard's dynamic variable: η̇ = −λη + ψ(z)."""
 
-    decay_per_s: float
-    """λ."""
-    gain: QuadraticForm
-    """ψ."""
-    initial: float = 0.0
-    """η at the start."""
+    decay_per_s: float  # λ
+    gain: QuadraticForm  # ψ
+    initial: float = 0.0  # η at the start
 
 
 class Forecast(NamedTuple):
     """The assumed growth of the sensor's error, and its threshold (:mod:`.self_triggered`)."""
 
-    beta: float
-    """β > 0."""
-    alpha_per_s: float
-    """α > 0."""
-    floor: float
-    """ε ≥ 0."""
-    growth_per_s: float
-    """L ≥ 0."""
-    mismatch_per_s: float
-    """a ≥ 0."""
-    disturbance_per_s: float
-    """b ≥ 0."""
+    beta: float  # β > 0
+    alpha_per_s: float  # α > 0
+    floor: float  # ε ≥ 0
+    growth_per_s: float  # L ≥ 0
+    mismatch_per_s: float  # a ≥ 0
+    disturbance_per_s: float  # b ≥ 0
 
 
 class TriggerRule(NamedTuple):
@@ -156,10 +145,8 @@ class CodedPolicy:
     """A policy that decides by code of its own, and so has no trigger rule."""
 
     weight: Matrix | None
-    new_trigger: Callable[[], "EventTrigger"]
-    """Returns a trigger that has not started."""
-    why_no_rule: str
-    """What a user is told where a trigger rule is needed."""
+    new_trigger: Callable[[], "EventTrigger"]  # Returns a trigger that has not started
+    why_no_rule: str  # What a user is told where a trigger rule is needed
 
 
 Policy = TriggerRule | CodedPolicy
