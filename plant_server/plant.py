@@ -284,10 +284,7 @@ class Plant:
 
 
 def plants_of(
-    loops: Sequence[Scenario],
-    phases_ns: Sequence[int] | None = None,
-    *,
-    start: Start = BEGINNING,
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
 ) -> LoopMachines:
     """Return the plants of resolved loops as the machines of a process.
 

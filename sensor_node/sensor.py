@@ -278,10 +278,7 @@ def _or_zero(setpoint: Vector | None) -> Vector:
 
 
 def sensors_of(
-    loops: Sequence[Scenario],
-    phases_ns: Sequence[int] | None = None,
-    *,
-    start: Start = BEGINNING,
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
 ) -> LoopMachines:
     """Return the sensors of resolved loops as the machines of a process.
 

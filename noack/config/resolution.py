@@ -12,13 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
-from noack.config.scenario import (
-    Scenario,
-    loop_scenario,
-    loop_sections,
-    loops_by_entry,
-    loops_of,
-)
+from noack.config.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
 from noack.config.scenario_checks import input_at
 from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError

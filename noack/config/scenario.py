@@ -15,11 +15,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import BaseModel, ValidationError, create_model, model_validator
 
-from noack.config.run_sections import (
-    MOST_LOOPS,
-    LoopSection,
-    SeedsSection,
-)
+from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.config.scenario_checks import check_changes, check_sections
 from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain

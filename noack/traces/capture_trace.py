@@ -332,8 +332,7 @@ def trace_of_numbers(
     order = np.argsort(numbered.received_ns, kind="stable")
     number = _unwrapped(numbered.number[order], bits)
     numbered = _first_of_each(
-        numbered._replace(number=number, received_ns=numbered.received_ns[order]),
-        capture.notes,
+        numbered._replace(number=number, received_ns=numbered.received_ns[order]), capture.notes
     )
     k, received_ns = (
         numbered.number - numbered.number[0],

@@ -195,9 +195,7 @@ def estimates(outputs: Sequence[Output]) -> Vector:
     return found
 
 
-def test_a_restarted_sensor_restarts_its_observer_and_reports_it(
-    observed: dict[str, Any],
-) -> None:
+def test_a_restarted_sensor_restarts_its_observer_and_reports_it(observed: dict[str, Any]) -> None:
     observed["network"]["initial_sync"] = "known_state"
     scenario = resolved(observed)
     t_ns, y, u = 400_000_000, 0.7, 0.1

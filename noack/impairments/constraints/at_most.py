@@ -23,10 +23,7 @@ class AtMost(Constraint):
         Clause(
             "atmost",
             "atmost 3 in 10",
-            (
-                Part(("losses",), COUNT, "M"),
-                Part(("window",), COUNT, "K", "in", "atmost 3 in 10"),
-            ),
+            (Part(("losses",), COUNT, "M"), Part(("window",), COUNT, "K", "in", "atmost 3 in 10")),
         ),
     )
 

@@ -211,10 +211,7 @@ def test_datagrams_of_any_size_and_their_copies_arrive(delay: str) -> None:
 
 def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
     late, lossy = settings_of("delay 500ms mansd 1"), settings_of("loss worst mansd 1")
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), late)]) as one,
-    ):
+    with endpoints(V4, V4) as (server, client), running([link(name_of(server), late)]) as one:
         send_numbers(client, one.address(), 0, 4)
         one.until(lambda: one.report().forward.counters.received == 4)
         one.relay.change("test", "forward", lossy)
@@ -291,10 +288,7 @@ def test_more_clients_than_allowed_are_refused_and_counted(
 def test_a_lack_of_file_descriptors_is_reported_and_counted(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    with (
-        endpoints(*[V4] * 13) as (server, *clients),
-        running([link(name_of(server))]) as one,
-    ):
+    with endpoints(*[V4] * 13) as (server, *clients), running([link(name_of(server))]) as one:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         used = max(server.fileno(), *(client.fileno() for client in clients)) + 8
         resource.setrlimit(resource.RLIMIT_NOFILE, (used, hard))

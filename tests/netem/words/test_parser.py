@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 from netem.tc_words import parse, settings_of, text_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.words import (
-    OWN_TIME_S,
-    PERCENT,
-    RATE_BPS,
-    TIME_S,
-    percent_text,
-    time_text,
-)
+from noack.impairments.words import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percent_text, time_text
 from tests.netem.any_settings import settings, words_can_say
 
 Given = dict[str, Any]
@@ -236,14 +229,8 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("replay t.csv by chance", "by chance: by should be 'packet' or 'time'"),
         ("replay t.csv from 2", "from 2: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("replay t.csv share 101%", "share 101%: expected a percentage from 0% to 100%"),
-        (
-            "replay records 0s+1ms,2ms",
-            "expected records of sending time and delay, in whole ns",
-        ),
-        (
-            "replay records 0s+1ms,0.1ns+lost",
-            "lost: expected records of sending time",
-        ),
+        ("replay records 0s+1ms,2ms", "expected records of sending time and delay, in whole ns"),
+        ("replay records 0s+1ms,0.1ns+lost", "lost: expected records of sending time"),
         ("replay records 1s+1ms", "sent_ns: must begin with 0, must not descend"),
         ("replay records 0s+1ms,1s+1ms from 2s", "from 2s: offset_s: the trace lasts 2s"),
         ("replay records 0s+3601s", "delays_ns: must be -1 to 3600000000000, one hour"),
