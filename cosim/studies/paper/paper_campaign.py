@@ -183,11 +183,11 @@ def _measure(resolved: Scenario) -> Measures:
     t_s = _grid(run.reached_s)
     samples = run.at(t_s)
     norms = np.linalg.norm(samples.x, axis=1)
-    growth = np.exp(trigger.alpha_per_s * t_s)
+    growth = np.exp(trigger.rate_per_s * t_s)
     # e_c jumps at a delivery, so its largest value may come just before. Before event 0 there is no
     # x_c.
     before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, loop.n)
-    at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
+    at_events = run.system.norms(before) * np.exp(trigger.rate_per_s * run.event_s[1:])
     between = run.e_c_norm(samples) * growth
     gaps_s = np.diff(run.event_s)
     states = np.array([state.x for state in run.before])[run.delivered]
@@ -199,7 +199,7 @@ def _measure(resolved: Scenario) -> Measures:
         float(gaps_s.min(initial=_NEVER)),
         _median(gaps_s),
         _median(np.diff(run.event_s[run.delivered])),
-        max(between.max(), at_events.max(initial=0.0)) / trigger.beta,
+        max(between.max(), at_events.max(initial=0.0)) / trigger.level,
         float(norms[-1]) if run.diverged_at_s is None else _NEVER,
         float(norms.max() / norms[0]),
         float((norms * growth).max()),

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of, policy_of
+from noack.config.resolution import loop_of, rule_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.settings.section import Rows
@@ -49,7 +49,7 @@ def trigger_bounds(resolved: Scenario) -> TriggerBounds:
     loop = loop_of(resolved)
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     fastest = float(np.abs(np.linalg.eigvals(loop.A_model + loop.B_model @ loop.K)).max()) or 1.0
-    return TriggerBounds(policy_of(resolved).trigger_rule(loop.n), weight, fastest)
+    return TriggerBounds(rule_of(resolved), weight, fastest)
 
 
 def certify(
