@@ -130,31 +130,43 @@ def campaign(
 
 
 @cli.command(cli.THEORY, 30, [
-    ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
+    ("noack paper", "1,000 draws into runs/paper"),
     ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
     *,
-    draws: Annotated[
-        int, typer.Option(help="Number of random plants, losses and initial states.")
-    ] = 1000,
+    draws: Draws = None,
     out: Annotated[
         Path, typer.Option("--out", help="Folder for paper.md and its figures.")
     ] = cli.DEFAULT_RUNS / "paper",
     json: cli.JsonOption = False,
 ) -> int:
-    """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
-    from cosim.live.progress import PatientConsole, draws_bar
-    from cosim.studies.paper import paper_run
+    """Reproduce the paper's Section V: a page with figures, tables and verdicts.
 
-    paper_run.make_folder(out)
-    with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = paper_run.reproduce(draws, cli.cores(), progress)
-    found = paper_run.document(results, paper_run.write_page(results, out))
+    The runs are those of the campaign paper, in runs/campaigns/paper.
+    """
+    from cosim.live.progress import PatientConsole
+    from cosim.output.result_tables import terminal_table
+    from cosim.shipped_files import find_shipped
+    from cosim.studies.campaign.campaign_file import load
+    from cosim.studies.campaign.campaign_report import claims_table
+    from cosim.studies.paper import paper_page
+
+    paper_page.make_folder(out)
+    path, console = find_shipped("paper", "campaigns"), PatientConsole(stderr=True)
+    folder = cli.DEFAULT_RUNS / "campaigns" / "paper"
+    done = execute_campaign(
+        console, load(path), path, worker_pool(None), folder=folder, draws=draws
+    )
+    with console.status("computing the examples"):
+        found, files = paper_page.write_page(done, out)
+    names = [str(file) for file in files]
     if json:
-        cli.print_json(found)
+        shown = {"draws": done.summary.draws, "representative": found["representative"]}
+        cli.print_json(shown | {"claims": found["summary"]["claims"], "files": names})
     else:
-        paper_run.print_claims(cli.console(), found)
+        cli.console().print(terminal_table(claims_table(done.summary), left=range(3)))
+        print(*names, sep="\n")
     return ExitStatus.OK
 
 
