@@ -14,7 +14,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
 
 if TYPE_CHECKING:
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
     from noack.config.scenario import Scenario
     from noack.core.linear_systems import Matrix
 
@@ -236,7 +236,7 @@ def design(
 def _limits(
     settling: float, quantile: float, settle: float, bounds: list[str], under: str
 ) -> "DesignLimits":
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
 
     for option, value, most in (
         ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),

@@ -365,8 +365,8 @@ class Campaign(ScenarioSection):
             for term in (term for pair in claim.conditions for term in pair):
                 if claim.axis is not None and term.label is not None:
                     self._require_values(f"claims.{i}.holds", [(claim.axis, term.label)])
-        for axis, values in self.claims_at.items():
-            self._require_values("claims_at", ((axis, value) for value in values))
+        for name, values in self.claims_at.items():
+            self._require_values("claims_at", ((name, value) for value in values))
         return self
 
     def _check_figure(self, place: str, figure: AnyFigure) -> None:
