@@ -14,6 +14,7 @@ from cosim.output import palette
 from cosim.output.figure_description import (
     TIME,
     Axis,
+    Dash,
     FigureDescription,
     Item,
     Line,
@@ -24,7 +25,7 @@ from cosim.output.figure_description import (
     series_colour,
     time_axis,
 )
-from cosim.record.align import align_tables
+from cosim.record.align import Reals, align_tables
 from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.clock import NS_PER_S
@@ -314,7 +315,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
     ):
         items: list[Item] = []
         for k, (_, t_s, samples) in every:  # the first run is on top
-            curves = [(getattr(samples, name), ())]
+            curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
             curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
             items += [
                 Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH,

@@ -109,7 +109,7 @@ def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> li
     groups: dict[tuple[str, str], dict[str, Mapping[str, Vector]]] = {}
     for found in summary.found:
         labels = found.point.labels
-        runs: dict[str, Vector] = {**runs_at(found.point, store)[0]}
+        runs = {str(name): values for name, values in runs_at(found.point, store)[0].items()}
         for name, costs in store.columns(found.point.number, plan.cost_columns).items():
             runs[name] = np.where(np.isnan(costs), np.inf, costs)
         groups.setdefault((labels[POLICY], labels.get(DISTURBANCE, OWN)), {})[labels[LOOPS]] = runs
@@ -207,7 +207,7 @@ def live_point(
     """
     policy, count = chosen
     wanted = {POLICY: policy, LOOPS: str(count), DISTURBANCE: OWN}
-    simulated = next(one for one in found if {DISTURBANCE: OWN} | one.point.labels == wanted)
+    simulated = next(one for one in found if {DISTURBANCE: OWN, **one.point.labels} == wanted)
     point, work = simulated.point, simulated.point.work
     assert isinstance(work, SharedNetworkWork)
     changes = {"seeds": seeds_of(work.seed, 0), "name": f"{policy}-{count}"}
