@@ -105,4 +105,5 @@ def _side(term: Term, claim: Claim, group: Sequence[Point], values: Values) -> V
     if term.metric is None:
         return np.array([term.number])
     (point,) = (p for p in group if term.label is None or p.labels[claim.axis or ""] == term.label)
-    return values(point)[term.metric]
+    # A metric that the grid point does not have fulfils no condition.
+    return values(point).get(term.metric, np.array([np.nan]))

@@ -333,11 +333,14 @@ class Campaign(ScenarioSection):
 
     @property
     def measured_metrics(self) -> set[Metric]:
-        """The metrics of the tables and the figures."""
+        """The metrics of the tables, the figures and the claims."""
         of_figures = {
             getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")
         }
-        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures)}
+        of_claims = {
+            term.metric for claim in self.claims for pair in claim.conditions for term in pair
+        }
+        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures | of_claims)}
 
     @model_validator(mode="after")
     def _check(self) -> Self:

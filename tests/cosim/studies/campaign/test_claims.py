@@ -67,6 +67,15 @@ def test_medians_and_numbers_can_be_compared(write: Write, plan: dict[str, Any])
     assert judged(write, plan, number, zoh).share == pytest.approx(2 / 3)
 
 
+def test_a_metric_that_a_grid_point_does_not_have_fulfils_no_condition(
+    write: Write, plan: dict[str, Any], full: Store, campaign: Few
+) -> None:
+    plan["claims"] = [{"says": "The bound holds.", "holds": ["certificate_used < 1"]}]
+    (claim,) = summarise(load(write(plan)), full).claims
+    assert (claim.share, claim.least, claim.verdict) == (1.0, 0.0, "partly")
+    assert claim.least_at.startswith("policy ZOH")
+
+
 def test_claims_are_in_the_summary(
     write: Write, plan: dict[str, Any], full: Store, campaign: Few
 ) -> None:
