@@ -25,7 +25,7 @@ from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.live_panel import LivePanel
 from cosim.lab.runs_panel import RunsPanel
 from cosim.lab.settings_panel import SettingsPanel
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFormat, figure_width_in
 from cosim.output.glossary import TERMS
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
@@ -294,10 +294,9 @@ def csv_of(run: Exploration) -> str:
 def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
     from cosim.interactive.exploration_figure import exploration_figure
-    from cosim.output.figure_drawing import draw
     from cosim.output.figure_files import file_content
 
-    return file_content(draw(exploration_figure(shown)), kind)
+    return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
 
 
 class Step(NamedTuple):

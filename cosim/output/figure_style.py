@@ -5,14 +5,13 @@ texts must keep a size that one can read: a figure is laid out for its width, no
 This module does not use pyplot, and does not change matplotlib's global settings permanently.
 """
 
-import functools
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, NamedTuple, ParamSpec
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -20,10 +19,10 @@ from matplotlib.figure import Figure
 from cosim.output.figure_format import SCREEN_IN
 from cosim.output.palette import Colour
 
-# If matplotlib cannot write its cache, it warns in every run; the warning is of no use here.
-logging.getLogger("matplotlib").setLevel(logging.ERROR)
+# Warnings of no use here: that matplotlib cannot write its cache, and of the dates in fonts.
+for library in ("matplotlib", "fontTools"):
+    logging.getLogger(library).setLevel(logging.ERROR)
 
-P = ParamSpec("P")
 Rgb = tuple[float, float, float]
 
 INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
@@ -43,10 +42,6 @@ _SETTINGS: dict[Any, Any] = {
     "axes.linewidth": 0.8,
     "axes.spines.right": False,
     "axes.spines.top": False,
-    "axes.titlecolor": INK,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.titley": 1.0,
     "figure.dpi": 100,
     "figure.facecolor": PAPER,
     "font.family": "sans-serif",
@@ -67,6 +62,11 @@ _SETTINGS: dict[Any, Any] = {
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
+}
+_LATEX_FONTS: dict[Any, Any] = {
+    "font.family": ["cmr10", "DejaVu Serif"],  # the second one has what the first one lacks
+    "mathtext.fontset": "cm",
+    "pdf.fonttype": 42,  # publishers refuse fonts of type 3
 }
 
 
@@ -97,6 +97,8 @@ class FigureLayout(NamedTuple):
     """Factor of the widths of lines and of the sizes of markers."""
     beside_title: bool = True
     """Whether there is room for a legend beside the title; else it is below the title."""
+    latex: bool = False
+    """Whether texts have the fonts of LaTeX."""
 
     @property
     def character_in(self) -> float:
@@ -110,14 +112,14 @@ class FigureLayout(NamedTuple):
 
     def settings(self) -> dict[Any, Any]:
         """Return matplotlib's settings for these sizes."""
-        sizes = {
+        sizes: dict[Any, Any] = {
             "axes.labelsize": self.label_pt,
-            "axes.titlesize": self.title_pt,
             "font.size": self.label_pt,
             "legend.fontsize": self.text_pt,
             "xtick.labelsize": self.text_pt,
             "ytick.labelsize": self.text_pt,
         }
+        sizes |= _LATEX_FONTS if self.latex else {}
         if not self.is_paper:
             return sizes
         return sizes | {
@@ -147,10 +149,11 @@ def layout() -> FigureLayout:
 
 
 @contextmanager
-def figure_width(width_in: float) -> Iterator[None]:
-    """Draw and save figures of this width within the context."""
+def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
+    """Draw and save figures of this width, perhaps with the fonts of LaTeX, within the context."""
     is_paper = width_in < SCREEN_IN
-    token = _WIDTH.set(_of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in))
+    wanted = _of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in)
+    token = _WIDTH.set(wanted._replace(latex=latex))
     try:
         yield
     finally:
@@ -169,11 +172,11 @@ def _of_paper(width_in: float) -> FigureLayout:
 
 
 @contextmanager
-def settings(extra: Mapping[Any, Any] | None = None) -> Iterator[None]:
+def settings() -> Iterator[None]:
     """Apply only these settings within the context, regardless of the user's matplotlibrc."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
-        mpl.rcParams.update(_SETTINGS | layout().settings() | dict(extra or {}))
+        mpl.rcParams.update(_SETTINGS | layout().settings())
         # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
@@ -187,17 +190,6 @@ class NotebookFigure(Figure):
         with settings():
             self.savefig(buffer, format="png")
         return buffer.getvalue()
-
-
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a function that draws a figure: it draws with these settings."""
-
-    @functools.wraps(draw)
-    def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
-        with settings():
-            return draw(*arguments, **options)
-
-    return drawn
 
 
 def rgb(colour: Colour) -> Rgb:
