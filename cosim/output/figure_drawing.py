@@ -46,7 +46,7 @@ from cosim.output.figure_placing import (
     legend_text,
     place_panels,
 )
-from cosim.output.figure_style import PAPER, NotebookFigure, layout, rgb, settings
+from cosim.output.figure_style import PAPER, POINTS_PER_IN, NotebookFigure, layout, rgb, settings
 from cosim.record.align import Reals
 
 Shown = tuple[Artist, str]
@@ -67,7 +67,6 @@ _MOST_CELLS = 1000
 """A map of more cells is a bitmap."""
 _TOP, _DARK = 0.97, 0.6
 _EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
-_POINTS_PER_IN = 72
 _SHORTEST_LINE = 8
 _UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
 _DOLLAR = re.compile(r"(?<!\\)\$")
@@ -159,8 +158,8 @@ def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Show
             loc="lower right", bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
             bbox_transform=figure.dpi_scale_trans, ncols=len(entries),
         ))  # fmt: skip
-    title_in += mpl.rcParams["axes.titlepad"] / _POINTS_PER_IN
-    figure.text(box.left, title_in, title, weight="bold", size=space.title_pt,
+    title_in += mpl.rcParams["axes.titlepad"] / POINTS_PER_IN
+    figure.text(box.left, title_in, title, weight="bold", size=mpl.rcParams["axes.titlesize"],
                 transform=figure.dpi_scale_trans)  # fmt: skip
 
 
@@ -253,7 +252,7 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
         for x, height in zip(middles, item.heights, strict=True):
             if height:
                 axes.text(x, height, f"{height:,g}", ha="center", va="bottom",
-                          size=layout().text_pt)  # fmt: skip
+                          size=mpl.rcParams["legend.fontsize"])  # fmt: skip
     return axes.bar(middles, item.heights, widths, **style).patches[0]
 
 
@@ -428,7 +427,7 @@ def _fit_to_paper(figure: Figure) -> None:
         line.set_linewidth(line.get_linewidth() * space.line_scale)
         line.set_markersize(line.get_markersize() * space.line_scale)
         line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
-    character_in = _EM_PER_CHARACTER_OF_LABEL * space.label_pt / _POINTS_PER_IN
+    character_in = _EM_PER_CHARACTER_OF_LABEL * mpl.rcParams["axes.labelsize"] / POINTS_PER_IN
     for axes in figure.axes:
         place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
         for axis, length_in in (
