@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rich.box import HEAVY_HEAD, SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -76,7 +77,12 @@ class ResultTable(NamedTuple):
 
 
 def terminal_table(
-    table: ResultTable, *, left: Collection[int] = (0,), styles: Mapping[str, str] | None = None
+    table: ResultTable,
+    *,
+    left: Collection[int] = (0,),
+    styles: Mapping[str, str] | None = None,
+    note: str | None = None,
+    dense: bool = False,
 ) -> Table:
     """Return a table for a terminal.
 
@@ -84,10 +90,18 @@ def terminal_table(
         table: the table.
         left: numbers of the columns that begin at the left; the others end at the right.
         styles: styles of texts in the last column, by their first words.
+        note: a text below the table.
+        dense: save width, and break no words.
     """
-    shown = Table(title=escape(table.caption) if table.caption else None)
+    shown = Table(
+        title=escape(table.caption) if table.caption else None, caption=note,
+        box=SIMPLE_HEAD if dense else HEAVY_HEAD, collapse_padding=dense, pad_edge=not dense,
+    )  # fmt: skip
     for i, heading in enumerate(table.headings):
-        shown.add_column(escape(heading), justify="left" if i in left else "right")
+        words = " ".join([heading, *(row[i] for row in table.rows)]).split()
+        least = max(map(len, words)) if dense else None
+        shown.add_column(escape(heading), justify="left" if i in left else "right",
+                         min_width=least)  # fmt: skip
     for *cells, last in table.rows:
         style = next((one for word, one in (styles or {}).items() if last.startswith(word)), "")
         shown.add_row(*map(escape, cells), Text(last, style))
