@@ -243,4 +243,4 @@ def value_text(value: Any) -> str:
         return "{ " + ", ".join(f"{key} = {value_text(one)}" for key, one in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(value_text, value)) + "]"
-    return tomlkit.item(value).as_string()
+    return str(tomlkit.item(value).as_string())

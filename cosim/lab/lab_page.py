@@ -20,7 +20,7 @@ from nicegui import ui
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import Shown
-from cosim.lab.explore_panel import ExplorePanel
+from cosim.lab.explore_panel import ExplorePanel, Rows
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.live_panel import LivePanel
 from cosim.lab.runs_panel import RunsPanel
@@ -221,12 +221,8 @@ class FileMenu:
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
                 ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
             ui.menu_item("glossary", self._open_words)
-        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
-            for term, meaning in TERMS:
-                with ui.element("dt"):
-                    ui.label(term)
-                with ui.element("dd"):
-                    ui.label(meaning)
+        with ui.dialog() as self._words, ui.card():
+            Rows("lab-words", TERMS)
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
             self._name = ui.input("file name", value="my_loop.toml", validation={
@@ -264,8 +260,9 @@ class FileMenu:
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
     def _data(self) -> None:
-        if self._session.run is not None:
-            ui.download(csv_of(self._session.run).encode(), "exploration.csv", "text/csv")
+        if self._session.results is not None:
+            content = csv_of(self._session.results.run).encode()
+            ui.download(content, "exploration.csv", "text/csv")
 
     async def _figure(self, kind: FigureFormat) -> None:
         shown = self._session.shown()

@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
 
+from cosim.lab.explore_panel import Rows
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.output.figure_format import SCREEN_IN
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
@@ -139,12 +140,7 @@ class RunsPanel:
 
     def _show(self, found: Opened, directory: Path) -> None:
         show_verdict(found.verdict, directory.name)
-        with ui.element("dl").classes("lab-rows"):
-            for name, value in found.facts:
-                with ui.element("dt"):
-                    ui.label(name)
-                with ui.element("dd"):
-                    ui.label(value)
+        Rows("lab-rows", found.facts)
         with ui.expansion(f"{len(found.claims)} claims").classes("w-full"):
             for verdict, claim in found.claims:
                 ui.label(f"{verdict}: {claim}")

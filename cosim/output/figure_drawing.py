@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, MaxNLocator
@@ -147,20 +146,20 @@ def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Show
     """Write a title and a legend above a box, where there are no data."""
     space, bottom_in = layout(), figure.get_figheight() - box.top
     rows = legend_rows([label for _, label in shown], box.width)
-    right_in, title_in = box.left + box.width, bottom_in
+    right_in, title_in = box.left + box.width, 0.0
     if not space.beside_title:  # the legend is below the title, and ends where all axes end
-        right_in = space.width_in - space.right_in
-        title_in += space.legend_row_in * len(rows)
+        right_in, title_in = space.width_in - space.right_in, space.legend_row_in * len(rows)
     for number, entries in enumerate(rows):
         above = len(rows) - 1 - number
-        axes.add_artist(Legend(
-            axes, [shown[i][0] for i in entries], [legend_text(shown[i][1]) for i in entries],
+        legend = axes.legend(
+            [shown[i][0] for i in entries], [legend_text(shown[i][1]) for i in entries],
             loc="lower right", bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
             bbox_transform=figure.dpi_scale_trans, ncols=len(entries),
-        ))  # fmt: skip
-    title_in += mpl.rcParams["axes.titlepad"] / POINTS_PER_IN
-    figure.text(box.left, title_in, title, weight="bold", size=mpl.rcParams["axes.titlesize"],
-                transform=figure.dpi_scale_trans)  # fmt: skip
+        )  # fmt: skip
+        if above:  # the next row would replace it
+            axes.add_artist(legend)
+    pad_pt = POINTS_PER_IN * title_in + mpl.rcParams["axes.titlepad"]
+    axes.set_title(title, loc="left", weight="bold", y=1.0, pad=pad_pt)
 
 
 @singledispatch

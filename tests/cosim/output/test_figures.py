@@ -139,7 +139,7 @@ def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> 
             assert box.x1 <= size_in[0], name
             assert box.y1 <= size_in[1], name
             for axes in figure.axes:
-                heads = [*axes.texts, axes.yaxis.get_offset_text(), *figure.texts]
+                heads = [*axes.texts, axes.yaxis.get_offset_text(), axes._left_title]
                 for legend in legends(axes):
                     assert legend.get_window_extent().y0 >= axes.bbox.y1 - 1, name
                     heads += legend.get_texts()
@@ -212,7 +212,7 @@ def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> Non
         mode=mode, t_s=np.arange(3.0), x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=none,
         dropped=no, received_s=none, forced=no, title="one draw out of 1,000",
     )  # fmt: skip
-    assert draw(figure).texts[0].get_text() == f"{head}: one draw out of 1,000"
+    assert draw(figure).axes[0].get_title("left") == f"{head}: one draw out of 1,000"
 
 
 def test_the_controllers_state_is_drawn_from_its_first_update_on() -> None:
