@@ -244,7 +244,7 @@ class Session:
                 return
             results = DraftResults(self.draft)
             if (why := why_not_exact(scenario)) is not None:
-                self.note = f"in virtual time, which takes about a second: {why}"
+                self.note = f"in virtual time, which takes longer: {why}"
                 results.put(RUN, await self._compute("run", run_of, scenario))
             _ = results.run  # an exact one takes some milliseconds
             self.results, self.pending = results, "computing: certificate"
