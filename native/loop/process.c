@@ -29,8 +29,7 @@ static int comes_first(const noack_process *process, int64_t one, int64_t other)
 static void lower(noack_process *process, int64_t place) {
     int64_t *heap = process->heap, count = process->heap_count;
     for (int64_t below; (below = 2 * place + 1) < count; place = below) {
-        if (below + 1 < count && comes_first(process, heap[below + 1], heap[below]))
-            below++;
+        below += below + 1 < count && comes_first(process, heap[below + 1], heap[below]);
         if (!comes_first(process, heap[below], heap[place]))
             return;
         int64_t loop = heap[place];
