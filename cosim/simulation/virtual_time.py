@@ -160,7 +160,7 @@ class VirtualRun:
         kinds = {settings_key(loop): loop for loop in loops}
         self.types = {kind: tables_of(loop) for kind, loop in kinds.items()}
         """The row types of the tables of each kind of loops (:func:`settings_key`)."""
-        run_types = row_types(map(shape_of, kinds.values())) | network_tables()
+        run_types = {**row_types(map(shape_of, kinds.values())), **network_tables()}
         self.record = RecordCollector(run_types, len(loops))
         self.core: Any = self._new_core(len(loops))
         wrong = core.noack_simulation_check(self.core)

@@ -116,7 +116,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
-    int64_t count = (4 * (TERMS + 1) + 10) * square + 8 * curve
+    int64_t count = (5 * (TERMS + 1) + 10) * square + 8 * curve
                     + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
@@ -143,6 +143,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->minus_BK = take(&next, square);
     memory->D_k = take(&next, (TERMS + 1) * square);
     memory->H_k = take(&next, (TERMS + 1) * square);
+    memory->KH_k = take(&next, (TERMS + 1) * square);
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
     double **curves[] = {&memory->r, &memory->e, &memory->d,         &memory->q,
@@ -150,7 +151,6 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     for (int i = 0; i < 8; i++)
         *curves[i] = take(&next, curve);
     memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;
-    memory->one_input = exact->m == 1;
     memory->is_static = 1;
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;

@@ -51,10 +51,9 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int is_static; /* H = 0: r, d and q stay as they are between events */
     int apart;     /* d is not 0: the models differ, or */
     int renewed;   /* q is not 0: the reference is not x_c */
-    int one_input; /* m = 1: u and its coefficients are numbers, not vectors */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
-    double *H, *K, *H_k;
+    double *H, *K, *H_k, *KH_k;
     double *weight, *forecast_weight, *Q, *R; /* NULL: the identity */
     double *form, *form_signs, *gain, *gain_signs;
     /* of a plant */

@@ -28,10 +28,11 @@ static inline __attribute__((always_inline)) void expand_with(
     exact_memory *memory, models state, double factor, int begin, int end, int moves, int apart,
     int renewed) {
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
-    const double *K = memory->K, *weight = memory->weight;
+    const double *KH_k = memory->KH_k, *weight = memory->weight;
     double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
     double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
-    int quadratic = memory->quadratic, one_input = memory->one_input;
+    lanes x_c = renewed ? subtract(state.r, state.q) : state.r;
+    int quadratic = memory->quadratic;
     for (int k = begin; k <= end; k++) {
         int table = k * N * STRIDE, at = k * STRIDE;
         lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
@@ -43,13 +44,11 @@ static inline __attribute__((always_inline)) void expand_with(
             d = apart ? times(H_k + table, state.d) : d;
             q = renewed ? times(H_k + table, state.q) : q;
             store(rs + at, r);
-            store(ds + at, d);
-            store(qs + at, q);
-            lanes x_c = renewed ? subtract(r, q) : r;
-            if (one_input)
-                us[k] = first_of(K, x_c);
-            else
-                store(us + at, times(K, x_c));
+            if (apart || k == 0)
+                store(ds + at, d);
+            if (renewed || k == 0)
+                store(qs + at, q);
+            store(us + at, times(KH_k + table, x_c));
         }
         lanes x = subtract(r, e), e_s = add(e, d);
         store(es + at, e);
@@ -349,7 +348,11 @@ static void follow(exact_memory *memory, exact_run *run) {
 }
 
 /* Compute what all runs share. */
-static void share(exact_memory *memory) { powers(memory->H, memory->H_k); }
+static void share(exact_memory *memory) {
+    powers(memory->H, memory->H_k);
+    for (int at = 0; at < (TERMS + 1) * N * STRIDE; at += STRIDE)
+        store(memory->KH_k + at, times(memory->K, load(memory->H_k + at)));
+}
 
 /* Compute a plant's tables; A is (n, n), B (n, m). */
 static void prepare(exact_memory *memory, const double *A, const double *B) {
