@@ -38,8 +38,8 @@ typedef struct {               /* a search on [0, end_s] for the first crossing 
     int backward;              /* search y(end_s - s) instead of y(s); then r = 0 */
 } level_search;
 
-typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its derivative */
-    double s, excess, slope;
+typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its derivatives */
+    double s, excess, slope, bend;
 } search_point;
 
 typedef struct { /* memory of a simulation; arrays begin in the caller's scratch */

@@ -32,12 +32,15 @@ double polynomial(const double *g, int degree, double s) {
 static inline search_point look(const void *curve, const level_search *search, double s) {
     const double *g = ((const scalar_curve *)curve)->g;
     int degree = ((const scalar_curve *)curve)->degree;
-    double level = level_at(search, s), total = g[degree], slope = 0.0;
+    double level = level_at(search, s), rate = search->rate;
+    double total = g[degree], slope = 0.0, half = 0.0;
     for (int k = degree - 1; k >= 0; k--) {
+        half = half * s + slope;
         slope = slope * s + total;
         total = total * s + g[k];
     }
-    return (search_point){s, total - level, slope + search->rate * level};
+    return (search_point){
+        s, total - level, slope + rate * level, 2.0 * half - rate * rate * level};
 }
 
 /* A bound on |g''| in [0, s]: the second derivative of the sum of |g_k| s^k. */
@@ -54,7 +57,7 @@ double first_root(const double *g, int degree, const level_search *search, doubl
     scalar_curve curve = {g, degree};
     double rate = search->rate, end_s = search->end_s, ahead_s = end_s;
     double most = bend_of(g, degree, end_s);
-    search_point at = {0.0, g[0] - search->level, g[1] + rate * search->level};
+    search_point at = look(&curve, search, 0.0);
     if (at.excess > grain || (at.excess >= -grain && at.slope > 0.0))
         return 0.0;
     if (end_s <= 0.0)

@@ -93,20 +93,20 @@ static double square_integrals(const exact_memory *memory, int p, double s) {
 static double climb(
     const double *curve, int p, double low_s, double high_s, double rate, double *at_s) {
     const int climbs = 12;
-    lanes y, dy;
-    value_and_slope(curve, p, low_s, &y, &dy);
-    double low = dot(y, dy) + rate * dot(y, y);
-    double best = sqrt(dot(y, y)) * fixed_exp(rate * low_s);
+    curve_point at = point_at(curve, p, low_s);
+    double low = dot(at.y, at.dy) + rate * dot(at.y, at.y);
+    double best = sqrt(dot(at.y, at.y)) * fixed_exp(rate * low_s);
     *at_s = low_s;
-    value_and_slope(curve, p, high_s, &y, &dy);
-    double high = dot(y, dy) + rate * dot(y, y);
+    at = point_at(curve, p, high_s);
+    double high = dot(at.y, at.dy) + rate * dot(at.y, at.y);
     for (int i = 0; i < climbs; i++) {
         /* Regula falsi if the slope decreases through 0, otherwise bisection. */
         double s = 0.5 * (low_s + high_s);
         if (low > 0.0 && 0.0 > high)
             s = low_s + (high_s - low_s) * (low / (low - high));
-        value_and_slope(curve, p, s, &y, &dy);
-        double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * fixed_exp(rate * s);
+        at = point_at(curve, p, s);
+        double square = dot(at.y, at.y), slope = dot(at.y, at.dy) + rate * square;
+        double size = sqrt(square) * fixed_exp(rate * s);
         int rises = slope > 0.0 && size >= best;
         *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);
