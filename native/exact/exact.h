@@ -10,7 +10,7 @@
 enum {
     HIGHEST = 24,        /* largest degree of a state's Taylor polynomial */
     TERMS = HIGHEST + 1, /* coefficients of a curve */
-    DEGREES = 11,        /* possible degrees: 4, 6, ..., 24 */
+    DEGREES = 6,         /* possible degrees: 4, 8, ..., 24 */
     MORE = 20,           /* coefficients of eta after those that its gain reaches */
     MOST_TERMS = 2 * HIGHEST + 2 + MORE,
     MOST_STEPS = 1000000 /* of a search */
@@ -79,6 +79,7 @@ typedef struct { /* a run, or a part of one */
     int64_t event;    /* likewise: 1: an event at t_s */
     int64_t losses;   /* consecutive ones so far */
     double at_s;      /* time at which the supremum is attained */
+    double growth;    /* e^(rt) of the supremum, at the start of a piece */
 } exact_run;
 
 /* The code for a number of states; see simulator.h. */

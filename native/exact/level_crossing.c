@@ -39,8 +39,7 @@ static inline search_point look(const void *curve, const level_search *search, d
         slope = slope * s + total;
         total = total * s + g[k];
     }
-    return (search_point){
-        s, total - level, slope + rate * level, 2.0 * half - rate * rate * level};
+    return (search_point){s, total - level, slope + rate * level, 2.0 * half - rate * rate * level};
 }
 
 /* A bound on |g''| in [0, s]: the second derivative of the sum of |g_k| s^k. */

@@ -57,9 +57,9 @@ static inline search_point look_at_square(const void *curve, const level_search 
 
 /* The length of a step that skips no crossing, at most span. speed is |y'|^2, most is b. */
 static inline double safe_length(
-    double size, double radial, double speed, double level, double rate, double most,
-    double span) {
-    const double small = 0.125; /* share of the level below which |y| + |y'| q is the better bound */
+    double size, double radial, double speed, double level, double rate, double most, double span) {
+    const double small =
+        0.125; /* share of the level below which |y| + |y'| q is the better bound */
     if (size < small * level)
         return safe_step(size - level, rate * level + sqrt(speed), most, span);
     double turned = radial > 0.0 ? speed - radial * radial : speed;
@@ -90,8 +90,8 @@ static double first_exit(
         if (slope > (most + rate * rate * level) * (ahead_s - s)) {
             if (ends_below && ahead_s == end_s)
                 return NONE;
-            double turned = size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy)
-                                       : dot(at.dy, at.ddy);
+            double turned =
+                size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy) : dot(at.dy, at.ddy);
             double bent = turned / (size > 0.0 ? size : radial) - rate * rate * level;
             search_point start = {s, size - level, slope, bent};
             s = ascend(look_at_square, &own, search, start, ahead_s);

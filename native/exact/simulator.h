@@ -11,7 +11,7 @@ static const double LARGEST = 1e100; /* a state above this norm counts as diverg
 static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
 /* Length of the first search after an event, in units of the time that the error would need at its
    initial speed. */
-static const double LOOK_AHEAD = 1.25;
+static const double LOOK_AHEAD = 1.05;
 
 typedef struct { /* the comparison from the start of a piece on */
     rule_phase phase;
@@ -124,12 +124,16 @@ static double first_window(exact_memory *memory, const comparison *now, int64_t 
         double soon_s = estimate_root(memory->g, now->level, 2.0 * now->phase.rate_per_s);
         return largest_of(LOOK_AHEAD * soon_s, (double)point * memory->grid_s - t_s);
     }
-    double speed = size_of(load(memory->error + STRIDE));
+    lanes first = load(memory->error + STRIDE), second = load(memory->error + 2 * STRIDE);
+    double speed = size_of(first), rate = now->phase.rate_per_s;
     if (speed == 0.0)
         return INFINITY;
     if (memory->integrates) /* of an error that grows in proportion to time: speed s^2/2 */
         return LOOK_AHEAD * sqrt(2.0 * largest_of(threshold - now->auxiliary, 0.0) / speed);
-    return LOOK_AHEAD * threshold / speed;
+    double slope = speed + rate * threshold, half = dot(first, second) / speed;
+    half -= 0.5 * rate * rate * threshold;
+    double square = slope * slope + 4.0 * half * threshold;
+    return LOOK_AHEAD * 2.0 * threshold / (slope + sqrt(largest_of(square, 0.0)));
 }
 
 /* The time of the next event on a piece, NONE or UNRESOLVED; the integral; the next grid point. */
@@ -150,18 +154,29 @@ static double find_event(
     return phase->compares ? first_exit(memory->error, p, &search, 0, MOST_STEPS) : NONE;
 }
 
-/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. */
+/* e^(rt) of the supremum; r is 0 from some time on. */
+static double growth_at(const noack_exact *exact, double t_s) {
+    double rate = exact->fading_per_s;
+    return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
+}
+
+/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. bound: the norm does not
+   exceed its threshold; NULL: it may. */
 static int measure_supremum(
     exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
-    double ceiling) {
+    const rule_phase *bound) {
     const noack_exact *exact = memory->exact;
-    int of_state = exact->measure == NOACK_EXACT_STATE;
+    int of_state = exact->measure == NOACK_EXACT_STATE, fades = t_s < exact->fading_until_s;
     const double *curve = of_state ? memory->x : memory->weighted;
     lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
-    double rate = t_s < exact->fading_until_s ? exact->fading_per_s : 0.0;
-    double growth = fixed_exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
-    double before = run->row->sup_e_c_scaled, at_s = length_s;
-    double best = largest_of(before, size_of(last) * growth * fixed_exp(rate * length_s));
+    double rate = fades ? exact->fading_per_s : 0.0, growth = run->growth;
+    run->growth = fades ? growth_at(exact, t_s + length_s) : growth;
+    double grown =
+        t_s + length_s <= exact->fading_until_s ? run->growth : growth * fixed_exp(rate * length_s);
+    double before = run->row->sup_e_c_scaled, at_s = length_s, ceiling = INFINITY;
+    if (bound != NULL)
+        ceiling = bound->threshold * (bound->rate_per_s > 0.0 ? growth : grown);
+    double best = largest_of(before, size_of(last) * grown);
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
         best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
     if (best == UNRESOLVED)
@@ -171,11 +186,11 @@ static int measure_supremum(
     return 1;
 }
 
-/* Add a piece's contribution to a row; settled is a level of |x|, and ceiling a bound on the
-   measured norm. Return the last time on the piece at which |x| > settled; NONE; or UNRESOLVED. */
+/* Add a piece's contribution to a row; settled is a level of |x|. Return the last time on the piece
+ * at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
     exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
-    double ceiling) {
+    const rule_phase *bound) {
     noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
     int q = degree_for(memory->measured_s, length_s);
@@ -183,7 +198,7 @@ static double measure_piece(
         row->cost += square_integrals(memory, q, length_s);
     if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
         return NONE;
-    if (!measure_supremum(memory, run, end, q, t_s, length_s, ceiling))
+    if (!measure_supremum(memory, run, end, q, t_s, length_s, bound))
         return UNRESOLVED;
     if (measure != NOACK_EXACT_ROW)
         return NONE;
@@ -257,9 +272,10 @@ static void follow(exact_memory *memory, exact_run *run) {
     double start = size_of(plant_of(state)), settled = exact->settle * start;
     double t_s = run->t_s, last_s = -1.0, first_s = 0.0, auxiliary = run->auxiliary;
     int64_t status = NOACK_EXACT_UNDECIDED, point = 0;
-    int first_degree = memory->quadratic ? 2 : 1, event = run->event != 0;
+    int event = run->event != 0;
     int above = start > settled, fresh = 1, looked = 0, agree = size_of(state.d) == 0.0;
     memory->renewed = 0;
+    run->growth = growth_at(exact, t_s);
     rule_span span = {0};
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
         farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
@@ -295,7 +311,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
         memory->apart = !agree || memory->renewed;
-        expand(memory, state, 1.0 / now.scale, 0, first_degree);
+        expand(memory, state, 1.0 / now.scale, 0, 2);
         if (phase.compares && !looked) {
             if (!is_within(state, LARGEST, phase.threshold)) {
                 status = NOACK_EXACT_DIVERGED;
@@ -306,7 +322,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         }
         window_s = least(window_s, left_s);
         int p = degree_for(memory->reach_s, window_s);
-        expand(memory, state, 1.0 / now.scale, first_degree + 1, p);
+        expand(memory, state, 1.0 / now.scale, 3, p);
         double found_s = find_event(memory, &now, p, &point, t_s, window_s);
         if (found_s == UNRESOLVED)
             break;
@@ -325,13 +341,10 @@ static void follow(exact_memory *memory, exact_run *run) {
             t_s += passed_at(memory, spent_s, LARGEST, &phase);
             break;
         }
-        double ceiling = INFINITY; /* while both models agree, e_c = e_s */
-        if (agree && !memory->quadratic && phase.compares && !memory->integrates
-            && exact->measure != NOACK_EXACT_STATE)
-            ceiling = phase.threshold
-                      * fixed_exp(
-                          exact->fading_per_s * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
-        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
+        int is_bounded = agree && !memory->quadratic && phase.compares && !memory->integrates
+                         && exact->measure != NOACK_EXACT_STATE; /* e_c = e_s */
+        const rule_phase *bound = is_bounded ? &phase : NULL;
+        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, bound);
         if (within_s == UNRESOLVED)
             break;
         above = within_s == spent_s;
