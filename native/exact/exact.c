@@ -7,24 +7,25 @@
 enum { CACHE_LINE = 8 }; /* doubles */
 
 #if defined(__x86_64__)
-static const exact_code *code_for(int64_t entries) {
-    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma"))
-        return entries == 3 ? &exact_plain_3 : &exact_plain_64;
-    if (entries <= 2)
-        return &exact_fused_2;
-    if (entries <= 4)
-        return entries == 3 ? &exact_fused_3 : &exact_fused_4;
-    return entries <= 8 ? &exact_fused_8 : entries <= 16 ? &exact_fused_16 : &exact_fused_64;
-}
+static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
+                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 #else
-static const exact_code *code_for(int64_t entries) {
-    if (entries <= 2)
-        return &exact_plain_2;
-    if (entries <= 4)
-        return entries == 3 ? &exact_plain_3 : &exact_plain_4;
-    return entries <= 8 ? &exact_plain_8 : entries <= 16 ? &exact_plain_16 : &exact_plain_64;
-}
+static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
+                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
 #endif
+
+/* The code for the fewest states that suffice. */
+static const exact_code *code_for(const noack_exact *exact) {
+    const exact_code *const *code = plain;
+#if defined(__x86_64__)
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+        code = fused;
+#endif
+    while ((*code)->n < max_of(exact->n, exact->m))
+        code++;
+    return *code;
+}
 
 void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result) {
     for (int64_t j = 0; j < columns; j++, result += stride)
@@ -168,14 +169,26 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     return count;
 }
 
+/* Copy a state (3, n) to a padded one, or back. */
+static void pack(int64_t n, int64_t stride, const double *state, double *padded) {
+    memset(padded, 0, 3 * (size_t)stride * sizeof *padded);
+    for (int64_t i = 0; i < 3; i++)
+        memcpy(padded + i * stride, state + i * n, (size_t)n * sizeof *state);
+}
+
+static void unpack(int64_t n, int64_t stride, const double *padded, double *state) {
+    for (int64_t i = 0; i < 3; i++)
+        memcpy(state + i * n, padded + i * stride, (size_t)n * sizeof *state);
+}
+
 int64_t noack_exact_scratch(const noack_exact *exact) {
-    return lay_out(exact, code_for(max_of(exact->n, exact->m)), NULL);
+    return lay_out(exact, code_for(exact), NULL);
 }
 
 void noack_exact_runs(
     const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
     const int64_t *keys, noack_exact_row *rows) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n, m = exact->m, stages = exact->link == NULL ? 0 : exact->link->stage_count;
     double state[3 * NOACK_EXACT_ENTRIES];
     exact_memory memory = {0};
@@ -201,7 +214,7 @@ void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
     double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
     int64_t *statuses) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
     exact_memory memory = {0};
@@ -211,12 +224,9 @@ void noack_exact_segments(
         noack_exact_row row = {.inter_event_min_s = INFINITY};
         exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .at_s = t_s[i], .state = state};
         run.auxiliary = auxiliaries[i];
-        memset(state, 0, sizeof state);
-        for (int64_t j = 0; j < 3 * n; j++)
-            state[j / n * stride + j % n] = states[j];
+        pack(n, stride, states, state);
         code->follow(&memory, &run);
-        for (int64_t j = 0; j < 3 * n; j++)
-            states[j] = state[j / n * stride + j % n];
+        unpack(n, stride, state, states);
         t_s[i] = run.t_s;
         auxiliaries[i] = run.auxiliary;
         events[i] = run.event;
@@ -230,18 +240,17 @@ void noack_exact_sample(
     const noack_exact *exact, const double *A, const double *B, int64_t starts,
     const double *start_s, const double *start_states, int64_t count, const double *t_s,
     double *states) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n;
     exact_memory memory = {0};
     lay_out(exact, code, &memory);
     code->prepare(&memory, A, B);
     for (int64_t start = 0, sampled = 0; start < starts; start++, start_states += 3 * n) {
-        double state[3 * NOACK_EXACT_ENTRIES] = {0};
+        double state[3 * NOACK_EXACT_ENTRIES];
         int64_t end = sampled;
         while (end < count && (start + 1 == starts || t_s[end] < start_s[start + 1]))
             end++;
-        for (int64_t j = 0; j < 3 * n; j++)
-            state[j / n * code->stride + j % n] = start_states[j];
+        pack(n, code->stride, start_states, state);
         code->sample(
             &memory, state, start_s[start], end - sampled, t_s + sampled, states + 3 * n * sampled);
         sampled = end;

@@ -9,8 +9,8 @@
 enum { MOST_PIECES = 1000000 };      /* of a run */
 static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
 static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
-/* Length of the first search after an event, in units of the time that the error would need at its
-   initial speed. */
+/* Length of the first search after an event, in units of the time that the error would need by its
+   first coefficients. */
 static const double LOOK_AHEAD = 1.05;
 
 typedef struct { /* the comparison from the start of a piece on */
@@ -125,15 +125,13 @@ static double first_window(exact_memory *memory, const comparison *now, int64_t 
         return largest_of(LOOK_AHEAD * soon_s, (double)point * memory->grid_s - t_s);
     }
     lanes first = load(memory->error + STRIDE), second = load(memory->error + 2 * STRIDE);
-    double speed = size_of(first), rate = now->phase.rate_per_s;
+    double speed = size_of(first);
     if (speed == 0.0)
         return INFINITY;
     if (memory->integrates) /* of an error that grows in proportion to time: speed s^2/2 */
         return LOOK_AHEAD * sqrt(2.0 * largest_of(threshold - now->auxiliary, 0.0) / speed);
-    double slope = speed + rate * threshold, half = dot(first, second) / speed;
-    half -= 0.5 * rate * rate * threshold;
-    double square = slope * slope + 4.0 * half * threshold;
-    return LOOK_AHEAD * 2.0 * threshold / (slope + sqrt(largest_of(square, 0.0)));
+    double norm[] = {0.0, speed, dot(first, second) / speed};
+    return LOOK_AHEAD * estimate_root(norm, threshold, now->phase.rate_per_s);
 }
 
 /* The time of the next event on a piece, NONE or UNRESOLVED; the integral; the next grid point. */
