@@ -6,7 +6,7 @@ live run in which no deadline is missed. It depends on its scenario alone, bit f
 of the network couple the loops.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import (
-    NetworkRows,
-    RecordSource,
-    RowsInMemory,
-    joined,
-    without_loop,
-)
+from cosim.record.record_source import NetworkRows, RowsInMemory, joined, without_loop
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.parameter_changes import change_notice, scheduled, settings_key
@@ -313,7 +307,7 @@ def _simulated(
     return RecordedRun(common, records)
 
 
-class _LoopRows(RecordSource):
+class _LoopRows(RowsInMemory):
     """The rows of a loop, which are separated from those of the other loops when they are read.
 
     Args:
@@ -330,7 +324,8 @@ class _LoopRows(RecordSource):
         number: int,
         types: Mapping[str, np.dtype[np.void]],
     ) -> None:
-        super().__init__(types)
+        super().__init__({})
+        self.types = types
         self._record, self._packets, self._number = record, packets, number
 
     @cached_property
@@ -344,14 +339,6 @@ class _LoopRows(RecordSource):
         if not has_loop(table):  # nothing in virtual time compares clocks
             return np.zeros(0, self.types[table])
         return without_loop(self._record.of_loop(table, self._number), self.types[table])
-
-    def count(self, table: str) -> int:
-        """Return the number of rows of a table."""
-        return len(self.whole(table))
-
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order."""
-        yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:

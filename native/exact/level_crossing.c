@@ -7,7 +7,7 @@
 
    phi is convex and negative between 0 and its positive root, so a step up to that root skips no
    crossing, however short. Since h'' >= -(b + r^2 c e^(-rs)) =: -L, h increases on all of [s, a] if
-   h'(s) > L (a - s). Then it has at most one root there, and Newton's method may take any steps
+   h'(s) > L (a - s). Then it has at most one root there, and Halley's method may take any steps
    that stay within a bracket.
 
    b = sum of k(k-1) |g_k| a^(k-2) is valid on [0, a]. It is computed again if a smaller a makes it

@@ -4,16 +4,14 @@
 
        h(s + q) <= phi(q) = |y(s) + y'(s) q| + b q^2/2 - c_s (1 - r q),    c_s = c e^(-rs).
 
-   phi is convex. If phi(0) < 0 and phi(q) <= 0, then phi and h are negative in between, so a step
-   of length q skips no crossing, however short. Newton's method from the right stays right of phi's
-   root. It begins at the root that |y(s)| + (y.y'/|y|) q in place of |y(s) + y'(s) q| gives. The
-   chord from its last point to (0, phi(0)) is zero at a point left of the root: this point is the
-   step. A chord of phi lies above phi, so Newton's method may stop at any iteration: the step is
-   then shorter and equally safe.
+   |y(s) + y'(s) q| is at most |y| + |y'| q. With the radial speed v = y.y'/|y| it is also at most
+   |y| + v q + w q^2/(2 |y|), where w is |y'|^2 - v^2 if v > 0, and |y'|^2 otherwise: the first terms
+   of a square root bound it from above. So phi has a quadratic bound, which is negative up to its
+   positive root. A step of this length skips no crossing, however short.
 
    If y is not 0, h'' = (|y'|^2 - (y.y'/|y|)^2 + y.y'')/|y| - r^2 c_s >= -(b + r^2 c_s) =: -L. If
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
-   Then it has at most one root there, and Newton's method may take any steps within the interval.
+   Then it has at most one root there, and Halley's method may take any steps within the interval.
 
    b is bend() and valid on [0, a]. It is computed again if a smaller a makes it much smaller.
    Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding error, steps
