@@ -83,11 +83,11 @@ class RowsInMemory(RecordSource):
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        return len(self._rows[table])
+        return len(self.whole(table))
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order."""
-        rows = self._rows[table]
+        rows = self.whole(table)
         if columns:
             rows = rows[[name for name in rows.dtype.names or () if name in columns]]
         for first in range(0, len(rows), BATCH_ROWS):
