@@ -186,6 +186,8 @@ class LoopMachines:
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(alike or range(len(self.parts)))
+        self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
+        """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
@@ -252,6 +254,7 @@ class LoopMachines:
         """Do what a step needs before it goes on."""
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
+        self._note_counting(loop)
 
     def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
@@ -308,6 +311,7 @@ class LoopMachines:
             machine.inputs += 1
             machine.change_ns = next_change_ns(schedule)
             outputs += [_with_loop(loop, output) for output in announced]
+            self._note_counting(loop)
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
@@ -362,11 +366,17 @@ class LoopMachines:
             if len(own):
                 loop = int(own[LOOP][0])
                 self._keep_notices(loop, self.parts[loop].inspect(own))
+                self._note_counting(loop)
+
+    def _note_counting(self, loop: int) -> None:
+        if self.parts[loop].counts_every_message:
+            self._counting.add(loop)
+        else:
+            self._counting.discard(loop)
 
     def _notable(self, rows: Rows) -> Rows:
         """Return the rows that a part may have to say something about."""
-        always = [loop for loop, part in enumerate(self.parts) if part.counts_every_message]
-        notable = np.isin(rows[LOOP], always)
+        notable = np.isin(rows[LOOP], sorted(self._counting))
         if "dropouts" in (rows.dtype.names or ()):
             notable |= rows["dropouts"] > 0
         return rows[notable]
