@@ -259,7 +259,8 @@ class LoopMachines:
     def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
 
-        ``last``: the machines make no more steps.
+        ``last``: the machines make no step before the caller has used the rows, which the next step
+        overwrites.
         """
         taken: list[tuple[str, Rows]] = []
         for number, rows in self._tables.items():
@@ -362,11 +363,12 @@ class LoopMachines:
 
     def _inspect(self, rows: Rows) -> None:
         notable = self._notable(rows)
+        if not len(notable):
+            return
         for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
-            if len(own):
-                loop = int(own[LOOP][0])
-                self._keep_notices(loop, self.parts[loop].inspect(own))
-                self._note_counting(loop)
+            loop = int(own[LOOP][0])
+            self._keep_notices(loop, self.parts[loop].inspect(own))
+            self._note_counting(loop)
 
     def _note_counting(self, loop: int) -> None:
         if self.parts[loop].counts_every_message:
@@ -376,7 +378,9 @@ class LoopMachines:
 
     def _notable(self, rows: Rows) -> Rows:
         """Return the rows that a part may have to say something about."""
-        notable = np.isin(rows[LOOP], sorted(self._counting))
+        notable = np.zeros(len(rows), np.bool_)
+        if self._counting:
+            notable |= np.isin(rows[LOOP], sorted(self._counting))
         if "dropouts" in (rows.dtype.names or ()):
             notable |= rows["dropouts"] > 0
         return rows[notable]
