@@ -7,7 +7,7 @@ restarts; :func:`lives_of` finds out which of its rows are recorded, and when it
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
+from noack.config.resolution import is_of_network
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION
@@ -87,19 +88,29 @@ def report_entries(run_dir: Path) -> Entries:
         return []
 
 
-def entries_of_loop(entries: Entries, number: int) -> Entries:
-    """Return the reports as of one loop: with its own rows, and its own counters of datagrams."""
+def entries_of_loop(
+    entries: Entries, number: int, others: Callable[[int, str, int], int]
+) -> Entries:
+    """Return the reports as of one loop: with its own rows, and its own counters of datagrams.
+
+    ``others(number, table, generation)`` returns how many rows of a table of the network are of
+    other loops. Rows of the network that are missing in the record are missing in every loop.
+    """
     found = []
     for role, report in entries:
         with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):  # damaged
-            found.append((role, _of_loop(report, number)))
+            found.append((role, _of_loop(report, number, others)))
     return found
 
 
-def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
+def _of_loop(
+    report: dict[str, Any], number: int, others: Callable[[int, str, int], int]
+) -> dict[str, Any]:
     written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
+    for table in filter(is_of_network, written):
+        written[table] -= others(number, table, report.get("generation", 0))
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])
     rejected = Counter[str](channel.get("rejected"))
@@ -137,17 +148,20 @@ def joint_reports(
 
 
 def valid_reports(
-    entries: Entries, source: RecordSource
+    entries: Entries, source: RecordSource, tables: Iterable[str]
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
-    """Return the reports of the last process of each role, and those of earlier processes."""
+    """Return the reports of the last process of each role, and those of earlier processes.
+
+    They have the numbers of rows of all ``tables`` that the process fills.
+    """
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []
     for role, entry in entries:
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
-            report = report_of(role, json.dumps(entry), source.types)
-            owned = [table for table in source.types if OWNER[table] == role]
+            report = report_of(role, json.dumps(entry), tables)
+            owned = [table for table in tables if OWNER[table] == role]
             if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
                 earlier.append(report | {"process": role})
             else:

@@ -7,7 +7,6 @@ of the network couple the loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
 from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, without_loop
-from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.parameter_changes import change_notice, scheduled
 from noack.config.resolution import (
@@ -251,7 +250,7 @@ def _simulated(
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
     of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
-    packets = NetworkRows(of_network, run.phases_ns)
+    packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
     types = row_types(map(shape_of, loops))
     counts = packets.counts() | {
         table: run.record.counts(table, len(loops)) for table in types if not is_of_network(table)
@@ -264,12 +263,12 @@ def _simulated(
         own_counts = {table: int(counts[table][number]) for table in own_types}
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
-        shared = number if len(loops) > 1 else None
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=shared))
+        roles = loop_roles(len(loops))
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report("netem", of_all, {"rejected": {}})}
     common = RunRecord(
-        scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
+        scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES
     )
     return RecordedRun(common, records)
 
@@ -301,28 +300,18 @@ class _LoopRows(RecordSource):
         self._record, self._by_table, self._run_types = record, by_table, run_types
         self._packets, self._number, self._loops = packets, number, loops
 
-    @cached_property
-    def _of_network(self) -> Mapping[str, Rows]:
-        return self._packets.of_loop(self._number)
-
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        if is_of_network(table):
-            return self._of_network[table]
-        if not has_loop(table):  # nothing in virtual time compares clocks
-            return np.zeros(0, self.types[table])
-        if table not in self._by_table:
-            whole = self._run_types[table]
-            self._by_table[table] = self._record.take_by_loop(table, whole, self._loops)
-        return without_loop(self._by_table[table][self._number], self.types[table])
-
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
         return len(self.whole(table))
 
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order."""
-        yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        if is_of_network(table):
+            yield from self._packets.of_loop(table, self._number)
+        elif has_loop(table):  # nothing in virtual time compares clocks
+            if table not in self._by_table:
+                whole = self._run_types[table]
+                self._by_table[table] = self._record.take_by_loop(table, whole, self._loops)
+            yield without_loop(self._by_table[table][self._number], self.types[table])
 
 
 def _joined(batches: Sequence[Rows]) -> Rows:

@@ -7,7 +7,7 @@ difference, and answers what the core asks: for users' code, and for changes of 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,33 +48,9 @@ _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
+SEQUENCE, TIME, VECTOR = 0, 1, 2
+"""Columns of the words of a message; those of its vector have the bits of its entries."""
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
-
-
-class SentMessages(NamedTuple):
-    """Messages of a flow."""
-
-    sequences: Numbers
-    t_ns: Numbers
-    vectors: NDArray[np.float64]
-    """(k, entries)"""
-
-    def at(self, places: slice | Numbers) -> "SentMessages":
-        """Return those at some places."""
-        return SentMessages(self.sequences[places], self.t_ns[places], self.vectors[places])
-
-    def followed_by(self, more: "SentMessages") -> "SentMessages":
-        """Return these and more."""
-        if not len(self.sequences):
-            return more
-        return SentMessages(
-            np.concatenate([self.sequences, more.sequences]),
-            np.concatenate([self.t_ns, more.t_ns]),
-            np.concatenate([self.vectors, more.vectors]),
-        )
-
-
-NONE_SENT = SentMessages(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0)))
 
 
 class InputReplay:
@@ -117,7 +93,7 @@ class InputReplay:
         for place in range(len(tables), 4):
             replay.tables[place].count = 0
         order = np.ascontiguousarray(order, np.int64)
-        self._sent = np.zeros(((1 + self._is_network) * len(order), replay.sent_width), np.int64)
+        self._sent = np.empty(((1 + self._is_network) * len(order), replay.sent_width), np.int64)
         replay.order, replay.count = pointer_to(order, "int64_t *"), len(order)
         replay.sent, replay.sent_count = pointer_to(self._sent, "int64_t *"), 0
         replay.next = 0
@@ -141,13 +117,15 @@ class InputReplay:
             self._machine.take_rows()
         return int(replay.next)
 
-    def sent_in(self, flow: Flow) -> SentMessages:
-        """Return the messages of a flow that the machine sent in the newest part."""
+    def sent_in(self, flow: Flow) -> Numbers:
+        """Return the messages of a flow that the machine sent in the newest part, (k, 2 + n).
+
+        The words of a message are its sequence number, its time, and its vector's n entries.
+        """
         sent = self._sent[: self._core.sent_count]
-        entries = self._sizes.get(flow, 0)
-        words = sent[sent[:, 0] == flow][:, : _HEADER_WORDS + entries]
-        vectors = np.ascontiguousarray(words[:, _HEADER_WORDS:]).view(np.float64)
-        return SentMessages(words[:, 1].copy(), words[:, 2].copy(), vectors)
+        mine = sent[:, 0] == flow
+        words = sent if mine.all() else sent[mine]
+        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0)]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
         """Return flows and heads of the datagrams that left the network in the newest part."""
@@ -247,13 +225,18 @@ def received_columns(table: str, dtype: np.dtype[np.void]) -> list[str]:
     return ["y", "u_applied"] if "y" in names else ["x"]
 
 
-def received_vectors(table: str, rows: Rows) -> tuple[NDArray[np.float64], list[str]]:
-    """Return the vectors of the received messages, (k, n), and the names of their entries."""
+def received_words(table: str, rows: Rows) -> tuple[Numbers, list[str]]:
+    """Return the words of the received messages, (k, 2 + n), and the names of the n entries."""
     columns = received_columns(table, rows.dtype)
-    vectors = np.hstack([np.zeros((len(rows), 0)), *(rows[column] for column in columns)])
-    return vectors, [
-        entry for column in columns for entry in entry_names(column, rows[column].shape[1])
-    ]
+    names = [entry for name in columns for entry in entry_names(name, rows.dtype[name].shape[0])]
+    words = np.empty((len(rows), VECTOR + len(names)), np.int64)
+    words[:, SEQUENCE], words[:, TIME] = rows["sequence"], rows["t_ns"]
+    first = VECTOR
+    for name in columns:
+        last = first + rows.dtype[name].shape[0]
+        words[:, first:last].view(np.float64)[...] = rows[name]
+        first = last
+    return words, names
 
 
 def _recorded_table(table: str, rows: Rows) -> dict[str, Any]:
