@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from cosim.record.processes import (
     LIFE_COLUMNS,
     Life,
-    LifeNumbers,
-    RowCounts,
     entries_of_loop,
     generations,
     joint_reports,
@@ -207,15 +205,15 @@ class RunRecord:
         if role not in self._lives:
             tables, reports = self.owned_by(role), self._reports_of(role)
             parts = self.slices(*tables, columns=LIFE_COLUMNS) if tables else ()
-            self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
+            self._lives[role] = lives_of(parts, tables, self.begun_lives(role), reports)
         return self._lives[role]
 
-    def row_counts(self, role: str) -> list[RowCounts]:
-        """The numbers of rows of each generation of a process, in order."""
-        if role in self._lives or len(self.life_numbers(role).begun) > 1:
-            return [one.counts for one in self.lives(role)]
+    def row_counts(self, role: str) -> list[Life]:
+        """The generations of a process in order, of which only rows and reports may be known."""
+        if role in self._lives or len(self.begun_lives(role)) > 1:
+            return self.lives(role)
         counts = {table: self.count(table) for table in self.owned_by(role)}
-        return [RowCounts(0, counts, self._reports_of(role).get(0))]
+        return [Life(0, counts, self._reports_of(role).get(0))]
 
     def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
         """The final reports of a process, by generation."""
@@ -223,10 +221,10 @@ class RunRecord:
         earlier = [report for report in self.earlier if report["process"] == role]
         return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
-    def life_numbers(self, role: str) -> LifeNumbers:
-        """The numbers of the generations of a process."""
+    def begun_lives(self, role: str) -> list[int]:
+        """The numbers of the recorded generations of a process, ascending."""
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
-        return LifeNumbers(generations(self.source, self.owned_by(role)) if again else [0])
+        return generations(self.source, self.owned_by(role)) if again else [0]
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
@@ -235,7 +233,7 @@ class RunRecord:
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
-        return next((role for role in LOOP_ROLES if len(self.life_numbers(role).begun) > 1), None)
+        return next((role for role in LOOP_ROLES if len(self.begun_lives(role)) > 1), None)
 
     @property
     def is_network(self) -> bool:

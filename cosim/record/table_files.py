@@ -178,6 +178,15 @@ class TableFile:
             for group in range(len(self.groups)) if groups is None else groups:
                 yield self._rows(file, group, self._dtype if dtype is None else dtype)
 
+    def whole(self) -> pa.Table:
+        """Return the table as it is, with all columns of the file."""
+        with self._open() as file:
+            table = file.read()
+            table.validate(full=True)
+        for column, _ in _columns(self._dtype):
+            _require_whole(self._path, column, table.column(column))
+        return table
+
     def segments(self) -> Iterator[Segment]:
         """Yield the groups as segments."""
         for group, rows in enumerate(self.batches(with_columns(self._dtype, ("input",)))):
@@ -218,21 +227,6 @@ def _group(group: Any, places: Mapping[str, int]) -> _Group:
     if loops is None or not loops.has_min_max:
         return _Group(group.num_rows, 0, MAX_LOOPS, highest)
     return _Group(group.num_rows, int(loops.min), int(loops.max), highest)
-
-
-def read_table(path: Path, dtype: RowType) -> pa.Table:
-    """Read a table's file as it is.
-
-    Raises:
-        CallerError: the file cannot be read, or does not have all columns of that type.
-    """
-    with _readable(path):
-        table = pq.read_table(path)
-        table.validate(full=True)
-        _require_columns(path, table.schema, dtype)
-    for column, _ in _columns(dtype):
-        _require_whole(path, column, table.column(column))
-    return table
 
 
 def write_table(

@@ -6,7 +6,7 @@ recorded inputs and compares each row that the machine writes. The class explain
 difference, and answers what the core asks: for users' code, and for changes of settings.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.processes import RowCounts
+from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
@@ -293,7 +293,7 @@ class MachineReplay:
 
     def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
-        self._numbers = record.life_numbers(role)
+        self._begun = record.begun_lives(role)
         self._lives = [_LifeReplay(role, record.scenario, life) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
@@ -301,19 +301,10 @@ class MachineReplay:
     def take(self, part: Slice) -> None:
         """Replay the next part of the record."""
         self.newest = []
-        for owned, life in zip(self._by_life(part), self._lives, strict=True):
-            if any(map(len, owned.values())):
-                self.newest += life.take(owned)
-
-    def _by_life(self, part: Slice) -> Iterator[Slice]:
-        """Yield the rows of each generation."""
         owned = {table: part[table] for table in self._tables}
-        if len(self._lives) == 1:
-            yield owned
-            return
-        places = {table: self._numbers.places(rows) for table, rows in owned.items()}
-        for i in range(len(self._lives)):
-            yield {table: rows.compress(places[table] == i) for table, rows in owned.items()}
+        for own, life in zip(split_by_life(owned, self._begun), self._lives, strict=True):
+            if any(map(len, own.values())):
+                self.newest += life.take(own)
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
@@ -329,7 +320,7 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: RowCounts) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
         self._role, self._scenario, self._life = role, scenario, life
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
