@@ -103,7 +103,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
     signals = signal_statistics(record)
     return LoopSummary(
         name=scenario.name,
-        number=record.number or 0,
+        number=record.number,
         phase_s=phase_ns / NS_PER_S,
         mode=scenario.mode,
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,

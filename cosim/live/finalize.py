@@ -187,7 +187,7 @@ _stored_run = cache(load_run)
 
 
 def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
-    phase_ns = run.phases_ns[record.number or 0]
+    phase_ns = run.phases_ns[record.number]
     return summarise(record, int(ending.status), ending.reason, phase_ns)
 
 
