@@ -124,9 +124,11 @@ def latency(record: RunRecord) -> LatencyPart:
     return LatencyPart(**_quantiles(sketch), updates=len(passed_us))
 
 
+_SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+
+
 def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
-    shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
-    return {key: sketch.quantile(share) for key, share in shares.items()}
+    return dict(zip(_SHARES, sketch.quantiles(*_SHARES.values()), strict=True))
 
 
 _ARRIVES_AFTER_END_S = 0.1
@@ -230,12 +232,12 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        for life in record.lives(role):
-            if life.report is None:
-                missing[role] += life.missing_inputs
+        for place, counts in enumerate(record.row_counts(role)):
+            if counts.report is None:
+                missing[role] += record.lives(role)[place].missing_inputs
                 continue
-            for table, count in life.rows.items():
-                missing[table] += life.report["rows"][table] - count
+            for table, count in counts.rows.items():
+                missing[table] += counts.report["rows"][table] - count
     return missing
 
 

@@ -210,6 +210,13 @@ class RunRecord:
         counts = {table: self.count(table) for table in self.owned_by(role)}
         return [RowCounts(0, counts, self._reports_of(role).get(0))]
 
+    def is_complete(self, role: str) -> bool:
+        """Whether the record has all rows that a process reported, of all its generations."""
+        return all(
+            one.report is not None and one.report["rows"].items() >= one.rows.items()
+            for one in self.row_counts(role)
+        )
+
     def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
         """The final reports of a process, by generation."""
         newest = [] if role not in self.reports else [self.reports[role]]

@@ -219,6 +219,8 @@ class RunEvidence:
         found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole = self.part.whole or self.record
         for role in LOOP_ROLES:
+            if whole.is_complete(role):
+                continue
             gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"

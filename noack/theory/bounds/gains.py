@@ -209,7 +209,7 @@ class ErrorGains:
                 totals[output] += kernel.sup_on_grid()
         return totals
 
-    @property
+    @cached_property
     def decays(self) -> bool:
         """Whether e^{(H+αI)τ} decays, or is constant in a hold."""
         return not self.scaled_H.any() or spectral_abscissa(self.scaled_H) < 0
