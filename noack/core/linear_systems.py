@@ -199,16 +199,20 @@ def _same(one: Vector | None, other: Vector | None) -> bool:
 
 
 def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
-    """Return X with M X + X Mᵀ = Q, (n, n).
+    """Return X with M X + X Mᵀ = Q, for matrices or stacks of them, (…, n, n).
 
     Raises:
-        numpy.linalg.LinAlgError: there is no unique solution.
+        numpy.linalg.LinAlgError: one of them has no unique solution.
     """
-    n = len(M)
+    *lead, n, _ = M.shape
     if n > _MOST_STATES:
         from scipy.linalg import solve_continuous_lyapunov
 
+        if lead:
+            return np.array([solve_lyapunov(one, Q) for one in M])
         return np.asarray(solve_continuous_lyapunov(M, Q))
     one = np.eye(n)
-    equations = np.kron(M, one) + np.kron(one, M)
-    return np.asarray(np.linalg.solve(equations, Q.ravel()).reshape(n, n))
+    left = M[..., :, None, :, None] * one[:, None, :]
+    right = one[:, None, :, None] * M[..., None, :, None, :]
+    equations = (left + right).reshape(*lead, n * n, n * n)
+    return np.asarray(np.linalg.solve(equations, Q.reshape(n * n, 1)).reshape(M.shape))
