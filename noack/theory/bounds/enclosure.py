@@ -157,22 +157,40 @@ class Outputs(Generic[Name]):
         each = [np.broadcast_to(C, (*lead, *C.shape[-2:])) for C in matrices.values()]
         self.stacked = np.concatenate(each, axis=-2)
         self.rows = _slices(*accumulate((C.shape[-2] for C in each), initial=0))
+        self._alike = _grouped(self.rows)
         self.norms = self.norms_with(None)
 
     def norms_with(self, M: Matrix | None) -> Stack:
         """Return ‖C M‖ of each C, (…, outputs)."""
         product = self.stacked if M is None else self.stacked @ M
-        return np.stack([spectral_norm(product[..., rows, :]) for rows in self.rows], axis=-1)
+        norms = np.empty((*product.shape[:-2], len(self.rows)))
+        for places, rows in self._alike:
+            norms[..., places] = spectral_norm(product[..., rows, :])
+        return norms
 
     def each(self, norm: Callable[[Stack], Stack], values: Stack, columns: Groups) -> Stack:
         """Return a norm of each C Y, (…, rows, r, k) → (…, outputs, groups of columns, k)."""
-        return np.stack(
-            [
-                np.stack([norm(values[..., rows, group, :]) for group in columns], axis=-2)
-                for rows in self.rows
-            ],
-            axis=-3,
-        )
+        found: Stack | None = None
+        for place, rows in enumerate(self.rows):
+            for number, group in enumerate(columns):
+                norms = norm(values[..., rows, group, :])
+                if found is None:
+                    *lead, cells = norms.shape
+                    found = np.empty((*lead, len(self.rows), len(columns), cells))
+                found[..., place, number, :] = norms
+        assert found is not None
+        return found
+
+
+def _grouped(groups: Groups) -> list[tuple[list[int], NDArray[np.intp]]]:
+    """Return the places of groups of equal length, with the rows of each, (groups, rows)."""
+    lengths = [group.stop - group.start for group in groups]
+    found = []
+    for length in dict.fromkeys(lengths):
+        places = [place for place, other in enumerate(lengths) if other == length]
+        rows = np.array([range(groups[place].start, groups[place].stop) for place in places])
+        found.append((places, rows))
+    return found
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,8 @@ _CELLS = 2048
 _MOST_BINS = 1 << 16
 _ROUNDING = 1 + 1e-9
 _EPSILON = float(np.finfo(float).eps)
+_TRANSFORMED = 3 * math.log2(2 * _CELLS) * _EPSILON
+"""Times the norms of both factors, this exceeds the rounding of a convolution by transforms."""
 
 
 class Solution(NamedTuple):
@@ -186,12 +188,13 @@ class LossAccumulation:
         numbers = np.arange(1, _CELLS + 1)
         g = np.where(numbers * (self._until_s[:, None] / _CELLS) > self.delay_s, g, 0.0)
         ages = np.maximum(g, np.pad(g[:, :-1], ((0, 0), (1, 0))))
-        return {
-            output: np.array([
-                np.convolve(*pair)[:_CELLS] for pair in zip(np.atleast_2d(area), ages, strict=True)
-            ])
-            for output, area in areas.items()
-        }  # fmt: skip
+        seen, size = np.fft.rfft(ages, 2 * _CELLS), np.linalg.norm(ages, axis=-1)
+        effects = {}
+        for output, area in areas.items():
+            convolved = np.fft.irfft(np.fft.rfft(area, 2 * _CELLS) * seen)[..., :_CELLS]
+            rounding = _TRANSFORMED * np.linalg.norm(area, axis=-1) * size
+            effects[output] = np.maximum(convolved, 0.0) + rounding[:, None]
+        return effects
 
     @cached_property
     def _beyond(self) -> Mapping[str, NDArray[np.float64]]:
@@ -375,8 +378,7 @@ class ErrorInequalities:
             )
         }
         free = _columns(*(state.free for state in self._states.values()))
-        rows = np.stack(np.broadcast_arrays(*states), axis=-2)
-        return _Signals(list(self._states), free, rows, errors)
+        return _Signals(list(self._states), free, _rows(*states), errors)
 
     def _solved(self, signals: "_Signals") -> tuple[Vector, Matrix]:
         """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
@@ -410,7 +412,7 @@ class ErrorInequalities:
             F = F + np.asarray(growing.estimation)[..., None] * estimated
             fixed = growing.fixed + free + growing.input_error * beyond
             each = (of_age, (F, fixed), of_estimate, *others)
-            rows = np.stack(np.broadcast_arrays(*(row for row, _ in each)), axis=-2)
+            rows = _rows(*(row for row, _ in each))
             return solve_inequalities(rows, np.broadcast_to(
                 _columns(*(right for _, right in each)), rows.shape[:-1]
             ))  # fmt: skip
@@ -531,4 +533,16 @@ def _product(row: Vector, column: Vector) -> Vector:
 
 def _columns(*values: Vector | float) -> Matrix:
     """Return values of loops, (…), side by side, (…, k)."""
-    return np.stack(np.broadcast_arrays(*values), axis=-1)
+    found = np.empty((*np.broadcast(*values).shape, len(values)))
+    for place, value in enumerate(values):
+        found[..., place] = value
+    return found
+
+
+def _rows(*values: Vector) -> Matrix:
+    """Return vectors of loops, (…, j), one below the other, (…, k, j)."""
+    *lead, size = np.broadcast(*values).shape
+    found = np.empty((*lead, len(values), size))
+    for place, value in enumerate(values):
+        found[..., place, :] = value
+    return found
