@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import summarise_run
@@ -41,14 +42,17 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
+from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
-_LOOPS_AT_ONCE = 16
+_LOOPS_AT_ONCE = 64
+"""Loops whose certificates are computed together."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
@@ -156,15 +160,16 @@ def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[Loop
     if workers < 2 or loops * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
         records = list(run.loops)
         plain = [_loop_summary(run, record, ending) for record in records]
+        certificates = _certificates([record.scenario for record in records])
         # Written again with the results, so that none of them can cost the summary.
         _write_summary(ending.run_dir, _summary(run, ending, plain))
         yield (
-            _with_results(record, one, ending.run_dir, loops)
-            for record, one in zip(records, plain, strict=True)
+            _with_results(*each, ending.run_dir, loops)
+            for each in zip(records, plain, certificates, strict=True)
         )
         return
     with processes(workers) as pool:
-        # Consecutive loops share parts of the files, and equal certificates.
+        # Consecutive loops share parts of the files.
         width = min(max(loops // (4 * workers), 1), _LOOPS_AT_ONCE)
         blocks = (range(first, min(first + width, loops)) for first in range(0, loops, width))
         with interrupts_held():
@@ -175,11 +180,20 @@ def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[Loop
 @np.errstate(all="ignore")
 def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[LoopSummary]:
     run, found = _stored_run(ending.run_dir), []
-    for number in numbers:
+    certificates = _certificates([run.scenarios[number] for number in numbers])
+    for number, own in zip(numbers, certificates, strict=True):
         record = run.loops[number]
         summary = _loop_summary(run, record, ending)
-        found.append(_with_results(record, summary, ending.run_dir, len(run.loops)))
+        found.append(_with_results(record, summary, own, ending.run_dir, len(run.loops)))
     return found
+
+
+def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
+    """Return the certificates of loops; None if they fail, which the claims then report."""
+    try:
+        return scheduled_certificates(scenarios)
+    except Exception:
+        return [None] * len(scenarios)
 
 
 _stored_run = cache(load_run)
@@ -192,7 +206,11 @@ def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> Loo
 
 
 def _with_results(
-    record: RunRecord, summary: LoopSummary, run_dir: Path, loops: int
+    record: RunRecord,
+    summary: LoopSummary,
+    certificates: Sequence[ScenarioCertificate] | None,
+    run_dir: Path,
+    loops: int,
 ) -> LoopSummary:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
     with ReplayProcess(record, run_dir) as replaying:
@@ -202,7 +220,7 @@ def _with_results(
         except Exception as error:  # likewise
             print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
         try:
-            results |= _claim_results(record, summary)
+            results |= _claim_results(record, summary, certificates)
         except Exception as error:  # likewise
             print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
         if record.kind == "live":
@@ -212,8 +230,13 @@ def _with_results(
     return summary.with_results(**results)
 
 
-def _claim_results(record: RunRecord, summary: LoopSummary) -> dict[str, Any]:
+def _claim_results(
+    record: RunRecord,
+    summary: LoopSummary,
+    certificates: Sequence[ScenarioCertificate] | None,
+) -> dict[str, Any]:
     claims = claims_of(record)
+    claims.certificates = certificates
     longest = summary.longest_loss_burst
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))

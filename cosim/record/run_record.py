@@ -47,6 +47,7 @@ from noack.config.resolution import (
     loop_of,
     network_tables,
     resolve,
+    resolved_loops,
     run_tables,
     tables_of,
 )
@@ -55,7 +56,6 @@ from noack.config.scenario import (
     loop_names,
     loop_scenario,
     loop_sections,
-    loops_of,
     phases_ns,
 )
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
@@ -267,6 +267,11 @@ class RecordedRun:
         return phases_ns(self.scenario)
 
     @cached_property
+    def scenarios(self) -> Sequence[Scenario]:
+        """The resolved scenario of each loop."""
+        return resolved_loops(self.scenario)
+
+    @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
         return loop_names(self.scenario)
@@ -304,7 +309,7 @@ class _StoredLoops(Sequence[RunRecord]):
 
     def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
         self._network, self._stored = network, stored
-        self._loops, self._phases_ns = loops_of(network.scenario), phases_ns(network.scenario)
+        self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
         """The loop that was used last."""
@@ -325,7 +330,7 @@ class _StoredLoops(Sequence[RunRecord]):
         return self._newest
 
     def _record_of(self, number: int) -> RunRecord:
-        loop = resolve(self._loops[number])
+        loop = self._loops[number]
         is_alone, rows = len(self) == 1, self._network.source
         entries = entries_of_loop(self._entries, number)
         if not is_alone:

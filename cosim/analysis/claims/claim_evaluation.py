@@ -18,7 +18,7 @@ the last time that all of them reached, because the loop is incomplete after it.
 import importlib
 import math
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import TypeVar
@@ -57,6 +57,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
 
@@ -253,11 +254,13 @@ _PACES = {
 """By process: the table and column with the times of its steps."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class RunClaims:
     """The claims about a run, part by part; each property is computed once."""
 
     record: RunRecord
+    certificates: Sequence[ScenarioCertificate] | None = None
+    """Those of the run's scenario, if they are known."""
 
     @cached_property
     def _judged(self) -> RunRecord:
@@ -279,8 +282,11 @@ class RunClaims:
         record = self._judged
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
-        part = RunPart(record, 0.0, _seconds(first_ns), None, void_at_setpoint(record.scenario))
-        own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
+        void, certificates = void_at_setpoint(record.scenario), self.certificates
+        own = record
+        if self._setpoint is not None:
+            own, certificates = _part_of(record, record.scenario, 0, None), None
+        part = RunPart(record, 0.0, _seconds(first_ns), None, void, certificates)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns

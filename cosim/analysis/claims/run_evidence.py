@@ -80,6 +80,8 @@ class RunPart(NamedTuple):
     no input before."""
     void: Mapping[str, str] = {}
     """By scope: why there is no certificate."""
+    certificates: Sequence[ScenarioCertificate] | None = None
+    """Those of the part's scenario, if they are known."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,9 @@ class RunEvidence:
     def certificates(self) -> list[ScenarioCertificate]:
         """The certificates of the run's scenario under the scenario's schedule."""
         found, void = [], self.part.void
-        (scheduled,) = scheduled_certificates([self.record.scenario], self.part.start_error)
+        scheduled = self.part.certificates
+        if scheduled is None:
+            (scheduled,) = scheduled_certificates([self.record.scenario], self.part.start_error)
         for one in scheduled:
             if one.scope in void:
                 one = replace(one, constants=None, floor_constants=None, void=void[one.scope])
