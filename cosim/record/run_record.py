@@ -59,6 +59,7 @@ from noack.config.scenario import (
     phases_ns,
 )
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.protocol.machine_interface import RESTART
@@ -168,6 +169,7 @@ class RunRecord:
         dtype = with_columns(self.tables[table], names)
         return joined([packed(rows, dtype) for rows in chosen], dtype)
 
+    @cached_method
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
         return self.columns(
@@ -203,6 +205,7 @@ class RunRecord:
             self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
         return self._lives[role]
 
+    @cached_method
     def row_counts(self, role: str) -> list[RowCounts]:
         """The numbers of rows of each generation of a process, in order."""
         if role in self._lives or len(self.life_numbers(role).begun) > 1:
@@ -223,6 +226,7 @@ class RunRecord:
         earlier = [report for report in self.earlier if report["process"] == role]
         return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
+    @cached_method
     def life_numbers(self, role: str) -> LifeNumbers:
         """The numbers of the generations of a process."""
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)

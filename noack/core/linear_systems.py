@@ -11,7 +11,7 @@ bounds, which are enlarged by more than the rounding.
 """
 
 from bisect import bisect_right
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -77,16 +77,26 @@ def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
     return np.ascontiguousarray(both[:n, :n]), np.ascontiguousarray(both[:n, n:])
 
 
+@lru_cache(maxsize=_CACHED_STEPS)
+def _transition(generator: MatrixKey, dt_ns: int) -> Matrix:
+    return transition(matrix_of(generator), dt_ns)
+
+
 class Propagator:
     """Advances states of the autonomous system ``dz/dt = G z`` exactly; G is (n, n), per second.
 
-    Transition matrices are cached by step; a loop on a time grid has few distinct steps.
+    Transition matrices are cached by generator and step; a loop on a time grid has few distinct
+    steps, and loops of one run may have equal models.
     """
 
     def __init__(self, generator: Matrix) -> None:
         self.generator = np.array(generator, dtype=np.float64)
         self._static = not self.generator.any()
-        self.transition = lru_cache(_CACHED_STEPS)(partial(transition, self.generator))
+        self._key = matrix_key(self.generator)
+
+    def transition(self, dt_ns: int) -> Matrix:
+        """Return e^{G dt}, (n, n)."""
+        return _transition(self._key, dt_ns)
 
     def __call__(self, state: Vector, dt_ns: int) -> Vector:
         """Return e^{G dt} ``state``, shape (n,)."""

@@ -391,7 +391,12 @@ def message_of(given: Any) -> Message:
 
 def row_types(shapes: Iterable[RecordShape]) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of loops; a row begins with the number of its loop."""
-    types = tables(**asdict(largest(shapes)))
+    return _row_types(largest(shapes))
+
+
+@cache
+def _row_types(shape: RecordShape) -> Mapping[str, np.dtype[np.void]]:
+    types = tables(**asdict(shape))
     return {name: np.dtype([(LOOP, "<u2"), *kind.descr]) for name, kind in types.items()}
 
 
