@@ -217,7 +217,8 @@ class _Unmatched:
     def take(self, sent: NDArray[np.int64], arrived: NDArray[np.int64]) -> "_Unmatched":
         """Add the next numbers; one is received in the same part as it is sent, or later."""
         self._newest = max(self._newest, int(arrived.max(initial=-1)))
-        self._sent = np.setdiff1d(np.concatenate([self._sent, sent]), arrived)
+        sent = np.concatenate([self._sent, sent])
+        self._sent = sent[:0] if np.array_equal(sent, arrived) else np.setdiff1d(sent, arrived)
         return self
 
     def count(self, *, complete: bool) -> int:
