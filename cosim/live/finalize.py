@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import summarise_run
+from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
@@ -84,14 +84,14 @@ def finalize(
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         with work_bar("the record of the run") as show:
             run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
-        summary = _judged(run, ending)
+        summary, over_time = _judged(run, ending)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
             # That of an earlier attempt may be complete: it stays if there is no space for another.
             quiet = (MachineError,) if is_shown else ()
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
-                _write_recording(run, summary, run_dir, None)
+                _write_recording(run, summary, run_dir, None, over_time)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
             for name in (*names, None):
@@ -129,22 +129,33 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-def _judged(run: RecordedRun, ending: RunEnding) -> RunSummary:
-    """Judge every loop and the network; return the summary of the run."""
+class _Judged(NamedTuple):
+    """What the end of a run finds out about a loop."""
+
+    summary: LoopSummary
+    over_time: LoopOverTime | None
+    """Only of several loops; None if it could not be computed."""
+
+
+def _judged(
+    run: RecordedRun, ending: RunEnding
+) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
+    """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
     with _judged_loops(run, ending) as found, work_bar(f"claims of {loops} loops") as show:
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
-        judged = []
-        for one in found:
-            judged.append(one)
+        judged: list[_Judged] = []
+        for loop in found:
+            judged.append(loop)
             show(len(judged) / loops)
-    summary = _summary(run, ending, judged)
-    if replayed is None:
-        return summary
-    network = summary.network.model_copy(update={"replay": replayed})
-    end = _exit_after_replay(summary.exit, replayed)
-    return summary.model_copy(update={"network": network, "exit": end})
+    summary = _summary(run, ending, [loop.summary for loop in judged])
+    if replayed is not None:
+        network = summary.network.model_copy(update={"replay": replayed})
+        end = _exit_after_replay(summary.exit, replayed)
+        summary = summary.model_copy(update={"network": network, "exit": end})
+    over_time = [loop.over_time for loop in judged if loop.over_time is not None]
+    return summary, over_time if len(over_time) == loops else None
 
 
 def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) -> RunSummary:
@@ -153,18 +164,18 @@ def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) 
 
 
 @contextmanager
-def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[LoopSummary]]:
-    """Yield the summaries of the loops; those of a long run come from a process for each core."""
+def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[_Judged]]:
+    """Yield the results of the loops; those of a long run come from a process for each core."""
     timing, loops = run.scenario.timing, len(run.loops)
     workers = min(cores(), loops)
     if workers < 2 or loops * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
         records = list(run.loops)
         plain = [_loop_summary(run, record, ending) for record in records]
-        certificates = _certificates([record.scenario for record in records])
         # Written again with the results, so that none of them can cost the summary.
         _write_summary(ending.run_dir, _summary(run, ending, plain))
+        certificates = _certificates([record.scenario for record in records])
         yield (
-            _with_results(*each, ending.run_dir, loops)
+            _with_results(run, ending.run_dir, *each)
             for each in zip(records, plain, certificates, strict=True)
         )
         return
@@ -174,18 +185,22 @@ def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[Loop
         blocks = (range(first, min(first + width, loops)) for first in range(0, loops, width))
         with interrupts_held():
             found = [pool.submit(_judged_stored_loops, ending, block) for block in blocks]
-        yield (one for block in found for one in block.result())
+        yield (loop for block in found for loop in block.result())
 
 
 @np.errstate(all="ignore")
-def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[LoopSummary]:
-    run, found = _stored_run(ending.run_dir), []
+def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[_Judged]:
+    run, judged = _stored_run(ending.run_dir), []
     certificates = _certificates([run.scenarios[number] for number in numbers])
     for number, own in zip(numbers, certificates, strict=True):
         record = run.loops[number]
         summary = _loop_summary(run, record, ending)
-        found.append(_with_results(record, summary, own, ending.run_dir, len(run.loops)))
-    return found
+        judged.append(_with_results(run, ending.run_dir, record, summary, own))
+    return judged
+
+
+_stored_run = cache(load_run)
+"""The run of a worker process."""
 
 
 def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
@@ -196,25 +211,21 @@ def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertif
         return [None] * len(scenarios)
 
 
-_stored_run = cache(load_run)
-"""The run of a worker process."""
-
-
 def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
     phase_ns = run.phases_ns[record.number or 0]
     return summarise(record, int(ending.status), ending.reason, phase_ns)
 
 
 def _with_results(
+    run: RecordedRun,
+    run_dir: Path,
     record: RunRecord,
     summary: LoopSummary,
     certificates: Sequence[ScenarioCertificate] | None,
-    run_dir: Path,
-    loops: int,
-) -> LoopSummary:
+) -> _Judged:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
     with ReplayProcess(record, run_dir) as replaying:
-        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, loops)}
+        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
         try:
             results["linearisation"] = linearisation(record.scenario)
         except Exception as error:  # likewise
@@ -227,7 +238,11 @@ def _with_results(
             verdict = replaying.verdict()
             replayed = _replay(record) if verdict is None else ReplayPart(**verdict)
             results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
-    return summary.with_results(**results)
+    over_time = None
+    with suppress(Exception):  # the recording reports it
+        if len(run.loops) > 1:
+            over_time = loop_over_time(record, run.phases_ns[record.number or 0])
+    return _Judged(summary.with_results(**results), over_time)
 
 
 def _claim_results(
@@ -328,11 +343,15 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 
 
 def _write_recording(
-    run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    loop: str | None,
+    known: Sequence[LoopOverTime] | None = None,
 ) -> None:
     from cosim.output.viewer.run_recording import write_view  # imports rerun
 
-    write_view(run, summary, run_dir, loop)
+    write_view(run, summary, run_dir, loop, known)
 
 
 def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:

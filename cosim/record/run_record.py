@@ -140,6 +140,11 @@ class RunRecord:
         """Return the number of rows of a table."""
         return self.source.count(table)
 
+    @cached_property
+    def is_short(self) -> bool:
+        """Whether the whole record is one part, which is kept in memory."""
+        return not any(self.count(table) > BATCH_ROWS for table in self.tables)
+
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
 
