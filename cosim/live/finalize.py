@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import claims_of
-from cosim.analysis.claims.run_evidence import scheduled_certificates
+from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
@@ -206,7 +206,7 @@ _stored_run = cache(load_run)
 def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
     """Return the certificates of loops; None if they fail, which the claims then report."""
     try:
-        return scheduled_certificates(scenarios)
+        return certificates_together(scenarios)
     except Exception:
         return [None] * len(scenarios)
 

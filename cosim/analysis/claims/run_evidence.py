@@ -169,7 +169,7 @@ class RunEvidence:
         found, void = [], self.part.void
         scheduled = self.part.certificates
         if scheduled is None:
-            (scheduled,) = scheduled_certificates([self.record.scenario], self.part.start_error)
+            scheduled = scheduled_certificates(self.record.scenario, self.part.start_error)
         for one in scheduled:
             if one.scope in void:
                 one = replace(one, constants=None, floor_constants=None, void=void[one.scope])
@@ -302,13 +302,20 @@ class RunEvidence:
 
 
 def scheduled_certificates(
+    scenario: Scenario, start_error: float | None = None
+) -> list[ScenarioCertificate]:
+    """Return the certificates of a resolved scenario under its schedule, if it can have any.
+
+    A part of a run that starts with an input of the part before has a ``start_error``.
+    """
+    (found,) = certificates_together([scenario], start_error)
+    return found
+
+
+def certificates_together(
     scenarios: Sequence[Scenario], start_error: float | None = None
 ) -> list[list[ScenarioCertificate]]:
-    """Return the certificates of resolved scenarios under their schedules, if they can have any.
-
-    They are computed together. A part of a run that starts with an input of the part before has a
-    ``start_error``.
-    """
+    """Return the certificates of several scenarios; see :func:`scheduled_certificates`."""
     searches: list[Search[ScenarioCertificate]] = []
     numbers: list[int] = []
     for number, scenario in enumerate(scenarios):

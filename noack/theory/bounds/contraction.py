@@ -7,7 +7,7 @@ Lyapunov function. ν is computed from the final L, so rounding in the computati
 import contextlib
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +111,7 @@ def _modal_factors(generator: Matrix) -> Matrix:
     return _each(np.linalg.inv, columns)
 
 
-def _each(function: Callable[[Matrix], Matrix], stack: Matrix) -> Matrix:
+def _each(function: Callable[..., Any], stack: Matrix) -> Matrix:
     """Return a function of each matrix of a stack; NaN where it fails."""
     if np.isfinite(stack).all():
         with contextlib.suppress(np.linalg.LinAlgError):

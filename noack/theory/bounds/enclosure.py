@@ -448,10 +448,10 @@ def ranks(matrix: Matrix) -> NDArray[np.int64]:
     return _ranks(np.linalg.svd(matrix, compute_uv=False), matrix.shape)
 
 
-def _ranks(singular: Stack, shape: tuple[int, ...]) -> NDArray[np.int64]:
+def _ranks(singular: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.int64]:
     cut = singular.max(axis=-1, initial=0.0) * max(shape[-2:]) * np.finfo(float).eps
     # The omitted part is below the matrix's rounding error; a zero matrix keeps one column.
-    return np.maximum((singular > cut[..., None]).sum(axis=-1), 1)
+    return np.asarray(np.maximum((singular > cut[..., None]).sum(axis=-1), 1))
 
 
 def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> Stack:

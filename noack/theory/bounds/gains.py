@@ -16,7 +16,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,7 +200,8 @@ class ErrorGains:
         """
         numbers = np.arange(np.max(events, initial=0), dtype=np.float64)
         sups = self.kernels[output].sups(np.asarray(spacing_s)[..., None] * numbers)
-        return np.where(numbers < np.asarray(events)[..., None], sups, 0.0).sum(axis=-1)
+        missing = numbers < np.asarray(events)[..., None]
+        return np.asarray(np.where(missing, sups, 0.0).sum(axis=-1))
 
     def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
@@ -322,7 +323,7 @@ class PlantGains:
         first, *others = plants
         if not others:
             return first
-        changed = {}
+        changed: dict[str, Any] = {}
         for name in (one.name for one in fields(first)):
             values = [getattr(plant, name) for plant in plants]
             if isinstance(values[0], np.ndarray):

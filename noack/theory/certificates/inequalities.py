@@ -90,7 +90,8 @@ def solve_inequalities(F: Matrix, g: Vector) -> Solution:
     is_small = loop_gain < 1
     if not is_small.all():
         large = ~is_small
-        minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
+        with np.errstate(invalid="ignore"):
+            minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
         diagonal = np.diagonal(F[large], axis1=-2, axis2=-1)
         gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
         known = np.isfinite(gains).all(axis=-1)

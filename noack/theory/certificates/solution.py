@@ -148,13 +148,14 @@ def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
         groups[("alone", place) if likeness is None else likeness].append(place)
     answers: dict[int, list[Constants] | Exception] = {}
     for places in groups.values():
-        together: list[list[Constants] | Exception]
         try:
-            together = _solved([problems[place] for place in places])
-        except _UNSOLVED as error:  # of one of them, if there are several
-            one = [error] if len(places) == 1 else None
-            together = one or [_answers([problems[place]])[0] for place in places]
-        answers.update(zip(places, together, strict=True))
+            found = _solved([problems[place] for place in places])
+            answers.update(zip(places, found, strict=True))
+        except _UNSOLVED as error:
+            if len(places) == 1:
+                answers[places[0]] = error
+            else:  # of one of them
+                answers.update((place, _answers([problems[place]])[0]) for place in places)
     return [answers[place] for place in range(len(problems))]
 
 

@@ -195,7 +195,7 @@ class _Inequalities:
         recent = [0.0, 0.0]
         if delay_s > 0:
             recent = [
-                drive_response.through(C).integral_on_grid()
+                float(drive_response.through(C).integral_on_grid())
                 for drive_response in self._recent_drive
             ]
             bound = bound + error.kernels[output].sup(delay_s) * _A
