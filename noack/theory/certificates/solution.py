@@ -362,17 +362,6 @@ def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smalles
     return best
 
 
-def solve_parts(problem: Problem) -> list[Constants]:
-    """Return the constants of the parts of one problem.
-
-    Raises: as :func:`solve`.
-    """
-    (found,) = _answers([problem])
-    if isinstance(found, Exception):
-        raise found
-    return found
-
-
 class SharpenedBounds(NamedTuple):
     """Bounds of all times; see :class:`noack.theory.bounds.terms.Constants`."""
 
