@@ -317,6 +317,12 @@ class PlantGains:
         rank = int(ranks(self.error.weight @ self._mismatch))
         return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
 
+    @property
+    def identity(self) -> Hashable:
+        """What equal plants without disturbances have in common."""
+        own = [getattr(self, one.name) for one in fields(self)]
+        return self.likeness, *(matrix_key(one) for one in own if isinstance(one, np.ndarray))
+
     @classmethod
     def together(cls, plants: Sequence[Self]) -> Self:
         """Return several plants of equal likeness as one object; a single one is returned as is."""

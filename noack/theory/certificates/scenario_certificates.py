@@ -6,9 +6,9 @@ searches for the largest sampling period, delay and age of inputs for which a ce
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -326,7 +326,8 @@ class CertificateScope:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
             plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
-            self._plants[alpha_per_s] = replace(plant, further_outputs=self._trigger.outputs)
+            plant = replace(plant, further_outputs=self._trigger.outputs)
+            self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
@@ -334,6 +335,20 @@ class CertificateScope:
         return (yield from sharpened(
             Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
         ))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _KnownPlant:
+    """A plant, which equals others of its identity."""
+
+    identity: Hashable
+    plant: PlantGains = field(compare=False)
+
+
+@lru_cache(maxsize=16)
+def _first_equal(known: _KnownPlant) -> PlantGains:
+    """Return the first of several equal plants, whose gains the others use."""
+    return known.plant
 
 
 def _at_floor(first: Constants, share: float) -> Constants:
