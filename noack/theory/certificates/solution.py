@@ -107,6 +107,8 @@ Search = Generator[Problem, list[Constants], Found]
 
 An error of a problem is raised where it was yielded.
 """
+_TOGETHER = 256
+"""So many problems of one state are solved together: the memory grows with the squared states."""
 _UNSOLVED = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
 
 
@@ -142,12 +144,17 @@ def completed_alone(search: Search[Found]) -> Found:
 
 def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
     """Return the constants of each problem, or its error."""
-    groups = defaultdict[Hashable, list[int]](list)
+    alike = defaultdict[Hashable, list[int]](list)
     for place, problem in enumerate(problems):
         likeness = problem.likeness if len(problems) > 1 else None
-        groups[("alone", place) if likeness is None else likeness].append(place)
+        alike[("alone", place) if likeness is None else likeness].append(place)
+    groups: list[list[int]] = []
+    for places in alike.values():
+        states = len(problems[places[0]].parts[0].error.H)
+        width = max(_TOGETHER // states**2, 1)
+        groups += (places[first : first + width] for first in range(0, len(places), width))
     answers: dict[int, list[Constants] | Exception] = {}
-    for places in groups.values():
+    for places in groups:
         try:
             found = _solved([problems[place] for place in places])
             answers.update(zip(places, found, strict=True))
