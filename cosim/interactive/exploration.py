@@ -26,10 +26,9 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
-from noack.trigger.trigger_rule import TriggerRule
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.runtime.life_cycle import HORIZON
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule
 
 POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""

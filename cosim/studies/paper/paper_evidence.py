@@ -27,13 +27,11 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
-from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1
-from noack.trigger.trigger_rule import TriggerRule, error_form
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1, theorem_2
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, Any]
 Mode = Literal["model", "zoh"]
