@@ -121,8 +121,9 @@ def run_with_events(
     """
     rows, log = _run(setting, population, setting.most_events)
     assert log.states is not None
-    parts = zip(rows["transmissions"].tolist(), *log, strict=True)
-    return rows, [Events(*(part[:events] for part in own)) for events, *own in parts]
+    events = rows["transmissions"].tolist()
+    parts = zip(events, log.event_s, log.delivered, log.states, strict=True)
+    return rows, [Events(*(part[:count] for part in own)) for count, *own in parts]
 
 
 def _run(
