@@ -31,7 +31,7 @@ LINES = {
     "cosim/doctor": 800,
     "cosim/interactive": 1800,
     "cosim/lab": 2350,
-    "cosim/live": 3500,
+    "cosim/live": 3550,
     "cosim/measurement": 2900,
     "cosim/output": 8700,
     "cosim/record": 3300,
