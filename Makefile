@@ -75,7 +75,7 @@ certify: setup ## Compute the guaranteed bounds of SCENARIO and their conditions
 adversary: setup ## Search for the worst losses that SCENARIO's network may cause
 	@$(BIN)/noack adversary "$(SCENARIO)" $(ARGS)
 
-paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/ (3 minutes)
+paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/
 	@$(BIN)/noack paper --out docs $(ARGS)
 
 campaign: setup ## Run CAMPAIGN: many random draws over a grid of settings

@@ -10,6 +10,7 @@ import hashlib
 import importlib.util
 import io
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -25,8 +26,9 @@ HERE = Path(__file__).resolve().parent
 INTO = HERE.parent / "noack" / "core"
 LIBRARY, HEADER = "libnoack.so", "_core_header.py"
 _SCRATCH = ".building-"
-_SIZES = "sizes"
-"""Folder of the files that take the longest; they are begun first."""
+_STATES = "states.c"
+"""The exact simulator's code for a fixed number of states; it is compiled for each of these:"""
+_SIZES = (64, 16, 8, 4, 3, 2)
 NO_COMPILER = 3
 """Exit status if there is no C compiler."""
 # No contraction of a·b + c: results have the same bits on every processor.
@@ -124,19 +126,32 @@ def _compile(into: Path, more_flags: tuple[str, ...]) -> None:
         f'const char *noack_sources(void) {{ return "{_digest()}"; }}\n'
     )
 
-    def compile_one(file: Path) -> str:
-        result = into / "-".join(file.with_suffix(".o").parts[-3:])
-        # Code for a fixed number of states takes half the time to compile, and as long to run.
-        flags = [*FLAGS, *(("-O2",) if file.parent.name == _SIZES else ()), *more_flags]
-        subprocess.run([*command, *flags, "-c", str(file), "-o", str(result)], check=True)
-        return str(result)
+    def compile_one(unit: tuple[int, tuple[Path, tuple[str, ...]]]) -> str:
+        number, (file, own) = unit
+        result = str(into / f"{file.stem}-{number}.o")
+        subprocess.run(
+            [*command, *FLAGS, *own, *more_flags, "-c", str(file), "-o", result], check=True
+        )
+        return result
 
-    files = sorted((*sources(), digest), key=lambda file: file.parent.name != _SIZES)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        objects = [*pool.map(compile_one, files)]
+        objects = [*pool.map(compile_one, enumerate([*_units(), (digest, ())]))]
     library = str(into / LIBRARY)
     command += [*FLAGS, *more_flags, "-shared", *objects, "-lm", "-o", library]
     subprocess.run(command, check=True)
+
+
+def _units() -> list[tuple[Path, tuple[str, ...]]]:
+    """Return the files to compile, each with its own flags; those that take longest are first."""
+    states = HERE / "exact" / _STATES
+    sizes: list[tuple[str, ...]] = [(f"-DN={size}",) for size in _SIZES]
+    if platform.machine() in ("x86_64", "AMD64"):  # two sizes for processors without AVX2 and FMA
+        fused = [(*size, "-DFUSED", "-mavx2", "-mfma") for size in sizes]
+        sizes = [*fused, ("-DN=64",), ("-DN=3",)]
+    return [
+        *((states, flags) for flags in sizes),
+        *((file, ()) for file in sources() if file != states),
+    ]
 
 
 def _write_declarations(into: Path) -> None:

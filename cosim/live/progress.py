@@ -168,14 +168,6 @@ def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int
 
 
 @contextmanager
-def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show the number of completed draws."""
-    column = TextColumn("{task.completed:g}/{task.total:g} draws")
-    with _bar(console, 1, column) as update:
-        yield lambda done, total: update(completed=done, total=total)
-
-
-@contextmanager
 def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
     """Show the number of completed runs, their rate and the remaining time.
 

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -30,22 +29,16 @@ from cosim.analysis.summary_model import (
 )
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.output.run_tables import (
-    CAPTION,
-    HEADINGS,
-    TIMING_HEADINGS,
-    Numbers,
+    LOOPS_CAPTION,
     away,
     badness,
     changes_in,
-    claim_headings,
-    claim_rows,
-    key_numbers,
-    loop_row,
+    loops_table,
     network_rows,
     run_title,
     shares_network,
     short_numbers,
-    timing_rows,
+    summary_tables,
 )
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from noack.core.errors import ExitStatus
@@ -251,52 +244,35 @@ def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
 
 
-def print_numbers(console: Console, title: str, rows: Numbers) -> None:
+def print_numbers(console: Console, title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print quantities and their values."""
     console.print(terminal_table(ResultTable("numbers", title, KEY_VALUE, rows)))
 
 
 def _print_details(console: Console, summary: RunSummary) -> None:
     """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
-    (loop,) = summary.loops
-    print_numbers(console, run_title(summary), key_numbers(summary))
-    if loop.lateness_us:  # none in virtual time
-        caption = "timing in µs of wall time (missed: deadlines missed)"
-        rows = [*timing_rows(loop)]
-        console.print(terminal_table(ResultTable("timing", caption, ("", *TIMING_HEADINGS), rows)))
+    (loop,), tables = summary.loops, {table.name: table for table in summary_tables(summary)}
+    console.print(terminal_table(tables["numbers"]))
+    if "timing" in tables:
+        console.print(terminal_table(tables["timing"]))
         _print_realtime(console, loop.realtime)
     console.print("the paper's assumptions for this scenario:")
     print_assumptions(console, loop.assumptions)
-    _print_claims(console, loop.claims)
+    if "claims" in tables:
+        _print_claims(console, tables["claims"], loop.claims)
 
 
 def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> None:
     """Print the network and the loops; without ``verbose`` the worst only."""
     for line in _void_lines(summary.loops):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    kind = "" if summary.kind == "live" else f", {summary.kind}"
-    further = "".join(f", {constraint}" for constraint in summary.constraints)
-    title = f"network of {summary.scenario}, M − 1 = {summary.mansd}{further}{kind}"
-    print_numbers(console, title, tuple(network_rows(summary)))
-    loops = sorted(summary.loops, key=badness, reverse=True)
-    shown = loops if verbose else loops[:_MOST_LOOPS]
-    if len(shown) == len(loops):
-        shown = summary.loops
-    table = Table(
-        title=f"{len(loops)} loops" + (", the worst first" if len(shown) < len(loops) else ""),
-        caption=CAPTION, box=SIMPLE_HEAD,
-        collapse_padding=True, pad_edge=False,
-    )  # fmt: skip
-    rows = [loop_row(loop) for loop in shown]
-    for i, heading in enumerate(HEADINGS):
-        cells = [heading, *(row[i] for row in rows)]
-        # Headings and claims may break between words; names and numbers have no spaces.
-        least = max(len(word) for cell in cells for word in cell.split())
-        table.add_column(heading, justify="right" if i else "left", min_width=least)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console.print(table)
-    if more := len(loops) - len(shown):
+    print_numbers(console, f"network of {run_title(summary)}", network_rows(summary))
+    loops, title = summary.loops, f"{len(summary.loops)} loops"
+    if not verbose and len(loops) > _MOST_LOOPS:
+        loops = sorted(loops, key=badness, reverse=True)[:_MOST_LOOPS]
+        title += ", the worst first"
+    console.print(terminal_table(loops_table(loops, title), note=LOOPS_CAPTION, dense=True))
+    if more := len(summary.loops) - len(loops):
         console.print(f"and {more} more loops: --verbose shows all")
 
 
@@ -315,13 +291,9 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
     return lines
 
 
-def _print_claims(console: Console, claims: Sequence[Claim]) -> None:
+def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim]) -> None:
     """Print the claims about a loop and their verdicts."""
-    if not claims:
-        return
-    headings, rows = claim_headings(claims), [*claim_rows(claims)]
-    table = ResultTable("claims", "claims checked against this run", headings, rows)
-    left = [i for i, heading in enumerate(headings) if heading != "share used"]
+    left = [i for i, heading in enumerate(table.headings) if heading != "share used"]
     console.print(terminal_table(table, left=left, styles=_CLAIM_STYLES))
     if any(claim.ratio is not None for claim in claims):
         console.print(

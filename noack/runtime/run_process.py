@@ -73,8 +73,8 @@ _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_REST_SHARE = 30
-_LONGEST_REST_NS = 700_000
+_REST_SHARE = 25
+_LONGEST_REST_NS = 800_000
 """Ticks of more than a few loops that are nearer to others than this part of a period are done
 together: waking up for each takes CPU time."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight

@@ -15,7 +15,7 @@ from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
 
 if TYPE_CHECKING:
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
     from noack.config.scenario import Scenario
     from noack.core.linear_systems import Matrix
 
@@ -72,26 +72,45 @@ def campaign(
 
 
 @cli.command(cli.THEORY, 30, [
-    ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
+    ("noack paper", "1,000 draws into runs/paper"),
     ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
-    *, draws: int = 1000, out: Path = cli.DEFAULT_RUNS / "paper", json: cli.JsonOption = False
+    *,
+    draws: Annotated[int | None, Option(min=1)] = None,
+    out: Path = cli.DEFAULT_RUNS / "paper",
+    json: cli.JsonOption = False,
 ) -> int:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts.
 
+    The runs are those of the campaign paper, in runs/campaigns/paper.
+
     Options:
-        draws: Number of random plants, losses and initial states.
+        draws: Number of random plants, losses and initial states; 1,000 by default.
         out: Folder for paper.md and its figures.
     """
-    from cosim.live.progress import draws_bar, error_console
-    from cosim.studies.paper import paper_run
+    from cosim.live.progress import error_console
+    from cosim.output.result_tables import terminal_table
+    from cosim.shipped_files import find_shipped
+    from cosim.studies.campaign.campaign_file import load
+    from cosim.studies.campaign.campaign_report import claims_table
+    from cosim.studies.paper import paper_page
 
-    paper_run.make_folder(out)
-    with draws_bar(error_console()) as progress:
-        results = paper_run.reproduce(draws, cli.cores(), progress)
-    found = paper_run.document(results, paper_run.write_page(results, out))
-    cli.show(json, lambda: found, paper_run.print_claims, found)
+    paper_page.make_folder(out)
+    path, console = find_shipped("paper", "campaigns"), error_console()
+    folder = cli.DEFAULT_RUNS / "campaigns" / "paper"
+    done = execute_campaign(
+        console, load(path), path, worker_pool(None), folder=folder, draws=draws
+    )
+    with console.status("computing the examples"):
+        found, files = paper_page.write_page(done, out)
+    names = [str(file) for file in files]
+    if json:
+        shown = {"draws": done.summary.draws, "representative": found["representative"]}
+        cli.print_json(shown | {"claims": found["summary"]["claims"], "files": names})
+    else:
+        cli.console().print(terminal_table(claims_table(done.summary), left=range(3)))
+        print(*names, sep="\n")
     return ExitStatus.OK
 
 
@@ -172,7 +191,7 @@ def design(
 def _limits(
     settling: float, quantile: float, settle: float, bounds: list[str], under: str
 ) -> "DesignLimits":
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
 
     for option, value, most in (
         ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),

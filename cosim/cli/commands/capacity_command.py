@@ -73,8 +73,7 @@ def capacity(
     """
     from cosim.live.progress import error_console
     from cosim.output.figure_format import figure_files
-    from cosim.studies.capacity import capacity_live, capacity_page
-    from cosim.studies.capacity.capacity_criteria import capacities
+    from cosim.studies.capacity import capacity_page, capacity_result
     from cosim.studies.capacity.capacity_plan import QUICK, THOROUGH
 
     start = worker_pool(workers)
@@ -90,7 +89,7 @@ def capacity(
         cli.find_scenario(scenario), settings or [], policy or [], depth, loops=loops,
         rate_bps=rate_bps, period_s=update_period, deadline_s=late_after, seed=seed,
     )  # fmt: skip
-    chosen = capacity_live.chosen_points(confirm, plan)
+    chosen = capacity_result.chosen_points(confirm, plan)
     name = f"{plan.scenario.name}-thorough" if thorough else plan.scenario.name
     folder = out or cli.DEFAULT_RUNS / "capacity" / name
     console = error_console()
@@ -100,9 +99,9 @@ def capacity(
     for policy_name, count in chosen:
         with console.status(f"live: {policy_name}, {count} loops"):
             at = policy_name, count
-            points.append(capacity_live.live_point(at, done.summary.found, folder / "live"))
+            points.append(capacity_result.live_point(at, done.summary.found, folder / "live"))
     result = capacity_page.CapacityResult(
-        plan, done.summary, capacities(plan, done.summary, done.store), points
+        plan, done.summary, capacity_result.capacities(plan, done.summary, done.store), points
     )
     files = [*capacity_page.write(result, folder, files_of_figures), *done.files]
     about = {"thorough": thorough, "estimated_s": estimated_s, "made": done.made}
@@ -118,24 +117,24 @@ def _announce(
 ) -> float:
     """Print on standard error what is computed and about how long it takes; return the seconds."""
     from cosim.studies.campaign.campaign_grid import grid
-    from cosim.studies.capacity import capacity_criteria
+    from cosim.studies.capacity import capacity_result
     from cosim.studies.capacity.capacity_plan import THOROUGH
 
     points = grid(plan.campaign(), Path("noack capacity"))
     longer = plan if thorough else plan.with_depth(THOROUGH)
-    missing = capacity_criteria.missing_loops(plan, points, folder)
+    missing = capacity_result.missing_loops(plan, points, folder)
     if not missing:
         return 0.0
-    cpu_s = capacity_criteria.cpu_per_loop_s(points)
-    estimated_s = capacity_criteria.estimated_s(missing, cpu_s, workers)
-    longer_s = capacity_criteria.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
+    cpu_s = capacity_result.cpu_per_loop_s(points)
+    estimated_s = capacity_result.estimated_s(missing, cpu_s, workers)
+    longer_s = capacity_result.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
     of_live = f", and {live} live" if live else ""
     idle = "an idle core" if workers == 1 else f"{workers} idle cores"
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
         f"with {min(plan.sizes):,} to {max(plan.sizes):,} loops{of_live}; the simulation takes "
-        f"about {capacity_criteria.time_text(estimated_s)} on {idle}"
-        + ("" if longer == plan else f"; --thorough: {capacity_criteria.time_text(longer_s)}")
+        f"about {capacity_result.time_text(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {capacity_result.time_text(longer_s)}")
     )
     return estimated_s
 

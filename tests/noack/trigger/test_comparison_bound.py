@@ -12,7 +12,7 @@ from noack.trigger.comparison_bound import comparison_bound
 from noack.trigger.dynamic import DynamicSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
-from noack.trigger.quadratic import QuadraticTrigger
+from tests.trigger_rules import quadratic_rule
 
 EPSILON = 0.3
 SCENARIO: dict[str, Any] = {
@@ -32,7 +32,7 @@ def test_no_e_s_at_which_a_quadratic_rule_is_silent_exceeds_the_bound(seed: int,
     Q = rng.uniform(-1, 1, (2 * n, 2 * n))
     Q = Q + Q.T
     Q[n:, n:] += 3 * np.eye(n)
-    bounded = comparison_bound(QuadraticTrigger(Q, 10**7, EPSILON, 0, W).trigger_rule(n), W)
+    bounded = comparison_bound(quadratic_rule(Q, 10**7, EPSILON, 0, W), W)
     assume(bounded is not None)
     assert bounded is not None
     for _ in range(20):
@@ -54,7 +54,7 @@ def test_rules_that_leave_e_s_unbounded_set_no_bound(
     model = ModelMatrices(np.zeros((2, 2)), np.eye(2), -np.eye(2))
     settings = kind.example(2)
     assert settings is not None
-    rule = settings.trigger_policy(model).trigger_rule(2)
+    rule = settings.trigger_policy(model)
     assert comparison_bound(rule, np.eye(2)) is None
 
 
@@ -63,6 +63,6 @@ def test_the_same_threshold_from_a_later_origin() -> None:
     trigger = {"policy": "deadline", "rule": rule, "interval_s": 1.0}
     late = validate(SCENARIO | {"trigger": trigger}, "test").trigger.at_origin(3.0)
     model = ModelMatrices(np.zeros((1, 1)), np.eye(1), -np.eye(1))
-    found = late.trigger_policy(model).trigger_rule(1)
+    found = late.trigger_policy(model)
     assert found.level == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)
     assert found.longest_ns == 10**9
