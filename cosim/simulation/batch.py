@@ -121,7 +121,8 @@ def run_with_events(
     """
     rows, log = _run(setting, population, setting.most_events)
     assert log.states is not None
-    parts = zip(rows["transmissions"].tolist(), *log, strict=True)
+    counts = rows["transmissions"].tolist()
+    parts = zip(counts, log.event_s, log.delivered, log.states, strict=True)
     return rows, [Events(*(part[:events] for part in own)) for events, *own in parts]
 
 
