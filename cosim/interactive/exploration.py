@@ -28,7 +28,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.runtime.life_cycle import HORIZON
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule
 
 POINTS = 400
 """Number of evenly spaced times; each event adds the times just before and after it."""
@@ -164,9 +164,9 @@ def _stacked(states: tuple[LoopState, ...]) -> tuple[Vector, Matrix, Matrix, Mat
 def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
     """Return the trigger's threshold at times (k,), if it is a function of time."""
     trigger = policy_of(resolved)
-    if not isinstance(trigger, DecayingTrigger):
+    if not (isinstance(trigger, TriggerRule) and trigger.is_decaying):
         return None
-    decaying: Vector = trigger.beta * np.exp(-trigger.alpha_per_s * t_s)
+    decaying: Vector = trigger.level * np.exp(-trigger.rate_per_s * t_s)
     return np.maximum(decaying, trigger.floor)
 
 

@@ -282,7 +282,7 @@ def _lateness(record: RunRecord) -> FigureDescription:
     scenario = record.scenario
     period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
     late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
-    maxima = {role: sketch.quantile(1.0) for role, sketch in late_us.items()}
+    maxima = {role: sketch.quantiles(1.0)[0] for role, sketch in late_us.items()}
     longest = ", ".join(
         f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
     )

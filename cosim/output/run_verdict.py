@@ -74,17 +74,25 @@ class VerdictLine(NamedTuple):
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     """Return how the run ended, the transmissions of its loops, and their claims."""
     loops = summary.loops
-    events, delivered = (
-        sum(getattr(one, key) for one in loops) for key in ("events", "deliveries")
-    )
+    events, delivered = sum(one.events for one in loops), sum(one.deliveries for one in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
     return (
         ending_line(summary.exit, summary.reached_s, summary.horizon_s),
         transmission_line(events, delivered, ideal),
-        _claims([claim for one in loops for claim in one.claims]),
+        _claims([claim for one in loops for claim in one.claims], _first_violation(summary)),
     )
+
+
+def _first_violation(summary: RunSummary) -> tuple[str, float] | None:
+    """Return the first reason of the void claims of a single loop, and since when it holds."""
+    if shares_network(summary):
+        return None
+    (loop,) = summary.loops
+    why = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
+    found = (one for one in loop.assumption_violations if one.what == why and one.cause in CAUSES)
+    return next(((one.what, one.t_s) for one in found), None)
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
@@ -105,8 +113,8 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(claims: Sequence[Claim]) -> VerdictLine:
-    """Count the claims by verdict, each with its first reason."""
+def _claims(claims: Sequence[Claim], violation: tuple[str, float] | None) -> VerdictLine:
+    """Count the claims by verdict, each with its first reason; of void ones since when."""
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
     counts = Counter(str(claim.verdict) for claim in claims)
@@ -114,7 +122,8 @@ def _claims(claims: Sequence[Claim]) -> VerdictLine:
     for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
         if counts[name]:
             style = colour if style == GOOD else style
-            parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
+            since = f" from {violation[1]:.3f} s on" if violation and name == "void" else ""
+            parts.append(f"{counts[name]} {name}{since}{_reason(claims, name)}")
     return VerdictLine(", ".join(parts), style)
 
 
@@ -141,15 +150,14 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    violations = loop.assumption_violations
+    stated = _first_violation(summary)  # by the verdict
+    violations = [one for one in loop.assumption_violations if (one.what, one.t_s) != stated]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
         severe = one.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
-    if len(violations) > _MOST_VIOLATIONS:
-        yield Remark(
-            f"{len(violations) - _MOST_VIOLATIONS} more violations of this kind", severe=True
-        )
+    if (more := len(violations) - _MOST_VIOLATIONS) > 0:
+        yield Remark(f"{more} more violations of this kind", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
