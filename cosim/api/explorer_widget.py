@@ -115,18 +115,14 @@ class ExplorerWidget:
 
     def _show_controls(self) -> None:
         controls = controls_of(self._results.draft)
-        shape = (
-            *((one.key, one.value, tuple(one.options)) for one in controls.choices),
-            *((one.key, one.ends) for one in controls.sliders),
-        )
         self._known = {one.key: one for one in controls.sliders}
-        if shape == self._shape:
+        if controls.shape == self._shape:
             for one in controls.sliders:
                 made = self._inputs[one.key]
                 if abs(one.place(made.value) - one.position) > one.step / 2:
                     made.value = one.value
             return
-        self._shape, self._inputs = shape, {}
+        self._shape, self._inputs = controls.shape, {}
         rows: list[widgets.Widget] = [self._choice(one) for one in controls.choices]
         for one in controls.sliders:
             self._inputs[one.key] = self._slider(one)

@@ -114,6 +114,14 @@ class Controls:
     choices: tuple[Choice, ...]
     sliders: tuple[Slider, ...]
 
+    @property
+    def shape(self) -> tuple[object, ...]:
+        """What decides which elements are shown; with equal shapes only values differ."""
+        return (
+            *((choice.key, choice.value, *choice.options) for choice in self.choices),
+            *((slider.key, *slider.ends) for slider in self.sliders),
+        )
+
 
 _GREEK = {"alpha_per_s": "α, decay of the threshold [1/s]", "beta": "β, threshold at the start",
           "floor": "ε, smallest threshold", "period_s": "period [s]"}  # fmt: skip

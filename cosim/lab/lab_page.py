@@ -3,7 +3,6 @@
 The page itself, then its menu of files and its tutorial.
 """
 
-import csv
 import io
 import json
 import re
@@ -15,7 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from nicegui import ui
+from pyarrow import csv
 
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
@@ -29,6 +30,7 @@ from cosim.output.figure_format import FigureFormat, figure_width_in
 from cosim.output.glossary import TERMS
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
+from noack.core.linear_systems import Vector
 
 _FOLDER = Path(__file__).parent
 _EXPLORE, _LIVE, _RUNS, _TUTORIAL = "explore", "run live", "recorded runs", "tutorial"
@@ -261,7 +263,7 @@ class FileMenu:
 
     def _data(self) -> None:
         if self._session.results is not None:
-            content = csv_of(self._session.results.run).encode()
+            content = csv_of(self._session.results.run)
             ui.download(content, "exploration.csv", "text/csv")
 
     async def _figure(self, kind: FigureFormat) -> None:
@@ -271,20 +273,15 @@ class FileMenu:
             ui.download(content, f"exploration.{kind}")
 
 
-def csv_of(run: Exploration) -> str:
+def csv_of(run: Exploration) -> bytes:
     """Return the curves of a run as CSV."""
-    n = run.x.shape[1]
-    heads = ["t_s", *(f"{name}_{i + 1}" for name in ("x", "x_s", "x_c") for i in range(n))]
-    columns = [run.t_s[:, None], run.x, run.x_s, run.x_c]
-    for name, one in (("e_s_norm", run.e_s_norm), ("e_c_norm", run.e_c_norm),
-                      ("threshold", run.threshold)):  # fmt: skip
-        if one is not None:
-            heads.append(name)
-            columns.append(one[:, None])
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(heads)
-    writer.writerows(np.hstack(columns).tolist())
+    columns: dict[str, Vector | None] = {"t_s": run.t_s}
+    for name, states in (("x", run.x), ("x_s", run.x_s), ("x_c", run.x_c)):
+        columns |= {f"{name}_{i}": values for i, values in enumerate(states.T, start=1)}
+    columns |= {"e_s_norm": run.e_s_norm, "e_c_norm": run.e_c_norm, "threshold": run.threshold}
+    known = {name: np.ascontiguousarray(v) for name, v in columns.items() if v is not None}
+    text = io.BytesIO()
+    csv.write_csv(pa.table(known), text)
     return text.getvalue()
 
 

@@ -99,11 +99,7 @@ class SettingsPanel:
             controls = controls_of(self._draft)
         except DraftError:
             return  # the mistakes are shown; the sliders stay
-        shape = (
-            *((one.key, tuple(one.options)) for one in controls.choices),
-            *((one.key, one.ends) for one in controls.sliders),
-        )
-        if shape == self._shape:
+        if controls.shape == self._shape:
             for slider in controls.sliders:
                 _, element, shown = self._sliders[slider.key]
                 self._sliders[slider.key] = (slider, element, shown)
@@ -111,7 +107,7 @@ class SettingsPanel:
                 if abs(element.value - slider.position) > slider.step / 2:
                     element.set_value(slider.position)
             return
-        self._shape, self._sliders = shape, {}
+        self._shape, self._sliders = controls.shape, {}
         self._controls.clear()
         with self._controls:
             for choice in controls.choices:

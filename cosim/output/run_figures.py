@@ -16,7 +16,7 @@ from cosim.analysis.claims.claim_evaluation import claims_of
 from cosim.analysis.loop_statistics import latency_us, lateness_parts
 from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
 from cosim.analysis.summary_model import InFlightPart, RunSummary
-from cosim.analysis.value_reduction import QuantileSketch, decimate, decimate_all
+from cosim.analysis.value_reduction import QuantileSketch, decimate_all
 from cosim.output import palette, signal_figures
 from cosim.output.figure_description import (
     Axis,
@@ -39,6 +39,7 @@ from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RecordedRun, RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import row_norms
 from noack.core.number_format import number
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import (
@@ -139,14 +140,17 @@ def _from_first_update(run: AlignedRun, record: RunRecord) -> AlignedRun:
     )
 
 
-def _reduced(record: RunRecord, table: str, column: str) -> tuple[Reals, Reals]:
-    """Return times in s (k,) and a vector column (k, n), reduced like the aligned samples."""
-    t_s, values = [np.zeros(0)], [np.zeros((0, record.tables[table][column].shape[0]))]
+@np.errstate(all="ignore")  # a run may diverge
+def _reduced(
+    record: RunRecord, table: str, column: str, curves: Callable[[Reals], Reals] = np.asarray
+) -> tuple[Reals, Reals]:
+    """Return times in s (k,) and curves of a vector column (k, …), reduced like the samples."""
+    t_s, values = [np.zeros(0)], [curves(np.zeros((0, *record.tables[table][column].shape)))]
     for rows in record.source.batches(table, ("t_ns", column)):
-        part_s = _seconds(rows["t_ns"])
-        keep = decimate_all(part_s, rows[column], record.slice_columns)
+        part_s, part = _seconds(rows["t_ns"]), curves(rows[column])
+        keep = decimate_all(part_s, part.reshape(len(part), -1), record.slice_columns)
         t_s.append(part_s[keep])
-        values.append(rows[column][keep])
+        values.append(part[keep])
     return np.concatenate(t_s), np.concatenate(values)
 
 
@@ -214,24 +218,12 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Line]) -> Figure
 
 
 def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
-    t_s, x_norm = _state_norms(record)
+    t_s, x_norm = _reduced(record, PLANT_STEP, "x", row_norms)
     return signal_figures.state_norm_figure(t_s, x_norm, bounds).captioned(
         "Norm of the plant's state." + _dashed(bounds),
         "Norm of the state over time on a logarithmic axis"
         + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
     )
-
-
-@np.errstate(all="ignore")
-def _state_norms(record: RunRecord) -> tuple[Reals, Reals]:
-    """Return times in s, (k,), and norms of the plant's state, (k,), reduced."""
-    t_s, norms = [np.zeros(0)], [np.zeros(0)]
-    for steps in record.source.batches(PLANT_STEP, ("t_ns", "x")):
-        part_s, x_norm = _seconds(steps["t_ns"]), np.linalg.norm(steps["x"], axis=1)
-        keep = decimate(part_s, x_norm, record.slice_columns)
-        t_s.append(part_s[keep])
-        norms.append(x_norm[keep])
-    return np.concatenate(t_s), np.concatenate(norms)
 
 
 def _input(record: RunRecord) -> FigureDescription:

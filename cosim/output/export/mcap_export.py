@@ -5,6 +5,7 @@ time of its row, its publish time the nominal one, both in simulated nanoseconds
 epoch.
 """
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,8 +31,11 @@ SUFFIX = ".mcap"
 _CHUNK_BYTES = 2**20
 ERRORS, LOG = "/loop/errors", "/log"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_HEX = "^([0-9a-f]{2})*$"
 _REAL: dict[str, Any] = {"type": ["number", "null"]}  # null: not finite
 _TABLES = {table.name: table for table in TABLES}
+_SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes())
+"""Of the messages that are no rows of a table."""
 Message = tuple[int, int, int, bytes]
 """Log time, publish time, sequence, and content."""
 
@@ -132,7 +136,7 @@ def _write_log(writer: "Writer", run: ExportedRun) -> None:
     """Write the lines of the run's log as foxglove.Log."""
     if not run.record.notices:
         return
-    channel = _channel(writer, run, LOG, LOG_SCHEMA)
+    channel = _channel(writer, run, LOG, _SCHEMAS["log"])
     for number, notice in enumerate(run.record.notices):
         t_ns = max(int(notice["t_ns"]), 0)
         content = {
@@ -149,7 +153,7 @@ def _write_log(writer: "Writer", run: ExportedRun) -> None:
 @np.errstate(all="ignore")  # a run may diverge
 def _write_errors(writer: "Writer", run: ExportedRun) -> None:
     """Write the norms of the errors at each measurement."""
-    channel, number = _channel(writer, run, ERRORS, ERRORS_SCHEMA), 0
+    channel, number = _channel(writer, run, ERRORS, _SCHEMAS["errors"]), 0
     for part in aligned_parts(run.record):
         aligned = part.aligned
         columns = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
@@ -183,7 +187,10 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, Any]:
         unit = described[name].unit
         text = described[name].meaning + (f" [{unit}]" if unit else "")
         properties[name] = {**_type(name, rows[name]), "description": text}
-    return _object(f"noack.{table}", _TABLES[table].row, properties)
+    return {
+        "$schema": _DIALECT, "title": f"noack.{table}", "description": _TABLES[table].row,
+        "type": "object", "properties": properties, "required": [*properties],
+    }  # fmt: skip
 
 
 def _type(name: str, field: np.dtype[Any]) -> dict[str, Any]:
@@ -194,38 +201,3 @@ def _type(name: str, field: np.dtype[Any]) -> dict[str, Any]:
         return dict(one)
     size = field.shape[0]
     return {"type": "array", "items": one, "minItems": size, "maxItems": size}
-
-
-_HEX = "^([0-9a-f]{2})*$"
-
-
-def _object(title: str, description: str, properties: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "$schema": _DIALECT, "title": title, "description": description, "type": "object",
-        "properties": properties, "required": [*properties],
-    }  # fmt: skip
-
-
-ERRORS_SCHEMA = _object(
-    "noack.errors",
-    "norms of the errors at a measurement",
-    {
-        "t_ns": {"type": "integer", "description": "time of the measurement [ns]"},
-        "e_s_norm": {**_REAL, "description": "‖W(x_s − x)‖ before a reset"},
-        "threshold": {**_REAL, "description": "value above which there is an event"},
-        "e_c_norm": {**_REAL, "description": "‖W(x_c − x)‖; null without controller records"},
-    },
-)
-_INTEGER, _TEXT = {"type": "integer"}, {"type": "string"}
-LOG_SCHEMA = _object(
-    "foxglove.Log",
-    "a line of the run's log",
-    {
-        "timestamp": {
-            "type": "object", "title": "time",
-            "properties": {"sec": dict(_INTEGER), "nsec": dict(_INTEGER)},
-        },
-        "level": dict(_INTEGER), "message": dict(_TEXT), "name": dict(_TEXT),
-        "file": dict(_TEXT), "line": dict(_INTEGER),
-    },
-)  # fmt: skip

@@ -62,7 +62,7 @@ def test_controls_have_names_and_text_has_contrast(
     page.wait(
         f"getComputedStyle(document.querySelector('.cm-editor')).backgroundColor {EDITOR[scheme]}"
     )
-    page.wait(f"{TEXT}.includes('assumed: ')")
+    page.wait(f"{TEXT}.includes('assumed (')")
     for tab in TABS:
         page.click(tab, ".q-tab")
         page.wait(f"document.querySelector('.q-tab--active').innerText.trim() === {tab!r}")
