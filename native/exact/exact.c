@@ -7,21 +7,35 @@
 enum { CACHE_LINE = 8 }; /* doubles */
 
 #if defined(__x86_64__)
+#include <cpuid.h>
+
+static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
+
+/* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
+   With ziglang, __builtin_cpu_supports() answers no to everything. */
+__attribute__((constructor)) static void ask_processor(void) {
+    unsigned a, b, c, d, kept, high;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE))
+        return;
+    __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
+    is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
+}
+
 static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
                                           &exact_fused_8, &exact_fused_16, &exact_fused_64};
 static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 #else
+enum { is_fused = 0 };
 static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
-                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
+                                          &exact_plain_8, &exact_plain_16, &exact_plain_64},
+                               *const *fused = plain;
 #endif
+
+int64_t noack_exact_is_fused(void) { return is_fused; }
 
 /* The code for the fewest states that suffice. */
 static const exact_code *code_for(const noack_exact *exact) {
-    const exact_code *const *code = plain;
-#if defined(__x86_64__)
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        code = fused;
-#endif
+    const exact_code *const *code = is_fused ? fused : plain;
     while ((*code)->n < max_of(exact->n, exact->m))
         code++;
     return *code;
