@@ -27,16 +27,19 @@ static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 #else
 enum { is_fused = 0 };
 static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
-                                          &exact_plain_8, &exact_plain_16, &exact_plain_64},
-                               *const *fused = plain;
+                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
+static const exact_code *const *const fused = plain;
 #endif
 
 int64_t noack_exact_is_fused(void) { return is_fused; }
 
-/* The code for the fewest states that suffice. */
+/* The code for the fewest states that suffice; that for 3 has another order of sums than the
+ * others.
+ */
 static const exact_code *code_for(const noack_exact *exact) {
     const exact_code *const *code = is_fused ? fused : plain;
-    while ((*code)->n < max_of(exact->n, exact->m))
+    int64_t entries = max_of(exact->n, exact->m);
+    while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
         code++;
     return *code;
 }
