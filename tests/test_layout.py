@@ -41,7 +41,7 @@ LINES = {
     "sensor_node": 400,
     "controller_node": 400,
     "benchmarks": 5650,
-    "native": 9550,
+    "native": 9520,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
