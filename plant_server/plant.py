@@ -110,15 +110,11 @@ _POLICIES = {
 class Watchdog:
     """Settings of a plant's watchdog."""
 
-    timeout_ns: int = NEVER_NS
-    """The policy chooses the input if the newest actuation is older."""
+    timeout_ns: int = NEVER_NS  # The policy chooses the input if the newest actuation is older
     policy: str = "hold"
-    notice_ns: int = 0
-    """Age from which a notice reports it; at least the timeout."""
-    H: Matrix | None = None
-    """The controller's model, (n, n), of policy ``model``."""
-    K: Matrix | None = None
-    """Its gain, (m, n)."""
+    notice_ns: int = 0  # Age from which a notice reports it; at least the timeout
+    H: Matrix | None = None  # The controller's model, (n, n), of policy ``model``
+    K: Matrix | None = None  # Its gain, (m, n)
 
     @property
     def is_predictive(self) -> bool:
@@ -291,10 +287,7 @@ class Plant:
 
 
 def plants_of(
-    loops: Sequence[Scenario],
-    phases_ns: Sequence[int] | None = None,
-    *,
-    start: Start = BEGINNING,
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
 ) -> LoopMachines:
     """Return the plants of resolved loops as the machines of a process.
 

@@ -6,16 +6,21 @@ live run in which no deadline is missed. It depends on its scenario alone, bit f
 of the network couple the loops.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, RowsInMemory, joined, without_loop
-from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from cosim.record.record_source import (
+    NetworkRows,
+    RecordSource,
+    RowsInMemory,
+    joined,
+    without_loop,
+)
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
 from noack.config.parameter_changes import change_notice, scheduled, settings_key
 from noack.config.resolution import (
@@ -285,7 +290,7 @@ def _simulated(
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
     of_network = {table: run.record.whole(table) for table in network_tables()}
-    packets = NetworkRows(of_network, run.phases_ns)
+    packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
     tables = {table for types in run.types.values() for table in types}
     counts = packets.counts() | {
         table: run.record.counts(table) for table in tables if not is_of_network(table)
@@ -297,17 +302,17 @@ def _simulated(
         own_counts = {table: numbers[table][number] for table in rows.types}
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
-        shared = number if len(loops) > 1 else None
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=shared))
+        roles = loop_roles(len(loops))
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
     reports = {"netem": _report(of_all, "netem")}
     common = RunRecord(
-        scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
+        scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES
     )
     return RecordedRun(common, records)
 
 
-class _LoopRows(RowsInMemory):
+class _LoopRows(RecordSource):
     """The rows of a loop, which are separated from those of the other loops when they are read.
 
     Args:
@@ -324,21 +329,18 @@ class _LoopRows(RowsInMemory):
         number: int,
         types: Mapping[str, np.dtype[np.void]],
     ) -> None:
-        super().__init__({})
-        self.types = types
+        super().__init__(types)
         self._record, self._packets, self._number = record, packets, number
 
-    @cached_property
-    def _of_network(self) -> Mapping[str, Rows]:
-        return self._packets.of_loop(self._number)
+    def count(self, table: str) -> int:
+        """Return the number of rows of a table."""
+        return len(self.whole(table))
 
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         if is_of_network(table):
-            return self._of_network[table]
-        if not has_loop(table):  # nothing in virtual time compares clocks
-            return np.zeros(0, self.types[table])
-        return without_loop(self._record.of_loop(table, self._number), self.types[table])
+            yield from self._packets.of_loop(table, self._number)
+        elif has_loop(table):  # nothing in virtual time compares clocks
+            yield without_loop(self._record.of_loop(table, self._number), self.types[table])
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:

@@ -12,13 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
-from noack.config.scenario import (
-    Scenario,
-    loop_scenario,
-    loop_sections,
-    loops_by_entry,
-    loops_of,
-)
+from noack.config.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
 from noack.config.scenario_checks import input_at
 from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError
@@ -36,7 +30,7 @@ from noack.protocol.record_tables import (
 )
 from noack.settings.section import rows_of
 from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule
 
 _SURELY_FINITE = 600.0
 """‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is finite; above this limit, the exponential itself is
@@ -271,6 +265,11 @@ def policy_of(resolved: Scenario) -> Policy:
     model = resolved.model
     matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
     return resolved.trigger.trigger_policy(matrices)
+
+
+def rule_of(resolved: Scenario) -> TriggerRule:
+    """Return a resolved scenario's trigger rule; raise CallerError if it has none."""
+    return require_rule(policy_of(resolved))
 
 
 def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:

@@ -188,6 +188,8 @@ class LoopMachines:
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(alike or range(len(self.parts)))
+        self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
+        """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
@@ -265,11 +267,13 @@ class LoopMachines:
         """Do what a step needs before it goes on."""
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
+        self._note_counting(loop)
 
     def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
 
-        ``last``: the machines make no more steps.
+        ``last``: the machines make no step before the caller has used the rows, which the next step
+        overwrites.
         """
         taken: list[tuple[str, Rows]] = []
         for number, rows in self._tables.items():
@@ -320,6 +324,7 @@ class LoopMachines:
             machine.inputs += 1
             machine.change_ns = next_change_ns(schedule)
             outputs += [_with_loop(loop, output) for output in announced]
+            self._note_counting(loop)
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
@@ -369,17 +374,28 @@ class LoopMachines:
         return [*records, *self.take_notices()]
 
     def _inspect(self, rows: Rows) -> None:
-        """Keep what the parts have to say about new rows of received messages."""
+        notable = self._notable(rows)
+        if not len(notable):
+            return
+        for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
+            loop = int(own[LOOP][0])
+            self._keep_notices(loop, self.parts[loop].inspect(own))
+            self._note_counting(loop)
+
+    def _note_counting(self, loop: int) -> None:
+        if self.parts[loop].counts_every_message:
+            self._counting.add(loop)
+        else:
+            self._counting.discard(loop)
+
+    def _notable(self, rows: Rows) -> Rows:
+        """Return the rows that a part may have to say something about."""
         notable = np.zeros(len(rows), np.bool_)
+        if self._counting:
+            notable |= np.isin(rows[LOOP], sorted(self._counting))
         if "dropouts" in (rows.dtype.names or ()):
-            notable = rows["dropouts"] > 0
-        if always := [k for k, part in enumerate(self.parts) if part.counts_every_message]:
-            notable |= np.isin(rows[LOOP], always)
-        rows = rows[notable]
-        for own in np.split(rows, np.flatnonzero(np.diff(rows[LOOP])) + 1):
-            if len(own):
-                loop = int(own[LOOP][0])
-                self._keep_notices(loop, self.parts[loop].inspect(own))
+            notable |= rows["dropouts"] > 0
+        return rows[notable]
 
     def _keep_notices(self, loop: int, notices: Sequence[Notice]) -> None:
         self._notices += [notice._replace(loop=loop) for notice in notices]
