@@ -33,9 +33,7 @@ static const exact_code *const *const fused = plain;
 
 int64_t noack_exact_is_fused(void) { return is_fused; }
 
-/* The code for the fewest states that suffice; that for 3 has another order of sums than the
- * others.
- */
+/* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
 static const exact_code *code_for(const noack_exact *exact) {
     const exact_code *const *code = is_fused ? fused : plain;
     int64_t entries = max_of(exact->n, exact->m);
