@@ -9,9 +9,6 @@ enum { CACHE_LINE = 8 }; /* doubles */
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
-                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
-static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
 
 /* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
@@ -23,19 +20,24 @@ __attribute__((constructor)) static void ask_processor(void) {
     __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
     is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
 }
+
+static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
+                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 #else
+enum { is_fused = 0 };
 static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
                                           &exact_plain_8, &exact_plain_16, &exact_plain_64};
 static const exact_code *const *const fused = plain;
-static const int is_fused = 0;
 #endif
 
 int64_t noack_exact_is_fused(void) { return is_fused; }
 
-/* The code for the fewest states that suffice. */
+/* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
 static const exact_code *code_for(const noack_exact *exact) {
     const exact_code *const *code = is_fused ? fused : plain;
-    while ((*code)->n < max_of(exact->n, exact->m))
+    int64_t entries = max_of(exact->n, exact->m);
+    while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
         code++;
     return *code;
 }

@@ -5,9 +5,9 @@
        h(s + q) <= phi(q) = |y(s) + y'(s) q| + b q^2/2 - c_s (1 - r q),    c_s = c e^(-rs).
 
    |y(s) + y'(s) q| is at most |y| + |y'| q. With the radial speed v = y.y'/|y| it is also at most
-   |y| + v q + w q^2/(2 |y|), where w is |y'|^2 - v^2 if v > 0, and |y'|^2 otherwise: the first terms
-   of a square root bound it from above. So phi has a quadratic bound, which is negative up to its
-   positive root. A step of this length skips no crossing, however short.
+   |y| + v q + w q^2/(2 |y|), where w is |y'|^2 - v^2 if v > 0, and |y'|^2 otherwise: the first
+   terms of a square root bound it from above. So phi has a quadratic bound, which is negative up to
+   its positive root. A step of this length skips no crossing, however short.
 
    If y is not 0, h'' = (|y'|^2 - (y.y'/|y|)^2 + y.y'')/|y| - r^2 c_s >= -(b + r^2 c_s) =: -L. If
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].

@@ -17,6 +17,18 @@ void noack_product(
     }
 }
 
+void multiply(
+    int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
+    double *restrict result) {
+    for (int64_t i = 0; i < rows; i++, A += inner, result += columns) {
+        for (int64_t j = 0; j < columns; j++)
+            result[j] = -0.0;
+        for (int64_t k = 0; k < inner; k++)
+            for (int64_t j = 0; j < columns; j++)
+                result[j] += A[k] * (transposed ? B[j * inner + k] : B[k * columns + j]);
+    }
+}
+
 double noack_norm(int64_t count, const double *vector) {
     double total = 0.0;
     for (int64_t k = 0; k < count; k++)

@@ -59,6 +59,12 @@ static inline int64_t tick_ns(const noack_machine *machine) {
     return t_ns <= machine->horizon_ns ? t_ns : NO_TICK;
 }
 
+/* result = A B, or A B' if transposed; A is (rows, inner), result (rows, columns). They must not
+   overlap. */
+void multiply(
+    int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
+    double *result);
+
 /* The norm of M v; M is (rows, columns). image: (rows,) */
 static inline double image_norm(
     int64_t rows, int64_t columns, const double *matrix, const double *vector, double *image) {

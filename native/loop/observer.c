@@ -8,19 +8,6 @@
 
 #include "loop.h"
 
-/* result = A B, or A B' if transposed; A is (rows, inner), result (rows, columns). */
-static void multiply(
-    int64_t rows, int64_t inner, int64_t columns, const double *A, const double *B, int transposed,
-    double *result) {
-    for (int64_t i = 0; i < rows; i++)
-        for (int64_t j = 0; j < columns; j++) {
-            double total = -0.0;
-            for (int64_t k = 0; k < inner; k++)
-                total += A[i * inner + k] * (transposed ? B[j * inner + k] : B[k * columns + j]);
-            result[i * columns + j] = total;
-        }
-}
-
 static void swap_rows(int64_t columns, double *one, double *other) {
     for (int64_t k = 0; k < columns; k++) {
         double value = one[k];

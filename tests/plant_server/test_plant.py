@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from noack.config.resolution import resolve
+from noack.config.resolution import resolve, resolved_loops
 from noack.config.scenario_file import validate
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from plant_server.plant import plants_of
 from tests.machine_parts import linear_plant, plant_of, state_of
 
 H_NS = 2_000_000
@@ -158,3 +159,16 @@ def test_the_plant_of_a_scenario_is_the_true_plant_not_the_model(content: dict[s
     e = math.exp(-0.6)
     expected = [e + 1.5 * (1 - e), 2 * math.exp(0.15)]
     np.testing.assert_allclose(sent[1].vector, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_loops_with_the_same_plant_share_its_description(
+    content: dict[str, Any], *, noise: bool
+) -> None:
+    content["loops"] = [{"name": "loop", "count": 3}]
+    if noise:
+        content["plant"]["measurement"] = {"noise_std": [0.1, 0.1]}
+    plants = plants_of(resolved_loops(validate(content, "loops")))
+    assert len({id(part) for part in plants.parts}) == (3 if noise else 1)
+    for name in ("x", "u"):
+        assert np.array_equal(state_of(plants, name, 2), state_of(plants, name))

@@ -8,7 +8,7 @@ import pytest
 
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
-from cosim.simulation.virtual_time import simulate
+from cosim.simulation.virtual_time import RowMemory, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
@@ -163,3 +163,12 @@ def test_progress_is_reported_during_a_run(busy: Scenario) -> None:
     assert len(reported_ns) > 2
     assert reported_ns == sorted(reported_ns)
     assert 0 <= reported_ns[0] < reported_ns[-1] <= longer.timing.horizon_ns
+
+
+def test_no_two_tables_share_memory() -> None:
+    memory, wide = RowMemory(), np.dtype([("a", "<u2"), ("b", "<f8", (1000,))])
+    tables = [memory.rows(places, wide) for places in (10, 1500, 1500, 1, 5000)]
+    assert [rows.shape for rows in tables] == [(10,), (1500,), (1500,), (1,), (5000,)]
+    for number, rows in enumerate(tables):
+        rows["b"] = number
+    assert all((rows["b"] == number).all() for number, rows in enumerate(tables))
