@@ -4,16 +4,13 @@
 #include <errno.h>
 #include <poll.h>
 #include <string.h>
-#include <sys/syscall.h>
 #include <time.h>
-#include <unistd.h>
 
 enum {
     FEW_BUFFERS = 16,
     BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
-    LOOP_HEADER_BYTES = 32,
-    EPOLL_PWAIT2 = 441 /* on every architecture; libc has the function since glibc 2.35 */
+    LOOP_HEADER_BYTES = 32
 };
 
 enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
@@ -40,9 +37,6 @@ void noack_relay_open(noack_relay *relay) {
         own->hints[k] = -1;
         renew_header(relay, k);
     }
-    struct timespec at_once = {0, 0};
-    own->sleeps =
-        syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;
 }
 
 void noack_relay_read_stamps(noack_relay *relay) {
@@ -318,15 +312,11 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     if (relay->only_socket >= 0)
         fd = relay->sockets[relay->only_socket].fd;
     struct pollfd readable = {.fd = fd, .events = POLLIN};
-    long found;
-    if (relay->only_socket < 0 && !own->sleeps)
-        found = syscall(EPOLL_PWAIT2, fd, own->ready, READY, &limit, NULL, 0);
-    else
-        found = ppoll(&readable, 1, &limit, NULL);
+    int found = ppoll(&readable, 1, &limit, NULL);
     if (found > 0 && relay->only_socket >= 0) {
         own->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
         own->ready[0].data.u64 = (uint64_t)relay->only_socket;
-    } else if (found > 0 && own->sleeps) {
+    } else if (found > 0) {
         found = epoll_wait(fd, own->ready, READY, 0);
     }
     own->ready_count = max_of(found, 0);

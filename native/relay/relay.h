@@ -58,7 +58,6 @@ typedef struct {
     int64_t stamp;
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
-    int64_t sleeps;        /* 1: there is no epoll_pwait2, so by ppoll and epoll_wait */
     pauses pauses;         /* work is sending */
     int64_t is_busy;       /* 1: the next datagrams may come together */
     int64_t has_more;      /* 1: as many as could be received were; others may wait */
