@@ -5,7 +5,13 @@
 #include <math.h>
 #include <time.h>
 
-enum { PPB = 1000000000 };
+enum {
+    PPB = 1000000000,
+    QUIET_NS = 500000, /* housekeeping in Python nearly always takes less time */
+    SETTLE_NS = 200000,
+    MOST_SETTLE_NS = 10000000,
+    MOST_PUT_OFF_NS = 50000000 /* if something is always near, or datagrams wait */
+};
 
 int64_t clock_ns(int clock) {
     struct timespec now;
@@ -49,4 +55,21 @@ int64_t noack_clock_wait_ns(const noack_clock *clock, int64_t simulated_ns) {
     if (speed == 1.0 || simulated_ns <= 0)
         return simulated_ns;
     return whole_ns((double)simulated_ns / speed);
+}
+
+/* Datagrams that wait come first, as after a stall of this process. Else housekeeping waits for a
+   step, and for a moment after it: the receivers of its messages come first, and the next step is
+   usually a period away. It must not make a tick or a delayed datagram late. */
+int64_t put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy) {
+    int64_t left_ns = MOST_PUT_OFF_NS - overdue_ns;
+    pauses->has_followed |= pauses->worked;
+    int settled =
+        is_busy || overdue_ns >= MOST_SETTLE_NS || (pauses->has_followed && !pauses->worked);
+    if (left_ns <= 0 || (settled && !has_more && next_ns > QUIET_NS)) {
+        pauses->has_followed = 0;
+        return 0;
+    }
+    if (has_more)
+        return left_ns;
+    return pauses->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
 }

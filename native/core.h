@@ -43,8 +43,8 @@ typedef void stage_function(packet *packet, const noack_stage *stage, noack_stag
 /* Stages are called for every packet of a flow, lost or not, so that a stage's random draws do not
    depend on other stages. */
 stage_function apply_bernoulli, apply_four_state, apply_gilbert_elliott, apply_periodic,
-    apply_scripted, apply_worst_case, apply_codel, apply_tail_drop, apply_blackout, apply_corrupt,
-    apply_delay, apply_duplicate, apply_opportunities, apply_reorder, apply_replay;
+    apply_scripted, apply_worst_case, apply_tail_drop, apply_blackout, apply_corrupt, apply_delay,
+    apply_duplicate, apply_opportunities, apply_reorder, apply_replay;
 
 /* Lose a packet by DROPPED, OVERFLOWED or BLACKED_OUT, unless it is lost already or must pass. */
 static inline void refuse(noack_decision *decision, int64_t fate) {
@@ -80,16 +80,26 @@ static inline int64_t first_above(
 double latent(double correlation, double innovation, noack_stage_memory *memory, double u);
 int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 
-/* bottleneck.c: a queue that is served at a rate. */
-int queue_enters(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t now_ns);
-int64_t queue_serve(
-    const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t size_bytes);
-void queue_occupy(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns, int64_t until_ns);
+/* tail_drop.c: occupy a place in a bottleneck's queue. codel.c: whether its law drops the packet
+   that has just entered the queue, and drop it. */
+void queue_occupy(noack_link *link, int64_t number, int64_t until_ns);
+int codel_is_due(const noack_link *link, int64_t number);
+void codel_drop(noack_link *link, int64_t number);
 
 /* clock.c: readings of a clock, and simulated times. */
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
 int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
+
+typedef struct {          /* of a driver that returns to Python for housekeeping */
+    int64_t worked;       /* 1: it has done something since it last waited */
+    int64_t has_followed; /* 1: likewise, since housekeeping has been due */
+} pauses;
+
+/* clock.c: how long to put off housekeeping that has been due for a time; 0: not at all. next_ns:
+   the time until the next tick or departure. has_more: datagrams wait. is_busy: no pause is to be
+   expected. All times are those of a clock on the wall. */
+int64_t put_off_ns(pauses *pauses, int64_t overdue_ns, int64_t next_ns, int has_more, int is_busy);
 
 /* guarantee.c */
 int counts_losses(const noack_link *link);

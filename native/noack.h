@@ -831,13 +831,15 @@ typedef struct { /* one direction of a link in the relay */
     int64_t errors[256];      /* datagrams that could not be sent or stored, by errno */
 } noack_direction;
 
-typedef struct { /* a stored datagram */
+typedef struct { /* a datagram that is stored, or about to be sent */
     int64_t packet, arrival_ns, bit;
     int32_t size_bytes;
     int32_t block; /* first block of the payload */
     int32_t direction, client;
     int32_t next; /* next free slot */
-    uint8_t copy, counts, fate, unused;
+    uint8_t copy, fate;
+    uint8_t counts; /* 1: it is the first intact copy */
+    uint8_t unused;
 } noack_slot;
 
 typedef struct { /* an entry of the heap of delayed datagrams */
@@ -933,7 +935,8 @@ void noack_relay_read_stamps(noack_relay *relay);
 /* Wait for a socket's datagrams, too; return 0 or errno. number is its place in sockets. */
 int64_t noack_relay_watch(noack_relay *relay, int64_t fd, int64_t number);
 
-/* Relay until Python is needed, or until a time; return a noack_reason. */
+/* Relay until Python is needed, or until a time; return a noack_reason. INT64_MIN: do what is due,
+   and do not wait. */
 int64_t noack_relay_run(noack_relay *relay, int64_t until_ns);
 
 /* Add a datagram as if a socket had just received it; noack_relay_run decides for it. */

@@ -93,7 +93,7 @@ class Relay:
         return {link.spec.name: link.address for link in self._open_links}
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
-        """Relay until ``stop()``; both are called at least every 50 ms, in this thread.
+        """Relay until ``stop()``; both are called at least every 100 ms, in this thread.
 
         Meanwhile, the thread's timer slack is 1 ns.
         """

@@ -33,7 +33,8 @@ _ROWS = 256
 """Rows of each table of the record that it keeps: as many as telemetry has in a batch."""
 _WORDS = (PACKET_ROW.names or ())[:-1]
 _PACKET_ROW = np.dtype([*((name, "<i8") for name in _WORDS), ("head", f"V{PACKET_HEAD_BYTES}")])
-_PAST_NS = -(2**62)
+_AT_ONCE_NS = -(2**63)
+"""Do what is due, and do not wait."""
 _NEVER_NS = 2**63 - 1
 
 
@@ -149,7 +150,7 @@ class RunNetwork:
         """Forward all datagrams that are due now; return their rows."""
         self._relay.read_ns = now_ns
         rows = _RowList()
-        self.drive(_PAST_NS, rows)
+        self.drive(_AT_ONCE_NS, rows)
         return sorted(rows, key=lambda record: int(record.row[0]))
 
     @property

@@ -21,14 +21,8 @@ enum {
     BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
     MESSAGES = 16,      /* received at once; the last place is for a datagram that Python adds */
     MESSAGE_BYTES = BUFFERS * BUFFER_BYTES, /* a message of the kernel has several datagrams */
-    QUIET_NS = 500000, /* housekeeping in Python nearly always takes less time */
-    /* Housekeeping waits for a step, and for so long after it: the receivers of its messages come
-       first, and the next step is usually a period away. But it does not wait longer than: */
-    SETTLE_NS = 200000,
-    MOST_SETTLE_NS = 10000000,
-    MOST_PUT_OFF_NS = 50000000, /* if a tick is always near */
-    MANY_BYTES = 49152,         /* of rows: as many go to the recorder without a pause */
-    EARLY_NS = 1000             /* a timer may expire so much before its time */
+    MANY_BYTES = 49152, /* of rows: as many go to the recorder without a pause */
+    EARLY_NS = 1000     /* a timer may expire so much before its time */
 };
 
 typedef union { /* room for the size of the datagrams in a message */
@@ -61,11 +55,10 @@ typedef struct {
     int64_t batch;             /* datagrams that one call receives */
     int64_t timer_ns;          /* when the timer expires, on the monotonic clock */
     int8_t out_flows[BUFFERS]; /* the sockets of what waits to be sent */
-    int64_t worked;            /* 1: something was done since it last slept */
-    int64_t has_followed;      /* 1: something was done since housekeeping has been due */
-    int64_t has_more;          /* 1: a socket may have more datagrams than were received */
-    int64_t first;             /* the socket that is read first the next time */
-    int64_t has_asked;         /* 1: the present step has asked Python */
+    pauses pauses;
+    int64_t has_more;  /* 1: a socket may have more datagrams than were received */
+    int64_t first;     /* the socket that is read first the next time */
+    int64_t has_asked; /* 1: the present step has asked Python */
     noack_message message;
     uint8_t out_data[BUFFERS][BUFFER_BYTES];
     uint8_t in_data[MESSAGES][MESSAGE_BYTES];
@@ -211,7 +204,7 @@ static void send_all(noack_driver *driver) {
 static void put_output(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
     const noack_output *output = &driver->process->output;
-    own->worked = 1;
+    own->pauses.worked = 1;
     if (!output->sends)
         return;
     int64_t place = own->out_count++;
@@ -354,8 +347,8 @@ static void set_timer(noack_driver *driver, int64_t wall_ns, int64_t at_ns) {
 static int64_t sleep_until_needed(
     noack_driver *driver, int64_t wall_ns, int64_t tick_ns, int64_t wait_ns) {
     driver_scratch *own = scratch_of(driver);
-    int rests = own->worked && !own->has_more && 0 < tick_ns && tick_ns < driver->rest_ns;
-    own->worked = 0;
+    int rests = own->pauses.worked && !own->has_more && 0 < tick_ns && tick_ns < driver->rest_ns;
+    own->pauses.worked = 0;
     if (rests) {
         struct timespec rest = {0, driver->rest_ns};
         return clock_nanosleep(CLOCK_MONOTONIC, 0, &rest, NULL) == EINTR
@@ -455,21 +448,14 @@ static void receive(noack_driver *driver, int64_t ready) {
 /* How long to wait for, at most, or 0 if the time for housekeeping has come. */
 static int64_t wait_for_ns(
     noack_driver *driver, int64_t until_ns, int64_t now_ns, int64_t tick_ns) {
-    driver_scratch *own = scratch_of(driver);
-    if (now_ns < until_ns) {
-        own->has_followed = 0;
+    if (now_ns < until_ns)
         return max_of(noack_clock_wait_ns(&driver->clock, until_ns - now_ns), 1);
-    }
     if (until_ns == INT64_MIN) /* what has been received is still to be handled */
-        return SETTLE_NS;
+        return 1;
     if (driver->rest_ns > 0) /* no moment is better than another */
         return 0;
     int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
-    own->has_followed |= own->worked;
-    int settled = overdue_ns >= MOST_SETTLE_NS || (own->has_followed && !own->worked);
-    if ((settled && tick_ns > QUIET_NS) || overdue_ns >= MOST_PUT_OFF_NS)
-        return 0;
-    return own->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
+    return put_off_ns(&scratch_of(driver)->pauses, overdue_ns, tick_ns, 0, 0);
 }
 
 /* Whether a table has so many rows that Python should take them before the next steps: few at a

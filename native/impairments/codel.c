@@ -29,7 +29,9 @@ static int64_t control_law(const noack_bottleneck *own, int64_t t_ns, int64_t dr
 }
 
 /* Whether the law drops the newly arrived packet. */
-static int is_due(const noack_bottleneck *own, noack_queue *queue) {
+int codel_is_due(const noack_link *link, int64_t number) {
+    const noack_bottleneck *own = &link->stages[number].bottleneck;
+    noack_queue *queue = &link->queues[number];
     int64_t now_ns = service_ns(queue), sojourn_ns = now_ns - queue->entry_ns;
     int above_long_enough = 0;
     if (sojourn_ns < own->target_ns || sojourn_ns <= own->mtu_ns)
@@ -51,10 +53,11 @@ static int is_due(const noack_bottleneck *own, noack_queue *queue) {
 }
 
 /* Drop the newly arrived packet: it keeps its place, and the law's state advances. */
-static void drop(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns) {
-    const noack_bottleneck *own = &stage->bottleneck;
+void codel_drop(noack_link *link, int64_t number) {
+    const noack_bottleneck *own = &link->stages[number].bottleneck;
+    noack_queue *queue = &link->queues[number];
     int64_t now_ns = service_ns(queue);
-    queue_occupy(stage, queue, ring_ns, now_ns);
+    queue_occupy(link, number, now_ns);
     if (queue->dropping) {
         queue->drops++;
         queue->dropped_before = 1;
@@ -66,36 +69,4 @@ static void drop(const noack_stage *stage, noack_queue *queue, int64_t *ring_ns)
     queue->drops = delta > 1 && recent ? delta : 1;
     queue->last_drops = queue->drops;
     queue->drop_next_ns = control_law(own, now_ns, queue->drops);
-}
-
-/* Put the packet and then its copy into the queue; ignore a packet that is lost already. */
-void apply_codel(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
-    (void)memory;
-    const noack_bottleneck *own = &stage->bottleneck;
-    noack_decision *decision = packet->decision;
-    if (decision->fate != NOACK_DELIVERED)
-        return;
-    noack_queue *queue = &packet->link->queues[packet->stage];
-    int64_t *ring_ns = packet->link->departures_ns;
-    if (!queue_enters(stage, queue, ring_ns, decision->release_ns))
-        refuse(decision, NOACK_OVERFLOWED);
-    if (decision->fate == NOACK_DELIVERED) {
-        if (is_due(own, queue))
-            refuse(decision, NOACK_OVERFLOWED);
-        if (decision->fate == NOACK_DELIVERED)
-            decision->release_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
-        else
-            drop(stage, queue, ring_ns);
-    }
-    if (decision->copy_ns == NOACK_NEVER_NS)
-        return;
-    if (decision->fate != NOACK_DELIVERED
-        || !queue_enters(stage, queue, ring_ns, decision->copy_ns)) {
-        decision->copy_ns = NOACK_NEVER_NS;
-    } else if (is_due(own, queue)) {
-        drop(stage, queue, ring_ns);
-        decision->copy_ns = NOACK_NEVER_NS;
-    } else {
-        decision->copy_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
-    }
 }

@@ -1,22 +1,79 @@
-/* Tail drop: a packet that finds the queue full is lost. */
+/* A bottleneck: packets leave one after the other, at a rate, from a finite queue. A packet that
+   finds it full is lost (tail drop); with CoDel, the law of codel.c may drop it, too.
+
+   The queue serves in the order of arrival. Its state depends on arrival times only, not on the
+   emulator's own lateness: the begin and the end of a packet's service are known on its arrival. */
 #include "../core.h"
+
+/* Whether the queue has a free place at now_ns; removes packets that have left until then. */
+int64_t noack_queue_enters(noack_link *link, int64_t number, int64_t now_ns) {
+    const noack_stage *stage = &link->stages[number];
+    const int64_t *ring_ns = link->departures_ns + stage->queue_begin;
+    noack_queue *queue = &link->queues[number];
+    queue->entry_ns = max_of(queue->entry_ns, now_ns);
+    while (queue->count > 0 && ring_ns[queue->head] <= queue->entry_ns) {
+        queue->head = (queue->head + 1) % stage->queue_places;
+        queue->count--;
+    }
+    return queue->count < stage->queue_places;
+}
+
+/* Occupy a place in the queue until a time; a packet that must pass may exceed the size. */
+void queue_occupy(noack_link *link, int64_t number, int64_t until_ns) {
+    const noack_stage *stage = &link->stages[number];
+    noack_queue *queue = &link->queues[number];
+    if (queue->count < stage->queue_places)
+        queue->count++;
+    int64_t last = (queue->head + queue->count - 1) % stage->queue_places;
+    link->departures_ns[stage->queue_begin + last] = until_ns;
+}
+
+/* Put a packet into the queue, after noack_queue_enters; return its departure time. */
+int64_t noack_queue_serve(noack_link *link, int64_t number, int64_t size_bytes) {
+    const noack_bottleneck *own = &link->stages[number].bottleneck;
+    noack_queue *queue = &link->queues[number];
+    int64_t line_bytes = max_of(size_bytes + own->overhead_bytes, 0);
+    if (own->cell_bytes > 0) {
+        int64_t cells = (line_bytes + own->cell_bytes - 1) / own->cell_bytes;
+        line_bytes = cells * (own->cell_bytes + own->cell_overhead_bytes);
+    }
+    if (queue->busy_until_ns < queue->entry_ns) {
+        queue->busy_until_ns = queue->entry_ns;
+        queue->carry = 0;
+    }
+    int64_t work = line_bytes * 8 * NS_PER_S + queue->carry;
+    queue->busy_until_ns = min_of(queue->busy_until_ns + work / own->rate_bps, LATEST_NS);
+    queue->carry = work % own->rate_bps;
+    queue_occupy(link, number, queue->busy_until_ns);
+    return queue->busy_until_ns;
+}
 
 /* Put the packet and then its copy into the queue; ignore a packet that is lost already. */
 void apply_tail_drop(packet *packet, const noack_stage *stage, noack_stage_memory *memory) {
     (void)memory;
     noack_decision *decision = packet->decision;
+    noack_link *link = packet->link;
+    int64_t number = packet->stage;
+    int has_law = stage->kind == NOACK_CODEL;
     if (decision->fate != NOACK_DELIVERED)
         return;
-    noack_queue *queue = &packet->link->queues[packet->stage];
-    int64_t *ring_ns = packet->link->departures_ns;
-    if (!queue_enters(stage, queue, ring_ns, decision->release_ns))
+    if (!noack_queue_enters(link, number, decision->release_ns))
         refuse(decision, NOACK_OVERFLOWED);
-    if (decision->fate == NOACK_DELIVERED)
-        decision->release_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
+    if (decision->fate == NOACK_DELIVERED) {
+        if (has_law && codel_is_due(link, number))
+            refuse(decision, NOACK_OVERFLOWED);
+        if (decision->fate == NOACK_DELIVERED)
+            decision->release_ns = noack_queue_serve(link, number, decision->size_bytes);
+        else
+            codel_drop(link, number);
+    }
     if (decision->copy_ns == NOACK_NEVER_NS)
         return;
-    if (decision->fate == NOACK_DELIVERED && queue_enters(stage, queue, ring_ns, decision->copy_ns))
-        decision->copy_ns = queue_serve(stage, queue, ring_ns, decision->size_bytes);
-    else
-        decision->copy_ns = NOACK_NEVER_NS;
+    int enters =
+        decision->fate == NOACK_DELIVERED && noack_queue_enters(link, number, decision->copy_ns);
+    int drops = enters && has_law && codel_is_due(link, number);
+    decision->copy_ns =
+        enters && !drops ? noack_queue_serve(link, number, decision->size_bytes) : NOACK_NEVER_NS;
+    if (drops)
+        codel_drop(link, number);
 }

@@ -35,20 +35,15 @@ static int64_t home_of(const noack_relay *relay, const int64_t key[4]) {
     return (int64_t)(mixed & (uint64_t)(relay->table_places - 1));
 }
 
-static int64_t find_key(const noack_relay *relay, const int64_t key[4]) {
-    int64_t mask = relay->table_places - 1;
+int64_t noack_client_find(
+    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
+    int64_t key[4], mask = relay->table_places - 1;
+    key_of(name, link, key);
     for (int64_t place = home_of(relay, key);; place = (place + 1) & mask) {
         int64_t row = relay->table[place];
         if (row < 0 || memcmp(relay->clients[row].key, key, KEY_BYTES) == 0)
             return row;
     }
-}
-
-int64_t noack_client_find(
-    const noack_relay *relay, const uint8_t name[NOACK_NAME_BYTES], int64_t link) {
-    int64_t key[4];
-    key_of(name, link, key);
-    return find_key(relay, key);
 }
 
 /* The table must have room. */
@@ -86,7 +81,7 @@ int64_t find_sender(noack_relay *relay) {
     int64_t key[4], k = own->batch_next, row = own->hints[k];
     key_of(own->in_names[k], own->batch_socket, key);
     if (row < 0 || memcmp(relay->clients[row].key, key, KEY_BYTES) != 0)
-        row = find_key(relay, key);
+        row = noack_client_find(relay, own->in_names[k], own->batch_socket);
     if (relay->client_rows <= FEW) /* the next datagram often has the same sender */
         own->hints[(k + 1) % BUFFERS] = (int32_t)row;
     return row;

@@ -91,24 +91,25 @@ void report_arrival(
 }
 
 void report_departure(noack_relay *relay, const departure *leaving, int64_t now_ns) {
-    int64_t direction = leaving->direction;
-    noack_event *event = next_event(relay, direction, leaving->client, 1 - (direction & 1));
+    int64_t direction = leaving->datagram.direction;
+    noack_event *event =
+        next_event(relay, direction, leaving->datagram.client, 1 - (direction & 1));
     event->t_ns = relay->unix_ns + now_ns;
-    event->packet = leaving->packet;
-    event->fate = leaving->fate;
-    event->size_bytes = (uint32_t)leaving->size_bytes;
-    event->delay_ns = now_ns - leaving->arrival_ns;
-    event->bit = leaving->bit;
+    event->packet = leaving->datagram.packet;
+    event->fate = leaving->datagram.fate;
+    event->size_bytes = (uint32_t)leaving->datagram.size_bytes;
+    event->delay_ns = now_ns - leaving->datagram.arrival_ns;
+    event->bit = leaving->datagram.bit;
     event->departure = 1;
-    event->copy = leaving->copy;
+    event->copy = leaving->datagram.copy;
     event->stale = leaving->stale;
     if (relay->taps == 2) {
         uint8_t *place = relay->data + relay->data_length;
         if (leaving->slot < 0)
-            memcpy(place, leaving->address, (size_t)leaving->size_bytes);
+            memcpy(place, leaving->address, (size_t)leaving->datagram.size_bytes);
         else
             copy_payload(relay, leaving->slot, place);
-        relay->data_length += leaving->size_bytes;
+        relay->data_length += leaving->datagram.size_bytes;
     }
 }
 
@@ -124,11 +125,11 @@ void record_packet(
 void record_release(noack_relay *relay, const departure *leaving, int64_t now_ns) {
     relay->releases[relay->release_rows++] = (noack_release_row){
         .input = relay->inputs++,
-        .sequence = relay->first_number + leaving->packet,
+        .sequence = relay->first_number + leaving->datagram.packet,
         .t_ns = leaving->release_ns,
         .now_ns = now_ns,
-        .flow = relay->loops * leaving->direction + leaving->client,
-        .copy = leaving->copy,
+        .flow = relay->loops * leaving->datagram.direction + leaving->datagram.client,
+        .copy = leaving->datagram.copy,
         .stale = leaving->stale,
     };
 }

@@ -4,20 +4,13 @@
 #include <errno.h>
 #include <poll.h>
 #include <string.h>
-#include <sys/syscall.h>
 #include <time.h>
-#include <unistd.h>
 
 enum {
     FEW_BUFFERS = 16,
     BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
-    HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
-    SETTLE_NS = 200000,       /* between sending and housekeeping */
-    MOST_PUT_OFF_NS = 10000000,
-    MOST_BACKLOG_NS = 50000000, /* for which datagrams that wait come before housekeeping */
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
-    LOOP_HEADER_BYTES = 32,
-    EPOLL_PWAIT2 = 441 /* on every architecture; libc has the function since glibc 2.35 */
+    LOOP_HEADER_BYTES = 32
 };
 
 enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
@@ -44,9 +37,6 @@ void noack_relay_open(noack_relay *relay) {
         own->hints[k] = -1;
         renew_header(relay, k);
     }
-    struct timespec at_once = {0, 0};
-    own->sleeps =
-        syscall(EPOLL_PWAIT2, (int)relay->epoll, own->ready, READY, &at_once, NULL, 0) < 0;
 }
 
 void noack_relay_read_stamps(noack_relay *relay) {
@@ -87,15 +77,15 @@ int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay
 static void line_up(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
     departure *leaving = &own->leaving[own->leaving_count++];
-    noack_direction *direction = &relay->directions[leaving->direction];
+    noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
-        direction->link, relay->clients[leaving->client].place, leaving->packet,
-        leaving->size_bytes, leaving->delayed, leaving->counts);
+        direction->link, relay->clients[leaving->datagram.client].place, leaving->datagram.packet,
+        leaving->datagram.size_bytes, leaving->delayed, leaving->datagram.counts);
     leaving->error = 0;
-    own->leaving_bytes += leaving->size_bytes;
-    int64_t link = leaving->direction >> 1;
+    own->leaving_bytes += leaving->datagram.size_bytes;
+    int64_t link = leaving->datagram.direction >> 1;
     if (direction->sends == NOACK_OWN_SOCKET)
-        leaving->socket = (int32_t)(2 * relay->links + leaving->client);
+        leaving->socket = (int32_t)(2 * relay->links + leaving->datagram.client);
     else if (direction->sends == NOACK_CLIENT_NAME)
         leaving->socket = (int32_t)link;
     else
@@ -117,18 +107,10 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
         relay->clients[slot->client].in_flight--;
         departure *leaving = &own->leaving[own->leaving_count];
         *leaving = (departure){
-            .packet = slot->packet,
-            .arrival_ns = slot->arrival_ns,
+            .datagram = *slot,
             .release_ns = entry.release_ns,
-            .bit = slot->bit,
-            .size_bytes = slot->size_bytes,
             .slot = (int32_t)entry.slot,
-            .direction = slot->direction,
-            .client = slot->client,
             .delayed = 1,
-            .copy = slot->copy,
-            .fate = slot->fate,
-            .counts = slot->counts,
         };
         line_up(relay);
         if (relay->records)
@@ -205,20 +187,22 @@ static void release(
     const uint8_t *data = own->buffers[own->batch_next];
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
     int64_t bit = copy ? decision->copy_bit : decision->bit;
-    int counts = is_first_intact(decision, copy);
     int delayed = release_ns > relay->now_ns;
     int64_t number = -1;
+    noack_slot datagram = {
+        .packet = decision->packet,
+        .arrival_ns = relay->now_ns,
+        .bit = bit,
+        .size_bytes = (int32_t)decision->size_bytes,
+        .direction = (int32_t)direction,
+        .client = (int32_t)client,
+        .copy = (uint8_t)copy,
+        .counts = (uint8_t)is_first_intact(decision, copy),
+        .fate = (uint8_t)decision->fate,
+    };
     if (delayed || bit >= 0)
-        number = store_payload(relay, data, decision->size_bytes, bit);
+        number = store_payload(relay, data, &datagram);
     if (delayed) {
-        noack_slot *slot = &relay->slots[number];
-        slot->packet = decision->packet;
-        slot->arrival_ns = relay->now_ns;
-        slot->direction = (int32_t)direction;
-        slot->client = (int32_t)client;
-        slot->copy = (uint8_t)copy;
-        slot->counts = (uint8_t)counts;
-        slot->fate = (uint8_t)decision->fate;
         relay->put++;
         int64_t order = departure_order(direction & 1, relay->put);
         noack_heap_entry entry = {release_ns, order, number};
@@ -227,18 +211,10 @@ static void release(
         return;
     }
     own->leaving[own->leaving_count] = (departure){
+        .datagram = datagram,
         .address = data,
-        .packet = decision->packet,
-        .arrival_ns = relay->now_ns,
         .release_ns = release_ns,
-        .bit = bit,
-        .size_bytes = (int32_t)decision->size_bytes,
         .slot = (int32_t)number,
-        .direction = (int32_t)direction,
-        .client = (int32_t)client,
-        .copy = (uint8_t)copy,
-        .fate = (uint8_t)decision->fate,
-        .counts = (uint8_t)counts,
     };
     line_up(relay);
 }
@@ -299,52 +275,48 @@ static int64_t decide_batch(noack_relay *relay) {
     return NOACK_CARRY_ON;
 }
 
-/* How long to postpone housekeeping, which is due; 0: not at all. Datagrams that wait come first,
-   as after a stall of this process. It must not make the next delayed datagram late. Else it waits
-   for a datagram, and for a moment after it: its receiver comes first, and the next one is usually
-   a period away. */
-static int64_t postponed_ns(noack_relay *relay) {
+/* Wall time until the next delayed datagram is due. */
+static int64_t departs_in_ns(const noack_relay *relay) {
+    if (relay->heap_length == 0)
+        return INT64_MAX;
+    return noack_clock_wait_ns(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
+}
+
+/* Until when to wait for datagrams; INT64_MIN: the time for housekeeping has come. */
+static int64_t waiting_ends_ns(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
-    double speed = relay->clock.speed;
+    if (relay->read_ns < until_ns)
+        return until_ns;
     if (own->due_since_ns == 0)
         own->due_since_ns = relay->read_ns;
-    int64_t most_ns = own->has_more ? MOST_BACKLOG_NS : MOST_PUT_OFF_NS;
-    double left_ns = (double)most_ns * speed - (double)(relay->read_ns - own->due_since_ns);
-    own->has_followed |= own->worked;
-    if (left_ns <= 0)
-        return 0;
-    if (relay->heap_length > 0
-        && (double)(relay->heap[0].release_ns - relay->read_ns) < (double)HOUSEKEEPING_NS * speed)
-        return (int64_t)((double)HOUSEKEEPING_NS * speed);
-    if (!own->has_more && (own->is_busy || (own->has_followed && !own->worked)))
-        return 0;
-    int settles = own->has_followed && !own->has_more;
-    return (int64_t)(settles ? (double)SETTLE_NS * speed : left_ns) + 1;
+    int64_t more_ns = 0;
+    if (until_ns != INT64_MIN)
+        more_ns = put_off_ns(
+            &own->pauses, noack_clock_wait_ns(&relay->clock, relay->read_ns - own->due_since_ns),
+            departs_in_ns(relay), own->has_more != 0, own->is_busy != 0);
+    if (more_ns == 0) {
+        own->ready_count = own->ready_next = own->due_since_ns = 0;
+        return INT64_MIN;
+    }
+    return relay->read_ns + simulated_ns_of(&relay->clock, more_ns) + 1;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
 static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
     relay_scratch *own = scratch_of(relay);
     int64_t wait_ns = noack_clock_wait_ns(&relay->clock, until_ns - relay->read_ns);
-    if (relay->heap_length > 0) {
-        int64_t due_ns =
-            noack_clock_wait_ns(&relay->clock, relay->heap[0].release_ns - relay->read_ns);
-        wait_ns = max_of(min_of(wait_ns, due_ns - relay->spin_ns), 0);
-    }
+    if (relay->heap_length > 0)
+        wait_ns = max_of(min_of(wait_ns, departs_in_ns(relay) - relay->spin_ns), 0);
     struct timespec limit = {wait_ns / NS_PER_S, wait_ns % NS_PER_S};
     int fd = (int)relay->epoll;
     if (relay->only_socket >= 0)
         fd = relay->sockets[relay->only_socket].fd;
     struct pollfd readable = {.fd = fd, .events = POLLIN};
-    long found;
-    if (relay->only_socket < 0 && !own->sleeps)
-        found = syscall(EPOLL_PWAIT2, fd, own->ready, READY, &limit, NULL, 0);
-    else
-        found = ppoll(&readable, 1, &limit, NULL);
+    int found = ppoll(&readable, 1, &limit, NULL);
     if (found > 0 && relay->only_socket >= 0) {
         own->ready[0].events = readable.revents & POLLERR ? EPOLLERR : EPOLLIN;
         own->ready[0].data.u64 = (uint64_t)relay->only_socket;
-    } else if (found > 0 && own->sleeps) {
+    } else if (found > 0) {
         found = epoll_wait(fd, own->ready, READY, 0);
     }
     own->ready_count = max_of(found, 0);
@@ -421,7 +393,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         if (reason != NOACK_CARRY_ON || all_taken || BUFFERS - own->batch_end < FEW_BUFFERS) {
             if (own->leaving_count > 0)
                 sent_ns = send_all(relay);
-            own->worked |= sent_ns >= 0;
+            own->pauses.worked |= sent_ns >= 0;
             if (reason == NOACK_LEAVING_FULL)
                 continue;
             if (reason != NOACK_CARRY_ON)
@@ -430,17 +402,10 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
         }
         if (all_taken) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
-            int64_t wait_until_ns = until_ns;
-            if (relay->read_ns >= until_ns) {
-                int64_t more_ns = postponed_ns(relay);
-                if (more_ns == 0) {
-                    own->ready_count = own->ready_next = 0;
-                    own->has_followed = own->due_since_ns = 0;
-                    return NOACK_HOUSEKEEPING;
-                }
-                wait_until_ns = relay->read_ns + more_ns;
-            }
-            own->worked = 0;
+            int64_t wait_until_ns = waiting_ends_ns(relay, until_ns);
+            if (wait_until_ns == INT64_MIN)
+                return NOACK_HOUSEKEEPING;
+            own->pauses.worked = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
                 return NOACK_INTERRUPTED;

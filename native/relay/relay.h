@@ -21,13 +21,12 @@ enum {
 };
 
 typedef struct { /* a datagram that is about to be sent */
-    const uint8_t *address;
-    int64_t packet, arrival_ns, release_ns, bit;
-    int32_t size_bytes;
-    int32_t slot; /* slot of the payload; -1: it is in a receive buffer */
-    int32_t socket, direction, client, next, error;
-    uint8_t delayed, copy, fate, stale;
-    uint8_t counts; /* 1: it is the first intact copy */
+    noack_slot datagram;
+    const uint8_t *address; /* of the payload, in a receive buffer, unless it has a slot: */
+    int64_t release_ns;
+    int32_t slot; /* of the stored payload; -1: none */
+    int32_t socket, next, error;
+    uint8_t delayed, stale;
 } departure;
 
 typedef union {
@@ -59,9 +58,7 @@ typedef struct {
     int64_t stamp;
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
-    int64_t sleeps;        /* 1: there is no epoll_pwait2, so by ppoll and epoll_wait */
-    int64_t worked;        /* 1: it has sent datagrams since it last waited */
-    int64_t has_followed;  /* 1: it has sent datagrams since housekeeping has been due */
+    pauses pauses;         /* work is sending */
     int64_t is_busy;       /* 1: the next datagrams may come together */
     int64_t has_more;      /* 1: as many as could be received were; others may wait */
     int64_t due_since_ns;  /* since when housekeeping has been due; 0: it is not */
@@ -74,7 +71,7 @@ static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay
 /* store.c: delayed datagrams. */
 int64_t blocks_for(int64_t size_bytes);
 uint8_t *block_address(const noack_relay *relay, int64_t block);
-int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit);
+int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram);
 void copy_payload(const noack_relay *relay, int64_t slot, uint8_t *into);
 void free_payload(noack_relay *relay, int64_t slot);
 

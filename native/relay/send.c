@@ -77,17 +77,18 @@ int64_t take_errors(noack_relay *relay, int64_t socket) {
 }
 
 static int64_t vectors_of(const departure *leaving) {
-    return leaving->slot < 0 ? 1 : blocks_for(leaving->size_bytes);
+    return leaving->slot < 0 ? 1 : blocks_for(leaving->datagram.size_bytes);
 }
 
 /* Write the vectors of a datagram's payload; return the next free one. */
 static int64_t add_vectors(const noack_relay *relay, int64_t count, const departure *leaving) {
     struct iovec *vectors = scratch_of(relay)->out_vectors;
     if (leaving->slot < 0) {
-        vectors[count] = (struct iovec){(void *)leaving->address, (size_t)leaving->size_bytes};
+        vectors[count] =
+            (struct iovec){(void *)leaving->address, (size_t)leaving->datagram.size_bytes};
         return count + 1;
     }
-    int64_t block = relay->slots[leaving->slot].block, left_bytes = leaving->size_bytes;
+    int64_t block = leaving->datagram.block, left_bytes = leaving->datagram.size_bytes;
     for (int64_t k = blocks_for(left_bytes); k > 0; k--) {
         int64_t length = min_of(left_bytes, NOACK_BLOCK_BYTES);
         vectors[count++] = (struct iovec){block_address(relay, block), (size_t)length};
@@ -100,11 +101,12 @@ static int64_t add_vectors(const noack_relay *relay, int64_t count, const depart
 /* Whether a datagram may follow others of size_bytes in one message that the kernel segments. */
 static int may_join(
     const noack_relay *relay, const departure *first, const departure *other, int64_t all_bytes) {
-    int to_client = relay->directions[first->direction].sends == NOACK_CLIENT_NAME;
-    return 0 < other->size_bytes && other->size_bytes <= first->size_bytes
-           && all_bytes + other->size_bytes <= MOST_SEGMENTED_BYTES
-           && other->direction == first->direction
-           && (other->client == first->client || !to_client);
+    int to_client = relay->directions[first->datagram.direction].sends == NOACK_CLIENT_NAME;
+    return 0 < other->datagram.size_bytes
+           && other->datagram.size_bytes <= first->datagram.size_bytes
+           && all_bytes + other->datagram.size_bytes <= MOST_SEGMENTED_BYTES
+           && other->datagram.direction == first->datagram.direction
+           && (other->datagram.client == first->datagram.client || !to_client);
 }
 
 static void write_segment_size(struct msghdr *message, control *room, int64_t size_bytes) {
@@ -119,10 +121,10 @@ static void write_segment_size(struct msghdr *message, control *room, int64_t si
 
 static void write_destination(
     const noack_relay *relay, struct msghdr *message, const departure *leaving) {
-    noack_direction *direction = &relay->directions[leaving->direction];
+    noack_direction *direction = &relay->directions[leaving->datagram.direction];
     if (direction->sends == NOACK_CLIENT_NAME) {
-        message->msg_name = relay->clients[leaving->client].name;
-        message->msg_namelen = (socklen_t)relay->clients[leaving->client].name_bytes;
+        message->msg_name = relay->clients[leaving->datagram.client].name;
+        message->msg_namelen = (socklen_t)relay->clients[leaving->datagram.client].name_bytes;
     } else if (direction->sends == NOACK_DESTINATION_NAME) {
         message->msg_name = direction->name;
         message->msg_namelen = (socklen_t)direction->name_bytes;
@@ -141,24 +143,26 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
         struct msghdr *message = &own->out_headers[headers].msg_hdr;
         *message = (struct msghdr){.msg_iov = own->out_vectors + vectors};
         own->out_first[headers] = (int32_t)number;
-        int64_t begin = vectors, all_bytes = first->size_bytes, segments = 1;
-        int64_t last_bytes = first->size_bytes;
+        int64_t begin = vectors, all_bytes = first->datagram.size_bytes, segments = 1;
+        int64_t last_bytes = first->datagram.size_bytes;
         vectors = add_vectors(relay, vectors, first);
         number = first->next;
         if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
-            while (number >= 0 && segments < MOST_SEGMENTS && last_bytes == first->size_bytes) {
+            while (number >= 0 && segments < MOST_SEGMENTS
+                   && last_bytes == first->datagram.size_bytes) {
                 const departure *other = &own->leaving[number];
                 if (!may_join(relay, first, other, all_bytes)
                     || vectors + vectors_of(other) > VECTORS)
                     break;
-                last_bytes = other->size_bytes;
+                last_bytes = other->datagram.size_bytes;
                 vectors = add_vectors(relay, vectors, other);
                 all_bytes += last_bytes;
                 segments++;
                 number = other->next;
             }
             if (segments > 1)
-                write_segment_size(message, &own->out_controls[headers], first->size_bytes);
+                write_segment_size(
+                    message, &own->out_controls[headers], first->datagram.size_bytes);
         }
         message->msg_iovlen = (size_t)(vectors - begin);
         write_destination(relay, message, first);
@@ -225,7 +229,7 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
             const struct msghdr *message = &own->out_headers[done].msg_hdr;
             if (message->msg_controllen > 0) {
                 relay->segment_below =
-                    min_of(relay->segment_below, own->leaving[number].size_bytes);
+                    min_of(relay->segment_below, own->leaving[number].datagram.size_bytes);
                 return done;
             }
         }
@@ -238,9 +242,9 @@ static int transmit(noack_relay *relay, int64_t socket, int headers, int64_t fol
 
 /* Count a datagram as sent or failed, and free its payload. */
 static void account(noack_relay *relay, const departure *leaving, int64_t now_ns) {
-    noack_direction *direction = &relay->directions[leaving->direction];
+    noack_direction *direction = &relay->directions[leaving->datagram.direction];
     if (leaving->error == 0) {
-        direction->delays[noack_bucket_of(now_ns - leaving->arrival_ns)]++;
+        direction->delays[noack_bucket_of(now_ns - leaving->datagram.arrival_ns)]++;
         if (leaving->delayed)
             direction->lateness[noack_bucket_of(now_ns - leaving->release_ns)]++;
         if (relay->taps)

@@ -12,16 +12,15 @@ uint8_t *block_address(const noack_relay *relay, int64_t block) {
            + block % NOACK_CHUNK_BLOCKS * NOACK_BLOCK_BYTES;
 }
 
-/* Copy a payload into a slot, flip a bit of it (-1: none), and return the slot's number. There must
-   be room. */
-int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_bytes, int64_t bit) {
-    int64_t number = relay->free_slot, count = blocks_for(size_bytes);
+/* Store a datagram with its payload, of which the bit that it names is flipped (-1: none); set its
+   first block, and return the number of its slot. There must be room. */
+int64_t store_payload(noack_relay *relay, const uint8_t *data, noack_slot *datagram) {
+    int64_t number = relay->free_slot, size_bytes = datagram->size_bytes, bit = datagram->bit;
     noack_slot *slot = &relay->slots[number];
     relay->free_slot = slot->next;
     relay->free_slots--;
-    slot->size_bytes = (int32_t)size_bytes;
-    slot->bit = bit;
-    slot->block = (int32_t)relay->free_block;
+    datagram->block = (int32_t)relay->free_block;
+    *slot = *datagram;
     int64_t block = slot->block, last = block;
     for (int64_t begin = 0; begin == 0 || begin < size_bytes; begin += NOACK_BLOCK_BYTES) {
         int64_t length = min_of(size_bytes - begin, NOACK_BLOCK_BYTES), byte = (bit >> 3) - begin;
@@ -34,7 +33,7 @@ int64_t store_payload(noack_relay *relay, const uint8_t *data, int64_t size_byte
     }
     relay->free_block = block;
     relay->block_next[last] = -1;
-    relay->free_blocks -= count;
+    relay->free_blocks -= blocks_for(size_bytes);
     return number;
 }
 

@@ -30,7 +30,15 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
-from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
+from tests.noack.runtime.live_loops import (
+    HOUR_NS,
+    Live,
+    Rows,
+    measurement,
+    plain,
+    received,
+    scenario,
+)
 from tests.wire_decoder import NO_VECTOR
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -250,6 +258,37 @@ def test_acknowledgements_that_come_together_are_received_though_measurements_fi
         live.drive_until_accepted(14)
         live.drive(lambda: live.driver.core.sources[1].received > 0)
         assert live.driver.core.sources[1].received == len(answers)
+
+
+def test_measurements_do_not_keep_an_acknowledgement_waiting(content: dict[str, Any]) -> None:
+    """They fill all the room of a call; the other socket is read first the next time."""
+    content["network"] |= {"protocol": "ack"}
+    with closing(Live("sensor", [scenario(content)] * 20, acknowledged=True)) as live:
+        live.send(*measurements(3, 20))
+        live.send(Message(Flow.ACKNOWLEDGEMENT, 10, 5, NO_VECTOR, 0), by=live.answers)
+        live.drive_until_accepted(60)
+        table = "sensor_acknowledgement"
+        (at_ns,) = live.rows.of(table, columns(live, table), NOW)
+        times_ns = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
+        assert sum(t_ns > at_ns for t_ns in times_ns) > 20
+
+
+def test_many_rows_are_passed_on_in_portions(content: dict[str, Any]) -> None:
+    """A portion fits into one fragment of a message of the control plane."""
+    portions: list[int] = []
+
+    class Portions(Rows):
+        def extend_table(self, table: str, rows: Any) -> None:
+            portions.append(rows.nbytes)
+            super().extend_table(table, rows)
+
+    with closing(Live("sensor", [scenario(content)] * 20)) as live:
+        live.rows = Portions()
+        live.send(*measurements(60, 20))
+        live.drive_until_accepted(1200)
+        assert len(live.rows.tables[SENSOR_MEASUREMENT]) == 1200
+    assert len(portions) > 1
+    assert max(portions) < 65_000
 
 
 def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -> None:
