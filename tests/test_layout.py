@@ -34,7 +34,7 @@ LINES = {
     "cosim/live": 3600,
     "cosim/measurement": 3050,
     "cosim/output": 8700,
-    "cosim/record": 3300,
+    "cosim/record": 3200,
     "cosim/simulation": 1650,
     "cosim/studies": 6650,
     "plant_server": 450,
