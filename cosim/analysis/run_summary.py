@@ -235,6 +235,8 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
                 for number, notice in enumerate(notices, 1)
             ]  # fmt: skip
             continue
+        if not notices and len(record.begun_lives(role)) == 1:
+            continue
         active_s = {
             life.generation: (_seconds(life.first_ns), _seconds(life.last_ns))
             for life in record.lives(role)

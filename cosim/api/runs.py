@@ -367,7 +367,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
     """
     from cosim.live.finalize import finalize
     from cosim.live.launcher import launch
-    from cosim.live.progress import PatientConsole, progress_line
+    from cosim.live.progress import PipeSafeConsole, progress_line
 
     loaded = load(scenario)
     if threading.current_thread() is not threading.main_thread():
@@ -375,7 +375,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
             "noack.run: a live run is started by the main thread, which signals go to"
         )
     with _folder(runs) as (folder, temporary):
-        console = PatientConsole(stderr=True, quiet=not progress)
+        console = PipeSafeConsole(stderr=True, quiet=not progress)
         with progress_line(console, loaded) as watcher:
             ending = launch(loaded, folder, watcher=watcher)
         outcome = finalize(ending, report=False, view=temporary is None)

@@ -34,7 +34,7 @@ def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, 
     Raises:
         PeerError: the text is no report, or has no entry for a table of the process.
     """
-    report = parse_message(ProcessReport, text)
+    report = parse_message(ProcessReport, text).fields()
     if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
         raise PeerError("the report lacks the number of rows of a table")
     return report
@@ -67,7 +67,7 @@ def add_kept_reports(run_dir: Path) -> None:
     kept = []
     for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
-            report = parse_message(ProcessReport, text)
+            report = parse_message(ProcessReport, text).fields()
             if report.get("process") in LOOP_ROLES and report.get("instance") not in instances:
                 kept.append({"generation": 0} | report)
     if kept:

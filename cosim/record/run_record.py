@@ -44,6 +44,7 @@ from noack.config.resolution import (
     loop_of,
     network_tables,
     resolve,
+    resolved_loops,
     run_tables,
     tables_of,
 )
@@ -52,10 +53,10 @@ from noack.config.scenario import (
     loop_names,
     loop_scenario,
     loop_sections,
-    loops_of,
     phases_ns,
 )
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.protocol.machine_interface import RESTART
@@ -143,6 +144,11 @@ class RunRecord:
         """Return the number of rows of a table."""
         return self.source.count(table)
 
+    @cached_property
+    def is_short(self) -> bool:
+        """Whether the whole record is one part, which is kept in memory."""
+        return not any(self.count(table) > BATCH_ROWS for table in self.tables)
+
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
 
@@ -173,6 +179,7 @@ class RunRecord:
         dtype = with_columns(self.tables[table], names)
         return joined([packed(rows, dtype) for rows in chosen], dtype)
 
+    @cached_method
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
         return self.columns(
@@ -208,6 +215,7 @@ class RunRecord:
             self._lives[role] = lives_of(parts, tables, self.begun_lives(role), reports)
         return self._lives[role]
 
+    @cached_method
     def row_counts(self, role: str) -> list[Life]:
         """The generations of a process in order, of which only rows and reports may be known."""
         if role in self._lives or len(self.begun_lives(role)) > 1:
@@ -215,12 +223,20 @@ class RunRecord:
         counts = {table: self.count(table) for table in self.owned_by(role)}
         return [Life(0, counts, self._reports_of(role).get(0))]
 
+    def is_complete(self, role: str) -> bool:
+        """Whether the record has all rows that a process reported, of all its generations."""
+        return all(
+            one.report is not None and one.report["rows"].items() >= one.rows.items()
+            for one in self.row_counts(role)
+        )
+
     def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
         """The final reports of a process, by generation."""
         newest = [] if role not in self.reports else [self.reports[role]]
         earlier = [report for report in self.earlier if report["process"] == role]
         return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
+    @cached_method
     def begun_lives(self, role: str) -> list[int]:
         """The numbers of the recorded generations of a process, ascending."""
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
@@ -271,6 +287,11 @@ class RecordedRun:
         return phases_ns(self.scenario)
 
     @cached_property
+    def scenarios(self) -> Sequence[Scenario]:
+        """The resolved scenario of each loop."""
+        return resolved_loops(self.scenario)
+
+    @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
         return loop_names(self.scenario)
@@ -308,7 +329,7 @@ class _StoredLoops(Sequence[RunRecord]):
 
     def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
         self._kind, self._stored = network.kind, stored
-        self._loops, self._phases_ns = loops_of(network.scenario), phases_ns(network.scenario)
+        self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
         """The loop that was used last."""
@@ -329,7 +350,7 @@ class _StoredLoops(Sequence[RunRecord]):
         return self._newest
 
     def _record_of(self, number: int) -> RunRecord:
-        loop = resolve(self._loops[number])
+        loop = self._loops[number]
         entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
         source = LoopTables(
             number, tables_of(loop), self._stored, self._shared, self._phases_ns[number]
@@ -467,6 +488,6 @@ def read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
-        return [parse_message(_Notice, line) for line in lines]
+        return [parse_message(_Notice, line).fields() for line in lines]
     except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None

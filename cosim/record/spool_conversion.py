@@ -217,7 +217,7 @@ def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:
     for role in (*LOOP_ROLES, RECORDER):
         for line in stored_lines(spool, role):
             try:
-                notice = parse_message(LogLine, line) | {"process": role}
+                notice = parse_message(LogLine, line).fields() | {"process": role}
             except PeerError:  # damaged
                 continue
             if notice.get(LOOP, 0) not in range(loops):  # damaged

@@ -25,6 +25,7 @@ from cosim.record.record_source import (
     without_loop,
 )
 from cosim.record.spool_conversion import Segment
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
@@ -115,6 +116,7 @@ class StoredTables(RecordSource):
             self._newest[table] = place, rows
         return rows
 
+    @cached_method
     def highest_input(self, table: str) -> int:
         """Return the highest number of an input in a table; −1 without rows."""
         highest = [group.highest_input for group in self._files[table].groups]

@@ -60,7 +60,7 @@ def test_a_run_is_changed_twice_and_survives_a_flood(
     invalid = set_parameters("loss.p", "1.5")
     assert invalid["exit"]["status"] == 2
     assert "should be less than or equal to 1" in invalid["error"]
-    wait_for(lambda: run_registry.request_change(run, {})["t_s"] > second["from_s"] + 1)
+    wait_for(lambda: run_registry.request_change(run, {}).t_s > second["from_s"] + 1)
     running.process.send_signal(signal.SIGTERM)
     finished = running.finish()
 
