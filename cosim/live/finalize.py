@@ -241,7 +241,7 @@ def _with_results(
     over_time = None
     with suppress(Exception):  # the recording reports it
         if len(run.loops) > 1:
-            over_time = loop_over_time(record, run.phases_ns[record.number or 0])
+            over_time = loop_over_time(record, run.phases_ns[record.number])
     return _Judged(summary.with_results(**results), over_time)
 
 

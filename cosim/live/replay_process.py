@@ -22,8 +22,7 @@ from noack.protocol.topology import LOOP_ROLES
 _ENVIRONMENT = ENVIRONMENT | dict.fromkeys(
     ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), f"{32 * 2**20}"
 )
-"""It keeps freed memory: half of its time would be page faults, if each part of the record had new
-memory."""
+"""It keeps freed memory: with new memory for each part, half of its time is page faults."""
 _LEAST_STEPS = 50_000
 """The replay of a shorter run takes less time than the start of a process."""
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
-from noack.config.resolution import is_of_network
+from noack.config.resolution import network_tables
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION
@@ -109,7 +109,7 @@ def _of_loop(
     written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
-    for table in filter(is_of_network, written):
+    for table in written.keys() & network_tables().keys():  # there are rows of notices, too
         written[table] -= others(number, table, report.get("generation", 0))
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])

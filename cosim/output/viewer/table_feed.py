@@ -20,6 +20,7 @@ from cosim.record.align import (
     join,
     true_states,
 )
+from cosim.record.record_source import joined
 from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
 from noack.config.resolution import loop_of, policy_of, tables_of
@@ -153,7 +154,7 @@ class ViewFeed:
         self._deliveries(until_ns)
         taken = self._take(PLANT_STEP, None)
         if self._has_internal_state or not self._scenario.coverage.knows_state:
-            self._steps = np.concatenate([self._steps, taken])
+            self._steps = joined([self._steps, taken], self._steps.dtype)
         self._lateness("plant", taken)
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
@@ -168,7 +169,7 @@ class ViewFeed:
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         waiting = self._pending[table]
-        rows = np.concatenate(waiting) if waiting else np.zeros(0, self._types[table])
+        rows = joined(waiting, self._types[table])
         if until_ns is None:
             self._pending[table] = []
             return rows
@@ -180,28 +181,28 @@ class ViewFeed:
         if not len(rows):
             return
         acknowledged = self._scenario.protocol.acknowledges
-        joined = join(
+        aligned = join(
             self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
         )
         # If the sensor does not measure x exactly, the plant's own x is shown.
         if not self._scenario.coverage.knows_state:
-            joined = joined._replace(x=true_states(self._steps, joined.t_ns))
-        z = true_states(self._steps, joined.t_ns, "z") if self._has_internal_state else None
-        self._steps = self._steps[self._steps["t_ns"] > joined.t_ns[-1]]
-        t_s = np.asarray(joined.t_ns * 1e-9)
+            aligned = aligned._replace(x=true_states(self._steps, aligned.t_ns))
+        z = true_states(self._steps, aligned.t_ns, "z") if self._has_internal_state else None
+        self._steps = self._steps[self._steps["t_ns"] > aligned.t_ns[-1]]
+        t_s = np.asarray(aligned.t_ns * 1e-9)
         bounds = np.column_stack(
-            [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
+            [self._bounds(rows, aligned), self._certified(t_s, "controller_error")]
         )
         if not self._scenario.protocol.acknowledges:
-            bounds[~in_common(self._scenario, joined)] = np.nan
-        curves = [joined.x, joined.x_s, joined.x_c, joined.e_s_norm, joined.e_c_norm, bounds]
-        kept = self._kept(joined.t_ns, np.column_stack(curves))
-        thin = AlignedRun._make(values[kept] for values in joined)
-        of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, joined)])
+            bounds[~in_common(self._scenario, aligned)] = np.nan
+        curves = [aligned.x, aligned.x_s, aligned.x_c, aligned.e_s_norm, aligned.e_c_norm, bounds]
+        kept = self._kept(aligned.t_ns, np.column_stack(curves))
+        thin = AlignedRun._make(values[kept] for values in aligned)
+        of_state = np.column_stack([self._certified(t_s, "state"), self._from_event(rows, aligned)])
         self._view.samples(thin, bounds[kept], of_state[kept])
-        frames = Frames(t_s, joined.x, joined.x_s, joined.x_c, z)
+        frames = Frames(t_s, aligned.x, aligned.x_s, aligned.x_c, z)
         shown = self._kept_frames(len(t_s))
-        self._view.move(joined.t_ns[shown], frames.at(shown))
+        self._view.move(aligned.t_ns[shown], frames.at(shown))
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
             passed_s = _intervals_s(event_ns, self._last_event_ns)
@@ -238,21 +239,21 @@ class ViewFeed:
             return None
         return known_state_bounds(self._scenario, self._certificate)
 
-    def _from_event(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
+    def _from_event(self, rows: Rows, aligned: AlignedRun) -> NDArray[np.float64]:
         """Return the certified bound of ‖x‖ from the newest event on, (k,); NaN for none."""
         if (known := self._known_state) is None:
             return np.full(len(rows), np.nan)
-        t_s, since = np.asarray(rows["t_ns"] * 1e-9), self._follower.take(rows, joined)
+        t_s, since = np.asarray(rows["t_ns"] * 1e-9), self._follower.take(rows, aligned)
         moved = known.state_deviation(t_s, since.age_s, since.missing)
         bound = np.fmin(row_norms(since.predicted) + moved, self._certified(t_s, "state"))
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
-    def _bounds(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
+    def _bounds(self, rows: Rows, aligned: AlignedRun) -> NDArray[np.float64]:
         """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
         if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
         e_s = rows["x_s"] - rows["x"]
-        return self._monitor.take(rows["t_ns"], e_s, rows["event"], joined.received).identity
+        return self._monitor.take(rows["t_ns"], e_s, rows["event"], aligned.received).identity
 
     def _kept(self, t_ns: Times, values: Reals) -> NDArray[np.intp]:
         """Return the rows to show of curves, (k,) or (k, n)."""
