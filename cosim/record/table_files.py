@@ -153,8 +153,10 @@ class TableFile:
 
     def __init__(self, path: Path, dtype: RowType, most_rows: int = MOST_ROWS) -> None:
         self._path, self._dtype = path, dtype
+        self._metadata: pq.FileMetaData | None = None
+        """Kept, since that of a file with many groups takes milliseconds to read."""
         with self._open() as file:
-            metadata = file.metadata
+            metadata = self._metadata = file.metadata
             groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
         self.rows = int(metadata.num_rows)
         if self.rows > most_rows:
@@ -202,7 +204,7 @@ class TableFile:
 
     @contextmanager
     def _open(self) -> Iterator[pq.ParquetFile]:
-        with _readable(self._path), pq.ParquetFile(self._path) as file:
+        with _readable(self._path), pq.ParquetFile(self._path, metadata=self._metadata) as file:
             _require_columns(self._path, file.schema_arrow, self._dtype)
             yield file
 
