@@ -58,7 +58,7 @@ def integrated(
 
     def excess(t_s: float, z: Vector) -> float:
         error = float(np.linalg.norm(z[n : 2 * n] - z[:n]))
-        return error - trigger.beta * float(np.exp(-trigger.alpha_per_s * t_s))
+        return error - trigger.level * float(np.exp(-trigger.rate_per_s * t_s))
 
     excess.terminal, excess.direction = True, 1.0  # type: ignore[attr-defined]
     t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]

@@ -154,8 +154,7 @@ _STDOUT = 1
 class _Batch(NamedTuple):
     events: Events
     data: Bytes
-    missing: NDArray[np.int64]
-    """(interfaces,) Number of missing events before this batch."""
+    missing: NDArray[np.int64]  # (interfaces,) Number of missing events before this batch
 
 
 class CaptureWriter:

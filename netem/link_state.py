@@ -202,7 +202,6 @@ class LinkState:
         return link
 
     def _point(self, link: Any) -> None:
-        """Write the addresses of all arrays."""
         for name, array in self._memory.items():
             setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
 

@@ -208,7 +208,6 @@ def socket_name(address: Address, what: str) -> SocketName:
 
 
 def _udp_socket(name: SocketName) -> Endpoint:
-    """Return a socket of the family of an address."""
     family = socket.AF_INET if len(name) == 2 else socket.AF_INET6
     return socket.socket(family, socket.SOCK_DGRAM)
 

@@ -161,7 +161,6 @@ class RelayMemory:
         relay.slots = pointer_to(slots, "noack_slot *")
 
     def _add_chunk(self) -> None:
-        """Add a chunk of blocks."""
         relay, blocks = self.core, core.NOACK_CHUNK_BLOCKS
         self._chunks.append(np.empty(blocks * core.NOACK_BLOCK_BYTES, np.uint8))
         begin = len(self._block_next)

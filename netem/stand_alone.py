@@ -10,7 +10,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,6 @@ _SPIN_NS = 50_000
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for running and recording a relay."""
     group = parser.add_argument_group("relay")
     group.add_argument(
         "--segment", action="store_true",
@@ -119,14 +118,14 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
     Raises:
         CallerError: an address is in use, or a file cannot be written.
     """
-    attachments = options_of(options)
+    check_watching_options(options)
     if options.capture == "-" and (options.json or options.stats is not None):
         raise CallerError("--capture -: --json and --stats use standard output, too")
     _check_files(options)
     if options.replay_fates is not None:
         specs = _replaying(specs, options.replay_fates)
     with ExitStack() as last, ExitStack() as stack:
-        with starting(attachments.name):
+        with starting(options.control):
             taps: list[Tap] = []
             if options.capture is not None:
                 taps.append(stack.enter_context(_capture(options.capture, specs)))
@@ -136,14 +135,15 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
             stack.callback(opened.close)
             # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
-            side = stack.enter_context(attached(opened, attachments))
+            side = stack.enter_context(attached(opened, options))
         for setting, answer in stack.enter_context(
             realtime(options.realtime, _FIFO_PRIORITY)
         ).items():
             if answer.startswith("refused"):
                 say(f"{setting} {answer}")
-        takes_output = options.capture == "-" or attachments.takes_output
-        _report_ready(opened, print_it=not takes_output, as_json=options.json)
+        takes_output = options.view or (options.stats is not None and options.stats_file is None)
+        is_free = options.capture != "-" and not takes_output
+        _report_ready(opened, print_it=is_free, as_json=options.json)
         opened.run(
             lambda: side.quit_requested or signals.received is not None, side.commands.run_pending
         )
@@ -222,28 +222,7 @@ _SWITCH_S = 0.0002
 """Maximum time for which another thread holds the interpreter lock before the relay's thread."""
 
 
-class Options(NamedTuple):
-    """Options for watching and changing a relay."""
-
-    name: str | None = None
-    """Name for live control; None: no live control."""
-    stats_s: float | None = None
-    """Time between two lines of statistics; None: no lines."""
-    stats_file: Path | None = None
-    """File for the lines; None: standard output."""
-    metrics: str | None = None
-    """Address of the metrics; None: no metrics."""
-    view: bool = False
-    """Show live statistics in the terminal."""
-
-    @property
-    def takes_output(self) -> bool:
-        """Whether the live screen or the lines of statistics use standard output."""
-        return self.view or (self.stats_s is not None and self.stats_file is None)
-
-
 def _add_watching_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for watching and changing a relay to a command line."""
     group = parser.add_argument_group("statistics and changes during operation")
     group.add_argument(
         "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
@@ -252,7 +231,9 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
         "--stats", metavar="SECONDS", type=float,
         help="print statistics as JSON lines every SECONDS",
     )  # fmt: skip
-    group.add_argument("--stats-file", metavar="FILE", help="write these lines to FILE instead")
+    group.add_argument(
+        "--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead"
+    )
     group.add_argument(
         OPTION, metavar="[HOST]:PORT",
         help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
@@ -264,28 +245,24 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 
 
-def options_of(parsed: argparse.Namespace) -> Options:
-    """Return the options of :func:`_add_watching_options`.
+def check_watching_options(options: argparse.Namespace) -> None:
+    """Check the options of :func:`_add_watching_options`; a file alone gets a line each second.
 
     Raises:
         CallerError: two options contradict each other.
     """
-    stats_s, file = parsed.stats, parsed.stats_file
-    if stats_s is not None and not (math.isfinite(stats_s) and stats_s >= 0.01):
-        raise CallerError(f"--stats {stats_s:g}: must be 0.01 s or more")
-    if file is not None and stats_s is None:
-        stats_s = 1.0
-    if parsed.view and stats_s is not None and file is None:
+    if options.stats is not None and not (math.isfinite(options.stats) and options.stats >= 0.01):
+        raise CallerError(f"--stats {options.stats:g}: must be 0.01 s or more")
+    if options.stats is None and options.stats_file is not None:
+        options.stats = 1.0
+    if options.view and options.stats is not None and options.stats_file is None:
         raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
-    path = Path(file) if file is not None else None
-    return Options(parsed.control, stats_s, path, parsed.metrics, parsed.view)
 
 
 class AttachedRelay(NamedTuple):
     """The relay thread's access to the threads that watch the relay."""
 
-    commands: CommandQueue
-    """To be run in the relay's thread, at least every 50 ms."""
+    commands: CommandQueue  # To be run in the relay's thread, at least every 50 ms
     screen: Screen | None
 
     @property
@@ -295,7 +272,7 @@ class AttachedRelay(NamedTuple):
 
 
 @contextmanager
-def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
+def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRelay]:
     """Watch a relay within the context; the relay runs within it and is closed after it.
 
     Enter the context before the relay's thread applies real-time settings: new threads would
@@ -308,15 +285,14 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
     commands = CommandQueue(relay)
     screen = None
     with ExitStack() as stack:
-        if options.stats_s is not None:
-            stack.enter_context(_statistics_lines(commands, options.stats_s, options.stats_file))
+        if options.stats is not None:
+            stack.enter_context(_statistics_lines(commands, options.stats, options.stats_file))
         if options.metrics is not None:
             stack.enter_context(_metrics(commands, options.metrics))
-        if options.name is not None:
-            stack.enter_context(ControlServer(options.name, commands))
+        if options.control is not None:
+            stack.enter_context(ControlServer(options.control, commands))
         if options.view:
-            title = "noack netem" if options.name is None else f"noack netem {options.name}"
-            screen = stack.enter_context(Screen(title))
+            screen = stack.enter_context(Screen(f"noack netem {options.control or ''}".strip()))
             stack.enter_context(
                 StatisticsThread(commands, _VIEW_S, screen.show, poll=screen.poll, poll_s=_POLL_S)
             )
@@ -328,7 +304,6 @@ def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
 
 @contextmanager
 def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
-    """Serve metrics within the context."""
     require_package()
     from netem.control.emulator_metrics import EmulatorMetrics
 
@@ -368,20 +343,18 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
             file.close()
 
 
-_COUNTS: dict[str, Callable[[DirectionStatistics], int]] = {
-    "dropped by a loss model": lambda side: side["fates"]["dropped"],
-    "corrupted": lambda side: side["fates"]["corrupted"],
-    "dropped by a full queue": lambda side: side["fates"]["overflowed"],
-    "dropped in a blackout": lambda side: side["fates"]["blacked_out"],
-    "forced by the guarantee": lambda side: side["fates"]["forced"],
-    "delivered out of order (stale)": lambda side: side["delivered_out_of_order"],
-    "held back for the guarantee": lambda side: side["held_back"],
-    "duplicated": lambda side: side["duplicated"],
-    "in flight at the end": lambda side: side["in_flight"],
+_COUNTS: Mapping[str, str] = {
+    "dropped by a loss model": "dropped",
+    "corrupted": "corrupted",
+    "dropped by a full queue": "overflowed",
+    "dropped in a blackout": "blacked_out",
+    "forced by the guarantee": "forced",
+    "delivered out of order (stale)": "delivered_out_of_order",
+    "held back for the guarantee": "held_back",
+    "duplicated": "duplicated",
+    "in flight at the end": "in_flight",
 }
-"""Rows that are shown if their value is not 0."""
-
-
+"""Rows that are shown if their value is not 0: label, and fate or key of the statistics."""
 _Row = tuple[str, Sequence[str], str]
 """Label, a text per direction, style."""
 
@@ -422,9 +395,10 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
 
     yield row("received", lambda side: f"{side['received']:,}")
     yield row("forwarded", lambda side: f"{side['forwarded']:,}")
-    for label, count in _COUNTS.items():
-        if any(map(count, sides)):
-            yield row(label, _number(count))
+    for label, key in _COUNTS.items():
+        counts = [{**side, **side["fates"]}[key] for side in sides]
+        if any(counts):
+            yield label, [f"{count:,}" for count in counts], ""
     if any(side["received_before"] for side in sides):
         yield "since the last change:", (), "dim"
     yield row("longest loss burst", burst_text)
@@ -447,10 +421,6 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
         yield ("port unreachable (ICMP)", (f"≥ {link['port_unreachable']:,}",), "yellow")
     if link["discarded"]:
         yield "answers discarded (--one-way)", ("", f"{link['discarded']:,}"), ""
-
-
-def _number(count: Callable[[DirectionStatistics], int]) -> Callable[[DirectionStatistics], str]:
-    return lambda side: f"{count(side):,}"
 
 
 def _times(times: DelayQuantiles) -> str:

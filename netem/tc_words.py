@@ -23,8 +23,9 @@ from pydantic import (
 from netem.relay_links import LinkSpec
 from noack.config import toml_file
 from noack.core.errors import CallerError, shortened
+from noack.impairments.clauses import Table
 from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
-from noack.impairments.feature import Constraint, Feature, Impairment, Table
+from noack.impairments.feature import Constraint, Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
 from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings
@@ -38,25 +39,31 @@ _REFUSED = {
     "ecn": "this emulator cannot mark packets: it sees payloads, not IP headers",
 }
 _KINDS: Sequence[type[Feature]] = (*IMPAIRMENTS, *CONSTRAINTS)
-_FEATURES = {word.name: (kind, word) for kind in _KINDS for word in kind.words if word.read}
+_CLAUSES = {
+    name: (kind, clause)
+    for kind in _KINDS for clause in kind.clauses for name in (clause.word, *clause.synonyms)
+}  # fmt: skip
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
-KEYWORDS = (*_FEATURES, *_SETTINGS, "seed")
+KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 """Words that begin a clause."""
-_AFTER: dict[str, str] = {}
+_WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.described()]
+_AFTER = {
+    word.name: ", or after ".join(other.after for other in _WORDS if other.name == word.name)
+    for word in _WORDS if word.name not in _CLAUSES
+}  # fmt: skip
 """For each word that begins no clause: the words after which it is allowed."""
-for _kind in _KINDS:
-    for _word in _kind.words:
-        if _word.name not in _FEATURES:
-            places = [_AFTER[_word.name]] if _word.name in _AFTER else []
-            _AFTER[_word.name] = ", or after ".join([*places, _word.after])
 EXAMPLES: Mapping[str, str] = {
-    **{word.name: word.example for kind in _KINDS for word in kind.words},
+    **{word.name: word.example for word in _WORDS},
     "mansd": "mansd 4",
     "first": "first",
     "limit": "limit 1000",
 }
 """By word; ``seed`` is missing because it is also an option."""
-GRAMMAR = [word.grammar for kind in IMPAIRMENTS for word in kind.words if word.grammar]
+GRAMMAR = [
+    word.grammar
+    for kind in IMPAIRMENTS for clause in kind.clauses for word in clause.described()
+    if word.grammar
+]  # fmt: skip
 """The words of each impairment, for ``--help``."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
 _CONSTRAINT: TypeAdapter[Any] = TypeAdapter(AnyConstraint)
@@ -68,8 +75,7 @@ class LinkWords(NamedTuple):
     """Settings in words."""
 
     settings: LinkSettings
-    seed: int | None
-    """Seed of the random streams, if the words contain one."""
+    seed: int | None  # Seed of the random streams, if the words contain one
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:
@@ -89,10 +95,9 @@ def parse(words: str | Sequence[str]) -> LinkWords:
             reader.wrong(f"goes right after {_AFTER[word]}")
         if word not in KEYWORDS:
             reader.unknown(word, KEYWORDS)
-        if word in _FEATURES:
-            kind, found = _FEATURES[word]
-            assert found.read is not None
-            table = {"kind": kind.model_fields["kind"].default, **found.read(reader)}
+        if word in _CLAUSES:
+            kind, clause = _CLAUSES[word]
+            table = {"kind": kind.model_fields["kind"].default, **clause.read(reader)}
             if issubclass(kind, Constraint):
                 constraints.append(_validated(_CONSTRAINT, table, reader))
                 continue
@@ -170,7 +175,8 @@ def _message(error: ValidationError) -> str:
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
     name = next((f"{part} " for part in reversed(first["loc"]) if isinstance(part, str)), "")
-    return name + first["msg"].removeprefix("Input ").removeprefix("Tuple ")
+    what = "is missing" if first["type"] == "missing" else first["msg"]
+    return name + what.removeprefix("Input ").removeprefix("Tuple ")
 
 
 def _check_place(

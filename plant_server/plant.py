@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
+from noack.config.sections import PlantSection
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
@@ -109,15 +110,11 @@ _POLICIES = {
 class Watchdog:
     """Settings of a plant's watchdog."""
 
-    timeout_ns: int = NEVER_NS
-    """The policy chooses the input if the newest actuation is older."""
+    timeout_ns: int = NEVER_NS  # The policy chooses the input if the newest actuation is older
     policy: str = "hold"
-    notice_ns: int = 0
-    """Age from which a notice reports it; at least the timeout."""
-    H: Matrix | None = None
-    """The controller's model, (n, n), of policy ``model``."""
-    K: Matrix | None = None
-    """Its gain, (m, n)."""
+    notice_ns: int = 0  # Age from which a notice reports it; at least the timeout
+    H: Matrix | None = None  # The controller's model, (n, n), of policy ``model``
+    K: Matrix | None = None  # Its gain, (m, n)
 
     @property
     def is_predictive(self) -> bool:
@@ -172,6 +169,7 @@ class Plant:
         measuring: the measurement model; None if y = x.
         reports_inputs: whether a measurement also carries the inputs of the steps since the last
             measurement. These are the latched inputs, without the disturbance.
+        section: the scenario's table of it, by which loops with the same plant are known.
     """
 
     system: PlantSystem
@@ -185,6 +183,7 @@ class Plant:
     disturbance: Disturbance | None = None
     measuring: MeasurementModel | None = None
     reports_inputs: bool = False
+    section: PlantSection | None = None
 
     role = PLANT
     schedule = None
@@ -288,10 +287,7 @@ class Plant:
 
 
 def plants_of(
-    loops: Sequence[Scenario],
-    phases_ns: Sequence[int] | None = None,
-    *,
-    start: Start = BEGINNING,
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
 ) -> LoopMachines:
     """Return the plants of resolved loops as the machines of a process.
 
@@ -314,10 +310,14 @@ def _part(resolved: Scenario) -> Plant:
         disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
+        section=resolved.plant,
     )
 
 
 def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
+    is_repeated = isinstance(plant.system, LinearSystem) and resolved.plant is plant.section
+    if is_repeated and plant.disturbance is None and plant.measuring is None:
+        return plant
     return replace(
         plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),

@@ -245,9 +245,8 @@ class Sensor:
             memory.fill(sensor.rule, {"weight": policy.weight})
             sensor.scratch = memory.zeros(5 * n)
             return
-        rule = policy.trigger_rule(n)
-        fill_rule(sensor.rule, rule, policy.weight, policy.initial_dynamic_variable, memory)
-        sensor.scratch = memory.zeros(4 * n + rule_rows(rule))
+        fill_rule(sensor.rule, policy, n, memory)
+        sensor.scratch = memory.zeros(4 * n + rule_rows(policy))
         if sensor.trigger.event_ns >= 0:
             core.noack_trigger_condition(
                 ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n,
@@ -279,10 +278,7 @@ def _or_zero(setpoint: Vector | None) -> Vector:
 
 
 def sensors_of(
-    loops: Sequence[Scenario],
-    phases_ns: Sequence[int] | None = None,
-    *,
-    start: Start = BEGINNING,
+    loops: Sequence[Scenario], phases_ns: Sequence[int] | None = None, *, start: Start = BEGINNING
 ) -> LoopMachines:
     """Return the sensors of resolved loops as the machines of a process.
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from cosim.live.progress import PatientConsole
+from cosim.live.progress import error_console
 from cosim.measurement.chain_fits import ChainFit
 from cosim.measurement.measurement_page import print_measurement, write_page
 from cosim.measurement.network_measurement import Measurement
@@ -59,7 +59,7 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
-    with PatientConsole(stderr=True).status("measuring"):
+    with error_console().status("measuring"):
         void = None if request.scenario is None else found.certificate_time(request.scenario)
         document = found.to_json()
     if console is not None:

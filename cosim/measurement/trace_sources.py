@@ -32,6 +32,7 @@ from noack.core.file_access import open_regular
 from noack.impairments.kinds.opportunities import OPPORTUNITY_BYTES, Opportunities
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, Fate
+from noack.settings.user_files import NamedFile
 from noack.traces.capture_packets import is_capture
 from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
 from noack.traces.packet_trace import (
@@ -252,7 +253,7 @@ def read_opportunities(path: Path, period_ns: int) -> PacketTrace:
     Raises:
         CallerError: one line; the file cannot be read, or is wrong.
     """
-    read = Opportunities(file=str(path.absolute())).without_files(Path("/"), "")
+    read = Opportunities(file=str(path)).read_file(NamedFile(str(path), Path()))
     times_ms = np.array(read.times_ms)
     probes = read.length_ns // period_ns
     if not 1 <= probes <= _MOST_PROBES:

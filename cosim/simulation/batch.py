@@ -14,13 +14,13 @@ from cosim.simulation.exact_simulation import ROW as ROW
 from cosim.simulation.exact_simulation import EventLog, ExactSimulation
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.config.resolution import loop_of, policy_of
+from noack.config.resolution import loop_of, rule_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
 from noack.impairments.link_settings import LinkSettings
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import TriggerRule
 
 
 class Population(NamedTuple):
@@ -44,7 +44,7 @@ class Setting:
     """Matrix of both models between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
     K: Matrix
     """Gain, (m, n)."""
-    trigger: Policy
+    trigger: TriggerRule
     link: LinkSettings
     """Losses, corruption and the cap, as in ``network_fates``."""
     horizon_s: float
@@ -66,6 +66,8 @@ class Events(NamedTuple):
     """(k,)"""
     delivered: NDArray[np.bool_]
     """(k,)"""
+    states: NDArray[np.float64]
+    """(x, e_s, e_c) just before the events, (k, 3, n)."""
 
 
 def setting_of(resolved: Scenario) -> Setting:
@@ -80,7 +82,7 @@ def setting_of(resolved: Scenario) -> Setting:
     return Setting(
         H=loop.H,
         K=loop.K,
-        trigger=policy_of(resolved),
+        trigger=rule_of(resolved),
         link=timeless(resolved.network.link),
         horizon_s=resolved.horizon_s,
         known_start=resolved.network.initial_sync == "known_state",
@@ -115,21 +117,20 @@ def run_with_events(
 ) -> tuple[NDArray[np.void], list[Events]]:
     """Run every draw; return its row, as :func:`run_batch` does, and its events.
 
-    The memory for the events is 9 bytes times ``setting.most_events`` for each draw.
+    There is room for ``setting.most_events`` events of each draw; only the used part takes memory.
     """
     rows, log = _run(setting, population, setting.most_events)
-    counts = rows["transmissions"].tolist()
-    return rows, [
-        Events(log.event_s[run, :events], log.delivered[run, :events])
-        for run, events in enumerate(counts)
-    ]
+    assert log.states is not None
+    events = rows["transmissions"].tolist()
+    parts = zip(events, log.event_s, log.delivered, log.states, strict=True)
+    return rows, [Events(*(part[:count] for part in own)) for count, *own in parts]
 
 
 def _run(
     setting: Setting, population: Population, places: int
 ) -> tuple[NDArray[np.void], EventLog]:
     _check(setting, population)
-    if (gone_s := vanishes_s(setting.trigger, len(setting.H))) < setting.horizon_s:
+    if (gone_s := vanishes_s(setting.trigger)) < setting.horizon_s:
         raise vanished(gone_s)
     names = stream_names(setting.link, UPDATE_LINK)
     keys = np.zeros((len(population.A), len(names), 2), np.int64)
@@ -140,7 +141,7 @@ def _run(
         known_start=setting.known_start, link=LinkState(setting.link, 0, UPDATE_LINK),
         Q=setting.Q, R=setting.R, settle=setting.settle, most_events=setting.most_events,
     )  # fmt: skip
-    return simulation.runs(*population[:3], keys, places)
+    return simulation.runs(*population[:3], keys, places, states=places > 0)
 
 
 def _check(setting: Setting, population: Population) -> None:
@@ -166,7 +167,7 @@ def _check(setting: Setting, population: Population) -> None:
             "network.impairments: a batch knows losses and corruption only; "
             "leave out what takes time"
         )
-    rule = setting.trigger.trigger_rule(n)
+    rule = setting.trigger
     for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):
         for part in form:
             if part.shape[1] != 2 * n:

@@ -34,7 +34,7 @@ from cosim.simulation.exact_simulation import (
 )
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState
-from noack.config.resolution import LoopMatrices, loop_of, policy_of
+from noack.config.resolution import LoopMatrices, loop_of, rule_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core
 from noack.core.errors import CallerError, ExitStatus
@@ -43,8 +43,7 @@ from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import TriggerRule
 
 _SMALLEST_THRESHOLD = 1e-140
 """Below it, the threshold's square or its significant bits would underflow."""
@@ -81,7 +80,7 @@ class Samples(NamedTuple):
 class ContinuousLoop:
     """The loop in continuous time, under any policy."""
 
-    def __init__(self, loop: LoopMatrices, trigger: Policy) -> None:
+    def __init__(self, loop: LoopMatrices, trigger: TriggerRule) -> None:
         self.loop = loop
         self.trigger = trigger
         self._between = self.simulation(0.0, known_start=True)
@@ -102,13 +101,13 @@ class ContinuousLoop:
         return np.block([[loop.A + BK, none, BK], [-E, loop.H, -BK], [-E, none, loop.H - BK]])
 
     @property
-    def decaying(self) -> DecayingTrigger:
+    def decaying(self) -> TriggerRule:
         """The trigger, which must be the paper's.
 
         Raises:
             CallerError: the policy is another one.
         """
-        if not isinstance(self.trigger, DecayingTrigger):
+        if not self.trigger.is_decaying:
             raise CallerError(
                 "trigger.policy: with a continuous trigger (--trigger continuous) only "
                 '"decaying" is searched'
@@ -148,9 +147,8 @@ def reset(state: LoopState, delivered: bool) -> LoopState:
     return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
 
 
-def vanishes_s(trigger: Policy, n: int) -> float:
+def vanishes_s(rule: TriggerRule) -> float:
     """Return the time from which a threshold is too small to compute with; infinity for never."""
-    rule = trigger.trigger_rule(n)
     if rule.from_event or rule.rate_per_s == 0 or rule.floor >= _SMALLEST_THRESHOLD:
         return math.inf
     return math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
@@ -175,7 +173,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
         resolved.coverage.require_exact()
     except CallerError as error:
         raise CallerError(f"with a continuous trigger (--trigger continuous): {error}") from None
-    return ContinuousLoop(loop_of(resolved), policy_of(resolved))
+    return ContinuousLoop(loop_of(resolved), rule_of(resolved))
 
 
 MAX_EVENTS = 100_000
@@ -271,7 +269,7 @@ def simulate_continuous(
             the run cannot be decided.
     """
     loop, fates = system.loop, [] if callable(delivered) else list(delivered)
-    until_s = min(horizon_s, vanishes_s(system.trigger, loop.n))
+    until_s = min(horizon_s, vanishes_s(system.trigger))
     x0, places = np.array(loop.x0 if x0 is None else x0, np.float64), min(_PLACES, max_events)
     while True:
         if callable(delivered):
@@ -400,7 +398,7 @@ def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
 
 
 def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
-    if not isinstance(run.system.trigger, DecayingTrigger):
+    if not run.system.trigger.is_decaying:
         return None
     return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
 

@@ -14,7 +14,7 @@ from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.trigger.trigger_rule import Policy, fill_rule
+from noack.trigger.trigger_rule import TriggerRule, fill_rule
 
 ROW = dtype_of("noack_exact_row")
 """The row of a run: ``noack_exact_row`` of native/noack.h."""
@@ -63,7 +63,7 @@ class ExactSimulation:
     Args:
         H: matrix of both models between updates, (n, n).
         K: gain, (m, n).
-        trigger: the policy.
+        trigger: the trigger rule.
         horizon_s: end of the runs.
         known_start: both models start from x(0); else from 0, and event 0 happens at t = 0.
         link: decides which updates arrive.
@@ -79,7 +79,7 @@ class ExactSimulation:
         self,
         H: Matrix,
         K: Matrix,
-        trigger: Policy,
+        trigger: TriggerRule,
         *,
         horizon_s: float,
         known_start: bool,
@@ -95,12 +95,10 @@ class ExactSimulation:
         self.n, self.m, self._link, self._memory = n, m, link, CoreMemory()
         self.core: Any = ffi.new("noack_exact *")
         """The structure, as the core's functions take it."""
-        rule = trigger.trigger_rule(n)
-        start = trigger.initial_dynamic_variable
-        fill_rule(self.core.rule, rule, trigger.weight, start, self._memory)
+        fill_rule(self.core.rule, trigger, n, self._memory)
         self._memory.fill(self.core, {
             "n": n, "m": m, "H": H, "K": K, "horizon_s": horizon_s, "known_start": known_start,
-            "most_events": 2**62, "fading_per_s": rule.fading_per_s, "fading_until_s": np.inf,
+            "most_events": 2**62, "fading_per_s": trigger.fading_per_s, "fading_until_s": np.inf,
             **numbers,
         })  # fmt: skip
         if link is not None:

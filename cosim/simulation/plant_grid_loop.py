@@ -26,7 +26,7 @@ from cosim.simulation.continuous import ContinuousLoop
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.trigger.trigger_rule import Policy, fill_rule, rule_rows
+from noack.trigger.trigger_rule import TriggerRule, fill_rule, rule_rows
 
 NO_ACTUATION = -1
 """Model time of a step without any actuation yet."""
@@ -179,11 +179,10 @@ class _Update(NamedTuple):
 class _CoreTrigger:
     """Tests measurements as the sensor does: the core's trigger."""
 
-    def __init__(self, policy: Policy, n: int) -> None:
-        self._n, self._memory, rule = n, CoreMemory(), policy.trigger_rule(n)
-        start = policy.initial_dynamic_variable
+    def __init__(self, rule: TriggerRule, n: int) -> None:
+        self._n, self._memory, start = n, CoreMemory(), rule.initial_dynamic_variable
         self._rule, self._sides = ffi.new("noack_trigger_rule *"), ffi.new("double[2]")
-        fill_rule(self._rule, rule, policy.weight, start, self._memory)
+        fill_rule(self._rule, rule, n, self._memory)
         self._state = ffi.new("noack_trigger_state *", {"auxiliary": start, "event_ns": -1})
         self._scratch = self._memory.zeros(4 * n + rule_rows(rule))
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from noack.config.resolution import assumed_model, loop_of, policy_of
+from noack.config.resolution import assumed_model, loop_of, rule_of
 from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
@@ -96,7 +96,7 @@ class SampledLoop:
         """Steps from one measurement to the next."""
         self.weight = np.eye(n) if self.matrices.weight is None else self.matrices.weight
         self.delay_ns = network_delay_ns(resolved, 0)
-        self._first_auxiliary = policy_of(resolved).initial_dynamic_variable
+        self._first_auxiliary = rule_of(resolved).initial_dynamic_variable
         self._most_in_flight = self.delay_ns // timing.measurement_period_ns + 2
         assumed, measurements = assumed_model(resolved), self.last // self.every + 1
         self._C, self._gains = assumed.C, np.zeros((0, n, len(assumed.C)))

@@ -10,7 +10,7 @@ A query with a mistake is answered with one line, and changes nothing.
 import json
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -40,23 +40,19 @@ def _in_use(name: str) -> CallerError:
 
 
 @contextmanager
-def _locked(kind: str, name: str) -> Iterator[Path]:
-    require_name(name, "emulator")
-    with ExitStack() as stack:
-        try:
-            path = stack.enter_context(private_folder.lock_file(kind, name, {}))
-        except FileExistsError:
-            raise _in_use(name) from None
-        yield path
-
-
-def published(name: str) -> AbstractContextManager[Path]:
+def published(name: str, folder: str = EMULATORS) -> Iterator[Path]:
     """Keep an emulator's file within the context.
 
     Raises:
         CallerError: the name is not allowed or in use, or the folder is not the user's own.
     """
-    return _locked(EMULATORS, name)
+    require_name(name, "emulator")
+    with ExitStack() as stack:
+        try:
+            path = stack.enter_context(private_folder.lock_file(folder, name, {}))
+        except FileExistsError:
+            raise _in_use(name) from None
+        yield path
 
 
 @contextmanager
@@ -69,7 +65,7 @@ def starting(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    with _locked(_STARTING, name):
+    with published(name, _STARTING):
         if name in running():
             raise _in_use(name)
         yield
@@ -158,12 +154,15 @@ class ControlServer:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(published(self._name))
-            self._session = self._open()
+            try:
+                self._session = open_session(EMULATORS, self._name, listen=True)
+            except zenoh.ZError as error:
+                raise MachineError(f"live control cannot be started: {cause_of(error)}") from None
             stack.callback(self._session.close)
             self._queryables = [
                 (self._session.declare_queryable(self._key(what), RingChannel(_QUERIES)), answer)
                 for what, answer in (
-                    ("report", self._report),
+                    ("report", lambda _: self._thread.now()),
                     ("settings", self._settings),
                     ("change", self._change),
                 )
@@ -174,12 +173,6 @@ class ControlServer:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    def _open(self) -> zenoh.Session:
-        try:
-            return open_session(EMULATORS, self._name, listen=True)
-        except zenoh.ZError as error:
-            raise MachineError(f"live control cannot be started: {cause_of(error)}") from None
 
     def _key(self, what: str) -> str:
         return f"netem/{self._name}/{what}"
@@ -208,9 +201,6 @@ class ControlServer:
             query.reply_err(f"internal error of the emulator: {error!r}")
         finally:
             query.drop()  # type: ignore[no-untyped-call]
-
-    def _report(self, _: Mapping[str, Any]) -> object:
-        return self._thread.now()
 
     def _settings(self, _: Mapping[str, Any]) -> object:
         links = [

@@ -4,24 +4,14 @@ A module of its own: prometheus_client is an optional package.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from prometheus_client import Metric
-from prometheus_client.metrics_core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-)
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
-from netem.control.emulator_statistics import (
-    CommandQueue,
-    DirectionStatistics,
-    Statistics,
-    statistics,
-)
-from netem.relay_links import (
-    DIRECTIONS,
-)
+from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
+from netem.relay_links import DIRECTIONS
 from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
 
@@ -29,38 +19,46 @@ _PREFIX = "noack_netem"
 _FRESH_S = 0.1
 """Newer statistics answer a further request, so that frequent readers do not load the relay."""
 
-_COUNTERS: Mapping[str, tuple[Callable[[DirectionStatistics], int], str]] = {
-    "received_datagrams": (lambda one: one["received"], "datagrams received"),
-    "received_bytes": (lambda one: one["received_bytes"], "bytes received, payload only"),
-    "forwarded_datagrams": (lambda one: one["forwarded"], "datagrams forwarded, copies included"),
-    "forwarded_bytes": (lambda one: one["forwarded_bytes"], "bytes forwarded, payload only"),
-    "duplicated_datagrams": (lambda one: one["duplicated"], "copies made"),
-    "stale_datagrams": (lambda one: one["delivered_out_of_order"],
-                        "datagrams delivered out of order"),
-    "held_back_datagrams": (lambda one: one["held_back"],
-                            "datagrams held back for the guarantee"),
-}  # fmt: skip
-_GAUGES: Mapping[str, tuple[Callable[[DirectionStatistics], float | None], str]] = {
-    "in_flight_datagrams": (lambda one: one["in_flight"], "datagrams inside the emulator"),
-    "longest_loss_burst": (lambda one: one["longest_loss_burst"],
-                           "most consecutive losses of a flow under the present settings"),
-    "loss_burst_limit": (lambda one: one["mansd"],
-                         "most consecutive losses that the guarantee allows (M - 1)"),
-    "loss_ratio": (lambda one: one["loss"]["realised"],
-                   "share of the datagrams not effectively delivered, present settings"),
-    "predicted_loss_ratio": (lambda one: one["loss"]["predicted"],
-                             "expected share of datagrams lost by a random draw"),
-}  # fmt: skip
-_TIMES = {
-    "delay_seconds": ("delay_ns", "time in the emulator, quantiles since its start"),
-    "lateness_seconds": ("lateness_ns", "lateness of the emulator, quantiles since its start"),
-}
-_QUANTILES = {"p50": "0.5", "p99": "0.99", "p999": "0.999", "max": "1"}
+_LABELS = ["link", "direction"]
 _OF_LINK = {
     "refused_datagrams": ("refused", "datagrams of clients beyond the limit"),
     "discarded_datagrams": ("discarded", "datagrams that no client waits for"),
     "port_unreachable": ("port_unreachable", "answers that no process listens"),
 }
+_COUNTERS = {
+    "received_datagrams": ("received", "datagrams received"),
+    "received_bytes": ("received_bytes", "bytes received, payload only"),
+    "forwarded_datagrams": ("forwarded", "datagrams forwarded, copies included"),
+    "forwarded_bytes": ("forwarded_bytes", "bytes forwarded, payload only"),
+    "duplicated_datagrams": ("duplicated", "copies made"),
+    "stale_datagrams": ("delivered_out_of_order", "datagrams delivered out of order"),
+    "held_back_datagrams": ("held_back", "datagrams held back for the guarantee"),
+}
+_GAUGES = {
+    "in_flight_datagrams": ("in_flight", "datagrams inside the emulator"),
+    "longest_loss_burst": (
+        "longest_loss_burst", "most consecutive losses of a flow under the present settings",
+    ),
+    "loss_burst_limit": ("mansd", "most consecutive losses that the guarantee allows (M - 1)"),
+}  # fmt: skip
+_LOSSES = {
+    "loss_ratio": (
+        "realised", "share of the datagrams not effectively delivered, present settings",
+    ),
+    "predicted_loss_ratio": ("predicted", "expected share of datagrams lost by a random draw"),
+}  # fmt: skip
+_BY_KEY = {
+    "datagrams": ("fates", "fate", "datagrams by their fate"),
+    "unintended_losses": ("unintended", "cause", "losses that no setting caused"),
+}
+_TIMES = {
+    "delay_seconds": ("delay_ns", "time in the emulator, quantiles since its start"),
+    "lateness_seconds": ("lateness_ns", "lateness of the emulator, quantiles since its start"),
+}
+"""By the metric's name: key of the statistics, label of a further key, text."""
+_QUANTILES = {"p50": "0.5", "p99": "0.99", "p999": "0.999", "max": "1"}
+_Rows = Iterable[tuple[list[str], float | None]]
+"""Values by their labels; None: not known."""
 
 
 class EmulatorMetrics:
@@ -84,58 +82,45 @@ class EmulatorMetrics:
 
 def metrics(found: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
-    yield GaugeMetricFamily(
-        f"{_PREFIX}_elapsed_seconds", "time since the emulator started", found["elapsed_s"]
+    links: Any = found["links"]
+    sides: Any = [([link["name"], name], link[name]) for link in links for name in DIRECTIONS]
+    yield _gauge("elapsed_seconds", "time since the emulator started", [], [
+        ([], found["elapsed_s"]),
+    ])  # fmt: skip
+    yield _gauge(
+        "clients", "clients of a link", ["link"], [([one["name"]], one["clients"]) for one in links]
     )
-    clients = GaugeMetricFamily(f"{_PREFIX}_clients", "clients of a link", labels=["link"])
-    for link in found["links"]:
-        clients.add_metric([link["name"]], link["clients"])
-    yield clients
     for name, (key, text) in _OF_LINK.items():
-        counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=["link"])
-        for link in found["links"]:
-            counter.add_metric([link["name"]], link[key])  # type: ignore[literal-required]
-        yield counter
-    directions = [
-        ([link["name"], name], link[name]) for link in found["links"] for name in DIRECTIONS
-    ]
-    yield from _of_directions(directions)
-
-
-def _of_directions(directions: list[tuple[list[str], DirectionStatistics]]) -> Iterator[Metric]:
-    labels = ["link", "direction"]
-    for name, (count, text) in _COUNTERS.items():
-        counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels)
-        for values, one in directions:
-            counter.add_metric(values, count(one))
-        yield counter
-    for name, (value, text) in _GAUGES.items():
-        gauge = GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels)
-        for values, one in directions:
-            if (known := value(one)) is not None:
-                gauge.add_metric(values, known)
-        yield gauge
-    yield from _by_key(directions, "fates", "datagrams", "fate", "datagrams by their fate")
-    yield from _by_key(
-        directions, "unintended", "unintended_losses", "cause", "losses that no setting caused"
-    )
+        yield _counter(name, text, ["link"], [([link["name"]], link[key]) for link in links])
+    for name, (key, text) in _COUNTERS.items():
+        yield _counter(name, text, _LABELS, [(labels, side[key]) for labels, side in sides])
+    for name, (key, text) in _GAUGES.items():
+        yield _gauge(name, text, _LABELS, [(labels, side[key]) for labels, side in sides])
+    for name, (key, text) in _LOSSES.items():
+        yield _gauge(name, text, _LABELS, [(labels, side["loss"][key]) for labels, side in sides])
+    for name, (key, label, text) in _BY_KEY.items():
+        yield _counter(name, text, [*_LABELS, label], [
+            ([*labels, which], count) for labels, side in sides
+            for which, count in side[key].items()
+        ])  # fmt: skip
     for name, (key, text) in _TIMES.items():
-        gauge = GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=[*labels, "quantile"])
-        for values, one in directions:
-            times: Any = one[key]  # type: ignore[literal-required]
-            for quantile, label in _QUANTILES.items():
-                if times[quantile] is not None:
-                    gauge.add_metric([*values, label], times[quantile] / NS_PER_S)
-        yield gauge
+        yield _gauge(name, text, [*_LABELS, "quantile"], [
+            ([*labels, label], None if side[key][p] is None else side[key][p] / NS_PER_S)
+            for labels, side in sides for p, label in _QUANTILES.items()
+        ])  # fmt: skip
 
 
-def _by_key(
-    directions: list[tuple[list[str], DirectionStatistics]], key: str, name: str, label: str,
-    text: str,
-) -> Iterator[Metric]:  # fmt: skip
-    counter = CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=["link", "direction", label])
-    for values, one in directions:
-        counts: Mapping[str, int] = one[key]  # type: ignore[literal-required]
-        for which, count in counts.items():
-            counter.add_metric([*values, which], count)
-    yield counter
+def _counter(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
+    return _filled(CounterMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+
+
+def _gauge(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
+    return _filled(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
+
+
+def _filled(metric: Any, rows: _Rows) -> Metric:
+    for values, value in rows:
+        if value is not None:
+            metric.add_metric(values, value)
+    assert isinstance(metric, Metric)
+    return metric

@@ -68,8 +68,7 @@ class Snapshot(NamedTuple):
 
     links: Sequence[LinkReport]
     in_force: Mapping[tuple[str, Direction], AppliedSettings]
-    elapsed_ns: int
-    """Time since the relay started."""
+    elapsed_ns: int  # Time since the relay started
     unix_ns: int
 
 
@@ -323,6 +322,7 @@ def _direction(
     seconds: float,
 ) -> DirectionStatistics:
     counters, since, words = report.counters, in_force.since, in_force.words
+    new = counters - since
     return {
         "words": words if len(words) <= _MAX_WORDS else words[: _MAX_WORDS - 1] + "…",
         "received_before": since.received,
@@ -338,9 +338,9 @@ def _direction(
         "mansd": report.settings.longest_burst,
         "constraints": [one.text() for one in report.settings.constraints],
         "loss": {
-            "realised": loss_share(counters, since),
-            "lost": _share(counters, since, "dropped", "corrupted", "overflowed", "blacked_out"),
-            "drawn": _share(counters, since, "dropped", "corrupted"),
+            "realised": loss_share(new),
+            "lost": _share(new, new.dropped + new.corrupted + new.overflowed + new.blacked_out),
+            "drawn": _share(new, new.dropped + new.corrupted),
             "predicted": in_force.predicted_loss,
         },
         "unintended": dict(report.unintended),
@@ -361,14 +361,14 @@ def _direction(
 
 
 def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> RecentRates:
-    new, old = after.counters, before.counters
+    new = after.counters - before.counters
     return {
         "seconds": seconds,
-        "received_per_s": (new.received - old.received) / seconds,
-        "received_bits_per_s": (new.received_bytes - old.received_bytes) * 8 / seconds,
-        "forwarded_per_s": (new.forwarded - old.forwarded) / seconds,
-        "forwarded_bits_per_s": (new.forwarded_bytes - old.forwarded_bytes) * 8 / seconds,
-        "loss": loss_share(new, old),
+        "received_per_s": new.received / seconds,
+        "received_bits_per_s": new.received_bytes * 8 / seconds,
+        "forwarded_per_s": new.forwarded / seconds,
+        "forwarded_bits_per_s": new.forwarded_bytes * 8 / seconds,
+        "loss": loss_share(new),
         "delay_ns": quantiles(after.delays - before.delays),
         "lateness_ns": quantiles(after.lateness - before.lateness),
     }
@@ -380,28 +380,18 @@ def unintended(totals: Statistics) -> int:
     return sum(sum(direction["unintended"].values()) for direction in directions)
 
 
-def loss_share(after: Counters, before: Counters) -> float | None:
+def loss_share(counters: Counters) -> float | None:
     """Return the share of the received datagrams that was not effectively delivered.
 
     None if no datagram was received. A stale datagram counts when it is forwarded; in a short
     interval, more datagrams may therefore be lost than received. The share is limited to 1.
     """
-    received = after.received - before.received
-    if received == 0:
-        return None
-    lost = received - _effective(after) + _effective(before)
-    return min(max(lost, 0) / received, 1.0)
+    effective = counters.delivered + counters.forced - counters.delivered_out_of_order
+    return _share(counters, min(max(counters.received - effective, 0), counters.received))
 
 
-def _effective(counters: Counters) -> int:
-    return counters.delivered + counters.forced - counters.delivered_out_of_order
-
-
-def _share(after: Counters, before: Counters, *fates: str) -> float | None:
-    """Return the share of the received datagrams with one of these fates; None without any."""
-    received = after.received - before.received
-    lost: int = sum(getattr(after, fate) - getattr(before, fate) for fate in fates)
-    return lost / received if received else None
+def _share(counters: Counters, lost: int) -> float | None:
+    return lost / counters.received if counters.received else None
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:

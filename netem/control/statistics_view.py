@@ -363,7 +363,6 @@ def _table(history: History, latest: Statistics, width: int, lines: int) -> Rend
 
 
 def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
-    """Return the directions that have received datagrams."""
     links = statistics["links"]
     return [(link, name) for link in links for name in DIRECTIONS if link[name]["received"]]
 

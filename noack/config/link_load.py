@@ -47,17 +47,14 @@ class Demand(NamedTuple):
 
     loops: int
     payload_bytes: int
-    least_s: float
-    """Least time between two transmissions of a loop."""
-    largest_s: float
-    """Largest time between two transmissions; infinite if there is none."""
+    least_s: float  # Least time between two transmissions of a loop
+    largest_s: float  # Largest time between two transmissions; infinite if there is none
 
 
 class _Stage(NamedTuple):
     """A part of the run, between two changes of settings."""
 
-    begin: str
-    """Where it begins, in words; empty: at the start of the run."""
+    begin: str  # Where it begins, in words; empty: at the start of the run
     direction: DirectionSection
     loops: Sequence[Demand]
 
@@ -178,7 +175,6 @@ def _window(direction: DirectionSection) -> LossWindow:
 
 
 def _share(window: LossWindow) -> float:
-    """Return the share of datagrams that must pass."""
     return (window.packets - window.losses) / window.packets
 
 
@@ -266,10 +262,9 @@ def _demand(loop: Scenario, count: int) -> Demand:
 
 def _inter_event_times_ns(loop: Scenario) -> tuple[float, float]:
     """Return the least and the largest time between two events that the trigger permits."""
-    policy, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
-    if isinstance(policy, CodedPolicy):  # it may transmit at every measurement, or never
+    rule, measured_ns = policy_of(loop), loop.timing.measurement_period_ns
+    if isinstance(rule, CodedPolicy):  # it may transmit at every measurement, or never
         return measured_ns, math.inf
-    rule = policy.trigger_rule(loop.model.dimensions[0])
     least_ns = max(measured_ns, rule.idle_ns)
     if rule.forecast is not None:
         least_ns = max(least_ns, rule.shortest_ns)

@@ -159,9 +159,7 @@ class ChangeSchedule:
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        prepare: Callable[[Scenario], Any] = lambda scenario: None,
+        self, scenario: Scenario, prepare: Callable[[Scenario], Any] = lambda scenario: None
     ) -> None:
         self._prepare = prepare
         self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Any, Any]] = {}

@@ -15,11 +15,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import BaseModel, ValidationError, create_model, model_validator
 
-from noack.config.run_sections import (
-    MOST_LOOPS,
-    LoopSection,
-    SeedsSection,
-)
+from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.config.scenario_checks import check_changes, check_sections
 from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain
@@ -155,7 +151,7 @@ def _with_parts(
     scenario: Scenario, content: Mapping[str, Any], parts: Iterable[str], place: str = ""
 ) -> Scenario:
     """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
-    model = _parts_model(frozenset(parts))
+    model = parts_model(frozenset(parts))
     try:
         found = model.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -210,12 +206,14 @@ def _seeds(
 
 
 @cache
-def _parts_model(parts: frozenset[str]) -> type[ScenarioSection]:
-    """Return a model of some of a scenario's parts."""
-    fields: dict[str, Any] = {
-        name: (field.annotation, field)
-        for name, field in Scenario.model_fields.items()
-        if name in parts
-    }
+def parts_model(parts: frozenset[str], *, others: bool = False) -> type[ScenarioSection]:
+    """Return a model of some of a scenario's parts; with ``others``, those are optional keys."""
+    fields: dict[str, Any] = {}
+    for name, field in Scenario.model_fields.items():
+        kind: Any = field.annotation
+        if name in parts:
+            fields[name] = (kind, field)
+        elif others:
+            fields[name] = (kind | None, None)
     model: type[ScenarioSection] = create_model("LoopParts", __base__=ScenarioSection, **fields)
     return model

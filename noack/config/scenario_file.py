@@ -10,25 +10,22 @@ import copy
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache
 from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
 import tomli_w
-from pydantic import create_model
 
 from noack.config import toml_file
 from noack.config.matrix_files import with_matrices
 from noack.config.runtime_parameters import SHORT, full_key
-from noack.config.scenario import PARTS, Scenario, with_loop_tables
+from noack.config.scenario import PARTS, Scenario, parts_model, with_loop_tables
 from noack.config.scenario_checks import check_kept_loss
 from noack.config.sections import DirectionSection
 from noack.config.toml_file import keys as known_keys
 from noack.config.toml_file import nearest_key
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_folder
-from noack.settings.section import ScenarioSection
 from noack.settings.user_files import FileSettings, file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
@@ -133,7 +130,7 @@ def _loop_tables(path: Path, named: str) -> dict[str, Any]:
     if content.get("loops"):
         raise CallerError(f"{named}: that file has loops itself; name a file of one loop")
     whole = with_matrices(content, path.parent, str(path))
-    file = toml_file.validated(_loop_file_model(), whole, str(path))
+    file = toml_file.validated(parts_model(frozenset(PARTS), others=True), whole, str(path))
     tables = {
         where: located(table, path.parent, f"{path}: {where}") for where, table in file_tables(file)
     }
@@ -145,23 +142,13 @@ def _path(name: str, folder: Path, named: str) -> Path:
     """Return the path of a file, or of the shipped scenario of that name."""
     shipped = {file.stem: file for file in shipped_folder("scenarios").glob("*.toml")}
     with suppress(OSError, ValueError):  # too long, or with a zero byte
-        if (path := folder / name).exists():
+        if name and (path := folder / name).exists():
             return path
     if name in shipped:
         return shipped[name]
     names = [*sorted(shipped), *sorted(file.name for file in folder.glob("*.toml"))]
     hint = did_you_mean(name, names) or "`noack scenarios` lists the shipped ones"
     raise CallerError(f"{named}: no such file, nor a shipped scenario; {hint}")
-
-
-@cache
-def _loop_file_model() -> type[ScenarioSection]:
-    """Return the model of a loop's file: a scenario in which all that a run has is optional."""
-    fields: dict[str, Any] = {}
-    for name, field in Scenario.model_fields.items():
-        kind: Any = field.annotation
-        fields[name] = (kind, field) if name in PARTS else (kind | None, None)
-    return create_model("LoopFile", __base__=ScenarioSection, **fields)
 
 
 def dumps(scenario: Scenario) -> str:

@@ -14,14 +14,10 @@ from noack.settings.section import RateHz, Row, ScenarioSection, require_whole_p
 class ControlModel(NamedTuple):
     """The data that a control law receives about the loop."""
 
-    A: Matrix
-    """Â, (n, n)."""
-    B: Matrix
-    """B̂, (n, m)."""
-    K: Matrix
-    """The scenario's gain, (m, n): x_s and x_c follow Â + B̂K between updates."""
-    period_s: float
-    """Time between two ticks."""
+    A: Matrix  # Â, (n, n)
+    B: Matrix  # B̂, (n, m)
+    K: Matrix  # The scenario's gain, (m, n): x_s and x_c follow Â + B̂K between updates
+    period_s: float  # Time between two ticks
 
 
 class ControlFailedError(NoackError):

@@ -16,13 +16,7 @@ from noack.controllers.controller_settings import (
 )
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.settings.user_files import (
-    ClassSettings,
-    new_instance,
-    read_only,
-    real_vector,
-    user_code,
-)
+from noack.settings.user_files import ClassSettings, new_instance, read_only, real_vector, user_code
 
 
 class PythonControllerSettings(ClassSettings, ControllerSettings):

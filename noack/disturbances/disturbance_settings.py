@@ -20,11 +20,9 @@ Place = Literal["input", "state"]
 class SignalSource(NamedTuple):
     """The data, besides its settings, from which a signal is computed."""
 
-    period_ns: int
-    """Step of the plant."""
+    period_ns: int  # Step of the plant
     seed: int
-    stream: tuple[str, ...]
-    """Name of the disturbance's own random stream."""
+    stream: tuple[str, ...]  # Name of the disturbance's own random stream
 
 
 class DisturbanceSettings(ScenarioSection):

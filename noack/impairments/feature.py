@@ -12,52 +12,36 @@ probability p exactly, for every ρ.
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.random_streams import uniform_pair
+from noack.impairments.clauses import Clause, Part
 from noack.impairments.loss_guarantee import LossRule
 from noack.impairments.markov_chain import Chain, Pattern, chance_chain
 from noack.impairments.words import (
     CORRELATION,
     OWN_TIME_S,
     PERCENT,
-    WordReader,
+    Quantity,
     brief_percent,
-    percent_text,
     time_text,
 )
 from noack.settings.section import Correlation, Probability, ScenarioSection
 from noack.settings.user_files import NamedFile
 
 T = TypeVar("T")
-Table = dict[str, Any]
-"""A table of settings, before it is validated."""
 Offset = Annotated[FiniteFloat, Field(ge=0, le=1e9)] | Literal["random"]
 """In seconds after the trace's first packet."""
 LONGEST_NS = 10**18
 """Longest trace: 31 years."""
 TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
 """What ``tc netem`` does differently."""
-
-
-class Word(NamedTuple):
-    """A word of the command line."""
-
-    name: str
-    example: str
-    read: Callable[[WordReader], Table] | None = None
-    """Reads the words that follow it; None: it is not the first word of its feature."""
-    after: str = ""
-    """The words that precede it, if it is not the first word."""
-    grammar: str = ""
-    """The words of its feature, for ``--help``; T is a time, P a percentage, N a number. Empty:
-    another word has it."""
 
 
 class Stage(NamedTuple):
@@ -95,18 +79,15 @@ def add_numbers(table: list[T], numbers: Iterable[T]) -> tuple[int, int]:
 class Feature(ScenarioSection):
     """Base class of all features."""
 
-    words: ClassVar[Sequence[Word]] = ()
+    clauses: ClassVar[tuple[Clause, ...]] = ()
+    """Its words; of several clauses, the first that can have the settings is written."""
     tc_missing: ClassVar[str] = ""
     """The feature that ``tc netem`` would need for it; empty if it has it."""
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        """Return settings for tests, mainly extreme ones; together they use every key."""
-        return (cls(),)
-
-    @abstractmethod
     def text(self) -> str:
         """Return words that are read as the same settings."""
+        clauses = [clause for clause in self.clauses if clause.writes(self)] or self.clauses
+        return clauses[0].text(self) if clauses else ""
 
     @abstractmethod
     def meaning(self) -> str:
@@ -172,6 +153,28 @@ class StageFeature(Feature):
         return ()
 
 
+class FileFeature(StageFeature):
+    """Base class of features that name a file, or have its content."""
+
+    file: Annotated[str, Field(min_length=1)] | None = None
+
+    @abstractmethod
+    def read_file(self, file: NamedFile) -> Feature:
+        """Return settings with the file's content.
+
+        Raises:
+            CallerError: as :meth:`StageFeature.without_files`.
+        """
+
+    def without_files(self, folder: Path, place: str) -> Feature:
+        return self if self.file is None else self.read_file(NamedFile(self.file, folder, place))
+
+    def require_content(self, error: type[Exception] = ValueError) -> None:
+        """Raise an error of this class if the file has not been read."""
+        if self.file is not None:
+            raise error(f"{self.file} has not been read")
+
+
 class Constraint(Feature):
     """Base class of constraints on the losses of a flow; each has its own first word."""
 
@@ -232,12 +235,8 @@ class Impairment(StageFeature):
         return delayed, reordered
 
 
-def read_chance(reader: WordReader) -> dict[str, float]:
-    """Read ``PERCENT [CORRELATION]``."""
-    table = {"probability": reader.value(PERCENT)}
-    if reader.number_follows():
-        table["correlation"] = reader.value(CORRELATION)
-    return table
+CHANCE = (Part(("probability",), PERCENT, "P"), Part(("correlation",), CORRELATION, "CORR"))
+"""The words of a probability and its correlation."""
 
 
 class CorrelatedChance(StageFeature):
@@ -252,17 +251,6 @@ class CorrelatedChance(StageFeature):
     """See :class:`noack.impairments.feature.Stage`."""
     action: ClassVar[str] = ""
     """Its action as a Markov chain; see :class:`Chain`; empty: it does not change the loss rate."""
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        chances = ((0.0, 0.0), (0.1, 0.0), (0.5, 0.7), (0.9, 0.0), (1.0, 0.0))
-        return [cls(probability=p, correlation=correlation) for p, correlation in chances]
-
-    @property
-    def chance_text(self) -> str:
-        """The words that :func:`read_chance` reads."""
-        correlation = f" {percent_text(self.correlation)}" if self.correlation else ""
-        return percent_text(self.probability) + correlation
 
     @property
     def correlation_meaning(self) -> str:
@@ -291,16 +279,16 @@ class CorrelatedChance(StageFeature):
         return (TC_CORRELATION,) if self.correlation else ()
 
 
-def read_offset(reader: WordReader) -> float | str:
-    """Read the word after ``from``."""
-    return "random" if reader.accept("random") else reader.value(OWN_TIME_S)
+def _offset(word: str) -> float | str:
+    return word if word == "random" else OWN_TIME_S.read(word)
 
 
-def offset_text(offset: float | str) -> str:
-    """Return the words of an offset; none if the trace is used from its beginning."""
-    if offset == 0:
-        return ""
-    return f" from {offset if isinstance(offset, str) else time_text(offset)}"
+OFFSET = Quantity(
+    f"{OWN_TIME_S.expected}; or random",
+    _offset,
+    lambda offset: offset if isinstance(offset, str) else time_text(offset),
+)
+"""Where in a trace a feature begins."""
 
 
 def offset_meaning(offset: float | str) -> str:

@@ -6,7 +6,7 @@ the end are what reports and recorded packet fates use of a link; native/noack.h
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -84,8 +84,7 @@ class RecordedDecision:
     """A recorded decision for a packet: the fields of ``noack_recorded``."""
 
     fate: int
-    delay_ns: int
-    """Time from arrival to departure; −1: it never left."""
+    delay_ns: int  # Time from arrival to departure; −1: it never left
     copy_delay_ns: int
     bit: int
     copy_bit: int
@@ -115,3 +114,8 @@ class Counters:
     longest_loss_burst: int = 0
     """Maximum number of consecutive losses of a flow under the present settings."""
     most_in_flight: int = 0
+
+    def __sub__(self, before: "Counters") -> "Counters":
+        """Return what was counted since ``before``; the two maxima have no meaning then."""
+        pairs = zip(astuple(self), astuple(before), strict=True)
+        return Counters(*(now - then for now, then in pairs))

@@ -6,9 +6,10 @@ counters are the one definition of the guarantee for the checks of records, for 
 for the adversary.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,45 +24,42 @@ def outcome_letters(delivered: Iterable[bool]) -> str:
     return "".join("D" if outcome else "L" for outcome in delivered)
 
 
-class LossRule(Protocol):
+class LossRule(ABC):
     """One rule of a guarantee, as a counter; states and values are integers."""
 
-    @property
-    def limit(self) -> int:
-        """The largest value that is allowed."""
+    limit: int
+    """The largest value that is allowed."""
 
     @property
     def start(self) -> int:
         """The state before the first packet."""
+        return 0
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """Short name, in the words of the settings."""
 
     @property
+    @abstractmethod
     def meaning(self) -> str:
         """The rule as part of a sentence."""
 
+    @abstractmethod
     def after(self, state: int, lost: bool) -> tuple[int, int]:
         """Return the state after an outcome, and the value that is compared with the limit."""
 
+    @abstractmethod
     def violation(self, value: float) -> str:
         """Return how a value violates the rule, as part of a sentence."""
 
 
 @dataclass(frozen=True)
-class LongestBurst:
+class LongestBurst(LossRule):
     """At most ``limit`` consecutive losses; the state is the number of consecutive losses."""
 
     limit: int
-
-    @property
-    def start(self) -> int:
-        return 0
-
-    @property
-    def name(self) -> str:
-        return "dropouts"
+    name = "dropouts"
 
     @property
     def meaning(self) -> str:
@@ -76,7 +74,7 @@ class LongestBurst:
 
 
 @dataclass(frozen=True)
-class LossesInWindow:
+class LossesInWindow(LossRule):
     """At most ``limit`` losses in ``window`` consecutive packets.
 
     The state has one bit for each of the last ``window`` − 1 packets: 1 if it was lost.
@@ -84,10 +82,6 @@ class LossesInWindow:
 
     limit: int
     window: int
-
-    @property
-    def start(self) -> int:
-        return 0
 
     @property
     def name(self) -> str:
@@ -107,7 +101,7 @@ class LossesInWindow:
 
 
 @dataclass(frozen=True)
-class DeliveriesBetweenBursts:
+class DeliveriesBetweenBursts(LossRule):
     """At least ``deliveries`` consecutive deliveries between two bursts of losses.
 
     The state is the number of deliveries since the last loss, up to ``deliveries``; the value is
@@ -115,10 +109,7 @@ class DeliveriesBetweenBursts:
     """
 
     deliveries: int
-
-    @property
-    def limit(self) -> int:
-        return 0
+    limit = 0
 
     @property
     def start(self) -> int:

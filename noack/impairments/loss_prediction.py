@@ -72,10 +72,8 @@ _found: dict[str, float] = {}
 class LossPrediction(NamedTuple):
     """A loss rate, or why there is none."""
 
-    rate: float | None
-    """Expected share of a flow's packets that are dropped or corrupted."""
-    note: str
-    """Why there is no rate, or the condition under which the rate holds; else empty."""
+    rate: float | None  # Expected share of a flow's packets that are dropped or corrupted
+    note: str  # Why there is no rate, or the condition under which the rate holds; else empty
 
 
 @lru_cache(maxsize=64)
@@ -153,7 +151,6 @@ def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> f
 
 
 def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Return the losses of several patterns combined, over their common period."""
     period = math.lcm(*map(len, patterns))
     if period > LONGEST_PATTERN:
         raise NotPredictableError(f"the loss patterns repeat together only after {period} packets")
@@ -236,14 +233,10 @@ def _stationary(start: Array, moves: Array) -> Array:
 class LossProcess:
     """The random losses of a link's packets."""
 
-    start: Array
-    """(n,) distribution before the first packet."""
-    moves: Array
-    """(n, n) transition matrix."""
-    lost: Array
-    """(n,) probability of a loss in each state."""
-    first_delivered: bool = True
-    """Whether the first packet is delivered in any case."""
+    start: Array  # (n,) distribution before the first packet
+    moves: Array  # (n, n) transition matrix
+    lost: Array  # (n,) probability of a loss in each state
+    first_delivered: bool = True  # Whether the first packet is delivered in any case
 
     @property
     def is_independent(self) -> bool:

@@ -34,23 +34,17 @@ class NotPredictableError(Exception):
 class Chain(NamedTuple):
     """A Markov chain with n states: for each packet it advances, then may act on the packet."""
 
-    start: Array
-    """(n,) Distribution before the first packet."""
-    moves: Array
-    """(n, n) Transition matrix."""
-    acts: Array
-    """(n,) Probability in each state that it acts on the packet."""
-    what: str = "lose"
-    """The action: ``lose``, ``corrupt`` or ``duplicate``."""
-    probability: float = 0.0
-    """Probability that it acts on a copy."""
+    start: Array  # (n,) Distribution before the first packet
+    moves: Array  # (n, n) Transition matrix
+    acts: Array  # (n,) Probability in each state that it acts on the packet
+    what: str = "lose"  # The action: ``lose``, ``corrupt`` or ``duplicate``
+    probability: float = 0.0  # Probability that it acts on a copy
 
 
 class Pattern(NamedTuple):
     """A periodic loss pattern."""
 
-    lost: NDArray[np.bool_]
-    """(period,)"""
+    lost: NDArray[np.bool_]  # (period,)
 
     @property
     def chain(self) -> Chain:
@@ -121,10 +115,8 @@ def stochastic(matrix: Array) -> Array:
 class Moves(NamedTuple):
     """The a states of a guarantee; state 0 is that before the first packet."""
 
-    after_loss: NDArray[np.int64]
-    """(a,) −1: a loss is not allowed."""
-    after_delivery: NDArray[np.int64]
-    """(a,)"""
+    after_loss: NDArray[np.int64]  # (a,) −1: a loss is not allowed
+    after_delivery: NDArray[np.int64]  # (a,)
 
 
 @lru_cache(maxsize=4)

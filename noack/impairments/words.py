@@ -9,10 +9,10 @@ import difflib
 import re
 import shlex
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, DecimalException
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import Generic, NoReturn, TypeVar
 
 from noack.core.errors import CallerError, printable, shortened
 
@@ -37,8 +37,6 @@ _RATE_UNITS = {"": 1} | {
     for prefix, scale in _PREFIXES.items()
     for unit, bits in (("bit", 1), ("bps", 8))
 }
-Option = tuple[str, Callable[["WordReader"], object]]
-"""The key of an option, and what reads its value."""
 _SPACES = " \t\r\n"
 
 
@@ -46,9 +44,10 @@ _SPACES = " \t\r\n"
 class Quantity(Generic[T]):
     """A kind of quantity."""
 
-    expected: str
-    """Description of a word, with an example: ``a time, e.g. 10ms``."""
+    expected: str  # Description of a word, with an example: ``a time, e.g. 10ms``.
     convert: Callable[[str], T]
+    text: Callable[[T], str] = str  # Writes a value as a word that is read as the same value
+    signs: str = ""  # The signs that its word may begin with, where it may be left out
 
     def read(self, word: str) -> T:
         """Read a word.
@@ -97,20 +96,21 @@ def _time_s(text: str) -> float:
     return _float(number * scale)
 
 
-def _own_time_s(text: str) -> float:
+def _own_time(text: str) -> Decimal:
+    """Return a time in seconds; only 0 needs no unit."""
     number, unit = _split(text)
     scale = _TIME_UNITS.get(unit.lower())
     if scale is None and (unit or number != 0):
         raise ValueError
-    return 0.0 if scale is None else _float(number * scale)
+    return number * (scale or 0)
+
+
+def _own_time_s(text: str) -> float:
+    return _float(_own_time(text))
 
 
 def _own_time_ns(text: str) -> int:
-    number, unit = _split(text)
-    scale = _TIME_UNITS.get(unit.lower())
-    if scale is None and (unit or number != 0):
-        raise ValueError
-    time_ns = number * (scale or 0) * 10**9
+    time_ns = _own_time(text) * 10**9
     if not -(2**62) < time_ns < 2**62 or time_ns % 1:
         raise ValueError
     return int(time_ns)
@@ -140,23 +140,6 @@ def _integer(pattern: str) -> Callable[[str], int]:
     return read
 
 
-PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0, 100))
-CORRELATION = Quantity(
-    "a correlation from 0% to below 100%, e.g. 25%", _percent(0, 100, below=True)
-)
-SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100))
-TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s)
-"""A time of tc: a number without a unit is in microseconds."""
-OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s)
-"""A time of a word that tc does not have: requires a unit, may be negative."""
-OWN_TIME_NS = Quantity("a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns)
-"""The same, exactly."""
-RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps)
-COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
-SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"))
-NUMBER = Quantity("a number, e.g. 2.5", _number)
-
-
 def _digits(number: Decimal) -> str:
     """Return a decimal without an exponent or trailing zeros."""
     text = format(number, "f")
@@ -172,19 +155,6 @@ def percent_text(share: float) -> str:
 def brief_percent(share: float) -> str:
     """A share in percent, with six digits."""
     return percent_text(float(f"{share:.6g}"))
-
-
-def without_defaults(values: Sequence[T], defaults: Sequence[T | None]) -> Sequence[T]:
-    """Return the values without those at the end that have their default value."""
-    count = len(values)
-    while count > 0 and values[count - 1] == defaults[count - 1]:
-        count -= 1
-    return values[:count]
-
-
-def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> str:
-    """Percentages, without those at the end that have their default value."""
-    return " ".join(map(percent_text, without_defaults(shares, defaults)))
 
 
 def time_text(time_s: float) -> str:
@@ -221,6 +191,40 @@ def number_text(number: float) -> str:
 def brief_number(number: float) -> str:
     """A number with four digits."""
     return number_text(float(f"{number:.4g}"))
+
+
+PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0, 100), percent_text)
+CORRELATION = Quantity(
+    "a correlation from 0% to below 100%, e.g. 25%", _percent(0, 100, below=True), percent_text
+)
+SIGNED_PERCENT = Quantity(
+    "a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100), percent_text
+)
+TIME_S = Quantity(
+    "a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s, time_text
+)
+"""A time of tc: a number without a unit is in microseconds."""
+OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s, time_text)
+"""A time of a word that tc does not have: requires a unit, may be negative."""
+OWN_TIME_NS = Quantity(
+    "a time in s, ms, us or ns, in whole ns, e.g. 10ms", _own_time_ns, time_ns_text
+)
+"""The same, exactly."""
+RATE_BPS = Quantity(
+    "a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps, rate_text
+)
+COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
+SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"), signs="-")
+NUMBER = Quantity("a number, e.g. 2.5", _number, number_text)
+
+
+def list_of(quantity: Quantity[T], expected: str) -> Quantity[Sequence[T]]:
+    """Return a list of quantities, separated by commas."""
+    return Quantity(
+        expected,
+        lambda word: [quantity.read(part) for part in word.split(",")],
+        lambda values: ",".join(map(quantity.text, values)),
+    )
 
 
 class WordReader:
@@ -267,20 +271,8 @@ class WordReader:
 
     def value(self, quantity: Quantity[T]) -> T:
         """Read a quantity."""
-        word = self.word(quantity.expected)
-        return self.read(word, quantity)
-
-    def values(self, quantity: Quantity[T], expected: str) -> list[T]:
-        """Read a list of quantities, separated by commas."""
         try:
-            return [quantity.read(part) for part in self.word(expected).split(",")]
-        except ValueError:
-            self.wrong(f"expected {expected}")
-
-    def read(self, word: str, quantity: Quantity[T]) -> T:
-        """Convert a word that has been read, or a part of it."""
-        try:
-            return quantity.read(word)
+            return quantity.read(self.word(quantity.expected))
         except ValueError:
             self.wrong(f"expected {quantity.expected}")
 
@@ -289,22 +281,9 @@ class WordReader:
         word = self._peek()
         return word is not None and word[0] in "0123456789." + signs
 
-    def accept(self, *words: str) -> bool:
-        """Read the next word if it is one of these; return whether it is."""
-        if self._peek() not in words:
-            return False
-        self._take()
-        return True
-
-    def options(self, table: dict[str, Any], known: Mapping[str, Option]) -> dict[str, Any]:
-        """Read options in any order, each at most once, into a table; return the table."""
-        while self._peek() in known:
-            word = str(self._take())
-            key, read = known[word]
-            if key in table:
-                self.wrong(f"{word} is given twice")
-            table[key] = read(self)
-        return table
+    def accept(self, *words: str) -> str | None:
+        """Read the next word if it is one of these; return it, or None."""
+        return self._take() if self._peek() in words else None
 
     def unknown(self, word: str, known: Collection[str]) -> NoReturn:
         """Raise a CallerError for an unknown word; name the nearest known word."""

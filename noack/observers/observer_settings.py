@@ -22,31 +22,21 @@ _POLE_TOLERANCE = 1e-6
 class NoiseVariances(NamedTuple):
     """Variances of the random disturbances and the noise of a scenario, entry by entry."""
 
-    at_state: Vector
-    """Of the disturbances at = "state", (n,)."""
-    at_input: Vector
-    """Of the disturbances at = "input", (m,)."""
-    output: Vector
-    """Of the measurement noise v, (p,)."""
+    at_state: Vector  # Of the disturbances at = "state", (n,)
+    at_input: Vector  # Of the disturbances at = "input", (m,)
+    output: Vector  # Of the measurement noise v, (p,)
 
 
 class EstimationModel(NamedTuple):
     """The model on the plant's time grid, with the covariances of its noise."""
 
-    Ad: Matrix
-    """Âd, (n, n)."""
-    Bd: Matrix
-    """B̂d, (n, m)."""
-    Gd: Matrix
-    """Effect of a disturbance w of ẋ that is constant over a step, (n, n)."""
-    C: Matrix
-    """(p, n)"""
-    Q: Matrix
-    """Covariance of q, (n, n)."""
-    R: Matrix
-    """Covariance of v, (p, p)."""
-    steps: int
-    """Steps of the plant between two measurements."""
+    Ad: Matrix  # Âd, (n, n)
+    Bd: Matrix  # B̂d, (n, m)
+    Gd: Matrix  # Effect of a disturbance w of ẋ that is constant over a step, (n, n)
+    C: Matrix  # (p, n)
+    Q: Matrix  # Covariance of q, (n, n)
+    R: Matrix  # Covariance of v, (p, p)
+    steps: int  # Steps of the plant between two measurements
 
     def process_covariance(self, at_state: Vector, at_input: Vector) -> Matrix:
         """Return the covariance of q for independent disturbances with these variances."""

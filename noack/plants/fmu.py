@@ -156,7 +156,6 @@ class FmuSystem:
         raise CallerError(f"{self._place}: {message}")
 
     def _described(self, path: Path) -> Any:
-        """The FMU's model description."""
         fmpy = _fmpy()
         try:
             with path.open("rb") as file:  # FMPy does not close a file that it cannot read
@@ -170,7 +169,6 @@ class FmuSystem:
         return description
 
     def _loaded(self, path: Path, end: contextlib.ExitStack, description: Any) -> "_Instance":
-        """Unpack and instantiate the FMU."""
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
         self._require_binary(folder, description)
@@ -200,7 +198,6 @@ class FmuSystem:
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
     def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
-        """Set the start values and initialise the FMU."""
         fmu, variables = self._instance.fmu, _Variables(description)
 
         def port(key: str, names: Sequence[str], refusal: Refusal = lambda variable: None) -> _Port:
@@ -382,7 +379,6 @@ def _not_initial(variable: Any) -> str | None:
 
 
 def _about(description: Any) -> str:
-    """Describe an FMU in one line."""
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"

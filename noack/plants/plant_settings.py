@@ -169,22 +169,14 @@ def _same(values: Vector) -> Vector:
 class PlantEquations:
     """``dz/dt = f(t, z, v)`` with x = output(z) and v = physical(u)."""
 
-    derivative: Derivative
-    """f."""
-    initial: Callable[[Vector], Vector] = _same
-    """z(0), (N,), as a function of x(0), (n,)."""
-    output: Callable[[Vector], Vector] = _same
-    """x, (n,), as a function of z."""
-    physical: Callable[[Vector], Vector] = _same
-    """v, (m,), as a function of u."""
-    relative: float = 1e-9
-    """Relative tolerance of each step of the integrator."""
-    absolute: float = 1e-12
-    """Absolute tolerance, in z's units."""
-    is_recorded: bool = False
-    """Whether z is recorded."""
-    advance: Advance | None = None
-    """The equations' own integrator."""
+    derivative: Derivative  # f
+    initial: Callable[[Vector], Vector] = _same  # z(0), (N,), as a function of x(0), (n,)
+    output: Callable[[Vector], Vector] = _same  # x, (n,), as a function of z
+    physical: Callable[[Vector], Vector] = _same  # v, (m,), as a function of u
+    relative: float = 1e-9  # Relative tolerance of each step of the integrator
+    absolute: float = 1e-12  # Absolute tolerance, in z's units
+    is_recorded: bool = False  # Whether z is recorded
+    advance: Advance | None = None  # The equations' own integrator
 
 
 class EquationSettings(PlantSettings):

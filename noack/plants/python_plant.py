@@ -20,13 +20,7 @@ from noack.plants.plant_settings import (
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.user_files import (
-    ClassSettings,
-    new_instance,
-    read_only,
-    real_vector,
-    user_code,
-)
+from noack.settings.user_files import ClassSettings, new_instance, read_only, real_vector, user_code
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6

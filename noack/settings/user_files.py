@@ -43,7 +43,7 @@ class NamedFile:
     """
 
     def __init__(self, name: str, folder: Path, place: str = "") -> None:
-        self.path = folder / name
+        self.name, self.folder, self.path = name, folder, folder / name
         self.named = f'{place}.file = "{name}"' if place else name
 
     def wrong(self, message: str) -> NoReturn:

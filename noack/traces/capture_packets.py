@@ -22,15 +22,12 @@ _RESOLUTION, _OFFSET, _FLAGS = 9, 14, 2
 class CapturedPacket(NamedTuple):
     """A packet of a capture."""
 
-    t_ns: int
-    """Unix time."""
+    t_ns: int  # Unix time
     interface: int
     link_type: int
-    is_outbound: bool
-    """Whether the capture says that this host sent it."""
+    is_outbound: bool  # Whether the capture says that this host sent it
     data: bytes
-    is_cut: bool
-    """Whether only its beginning was captured."""
+    is_cut: bool  # Whether only its beginning was captured
 
 
 class _Interface(NamedTuple):

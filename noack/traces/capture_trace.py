@@ -53,23 +53,24 @@ class CapturedDatagram(NamedTuple):
     t_ns: int
     flow: CapturedFlow
     payload: bytes
-    is_cut: bool
-    """Whether only its beginning was captured."""
+    is_cut: bool  # Whether only its beginning was captured
     is_outbound: bool
 
 
-class Payloads(NamedTuple):
-    """Captured datagrams, sorted by time."""
+class Datagrams(NamedTuple):
+    """The complete datagrams of a capture, sorted by time."""
 
     t_ns: Int64s
-    hashes: Int64s
-    """Of the payloads."""
-    flow: Int64s
-    """Places of the flows in :attr:`CaptureFlows.names`."""
+    hashes: Int64s  # Of the payloads
+    flow: Int64s  # Places of the flows in :attr:`Capture.flows`
+
+    def where(self, flags: NDArray[np.bool_]) -> "Datagrams":
+        """Return those that are flagged."""
+        return Datagrams(*(column[flags] for column in self))
 
 
-class CaptureFlows:
-    """A capture that has been read once: its flows, the largest first.
+class Capture:
+    """A capture that has been read once: its flows, the largest first, and its datagrams.
 
     Raises:
         ValueError: it is not a capture, or has no UDP datagrams.
@@ -79,27 +80,45 @@ class CaptureFlows:
         self._file = file
         self.notes: list[str] = []
         """Lines about the capture."""
-        counts: Counter[CapturedFlow] = Counter()
-        for datagram in self.datagrams(self.notes):
-            counts[datagram.flow] += 1
+        counts: dict[CapturedFlow, list[int]] = {}
+        columns = array("q"), array("q"), array("q")
+        for datagram in self.read(self.notes):
+            number_and_count = counts.setdefault(datagram.flow, [len(counts), 0])
+            number_and_count[1] += 1
             if len(counts) > _MOST_FLOWS:
                 raise ValueError(f"has more than {_MOST_FLOWS} flows; filter the capture first")
+            if not datagram.is_cut:
+                digest = hashlib.blake2b(datagram.payload, digest_size=8, key=_KEY).digest()
+                hashed = int.from_bytes(digest, "little", signed=True)
+                for column, value in zip(
+                    columns, (datagram.t_ns, hashed, number_and_count[0]), strict=True
+                ):
+                    column.append(value)
         if not counts:
             cut = self.notes[0].partition(";")[0] if self.notes else ""
             raise ValueError(f"has no UDP datagrams{': ' if cut else ''}{cut}")
-        self.names, self._counts = zip(*counts.most_common(), strict=True)
+        self.flows = sorted(counts, key=lambda flow: -counts[flow][1])
+        self._counts = [counts[flow][1] for flow in self.flows]
+        places = np.argsort([counts[flow][0] for flow in self.flows])
+        order = np.argsort(np.array(columns[0]), kind="stable")
+        t_ns, hashes, flow = (np.array(column)[order] for column in columns)
+        self.complete = Datagrams(t_ns, hashes, places[flow])
 
     def choose(self, number: int) -> CapturedFlow:
         """Return the flow of a number; 1 is the largest. Raise ValueError if there is none."""
-        if not 1 <= number <= len(self.names):
-            raise ValueError(f"has no flow {number}; its flows are 1 to {len(self.names)}")
-        flow: CapturedFlow = self.names[number - 1]
-        many = len(self.names)
+        many = len(self.flows)
+        if not 1 <= number <= many:
+            raise ValueError(f"has no flow {number}; its flows are 1 to {many}")
+        flow = self.flows[number - 1]
         others = f"; --flow chooses another of the {many} flows" if many > 1 else ""
         self.notes.append(f"flow {number}: {flow}, {self._counts[number - 1]} datagrams{others}")
         return flow
 
-    def datagrams(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
+    def reverse_of(self, flow: CapturedFlow) -> list[int]:
+        """Return the places of the flows that go the other way."""
+        return [place for place, name in enumerate(self.flows) if name.is_reverse_of(flow)]
+
+    def read(self, notes: list[str] | None = None) -> Iterator[CapturedDatagram]:
         """Yield the UDP datagrams, but not the last ones of a probe, which have no numbers."""
         try:
             for packet in captured_packets(self._file):
@@ -114,78 +133,47 @@ class CaptureFlows:
             if notes is not None:
                 notes.append(f"the capture {error}; what is before is used")
 
-    def payloads(self) -> Payloads:
-        """Return all complete datagrams."""
-        numbers = {flow: number for number, flow in enumerate(self.names)}
-        columns = array("q"), array("q"), array("q")
-        for datagram in self.datagrams():
-            if not datagram.is_cut:
-                digest = hashlib.blake2b(datagram.payload, digest_size=8, key=_KEY).digest()
-                hashed = int.from_bytes(digest, "little", signed=True)
-                values = datagram.t_ns, hashed, numbers[datagram.flow]
-                for column, value in zip(columns, values, strict=True):
-                    column.append(value)
-        order = np.argsort(np.array(columns[0]), kind="stable")
-        return Payloads(*(np.array(column)[order] for column in columns))
-
 
 def _is_end_of_probe(payload: bytes) -> bool:
     return payload[:4] == MAGIC and payload[5:6] in (b"\4", b"\5")
 
 
-class _Matches(NamedTuple):
-    """Datagrams at the receiver's end with the payload of a sent one."""
-
-    received: Int64s
-    """Places among the received datagrams."""
-    sent: Int64s
-    """Places among the sent datagrams."""
-
-
 def two_captures(
-    sender: CaptureFlows, flow: CapturedFlow, receiver: CaptureFlows
-) -> tuple[Payloads, Payloads]:
+    sender: Capture, flow: CapturedFlow, receiver: Capture
+) -> tuple[Datagrams, Datagrams]:
     """Return the datagrams of a flow at its sender, and all that may be the same at the receiver.
 
     The addresses may differ (NAT, a relay); only the reverse flow of an echo is left out.
     """
-    back = [k for k, name in enumerate(receiver.names) if name.is_reverse_of(flow)]
-    received = receiver.payloads()
-    sent = sender.payloads()
+    sent, received = sender.complete, receiver.complete
     return (
-        _where(sent, sent.flow == sender.names.index(flow)),
-        _where(received, ~np.isin(received.flow, back)),
+        sent.where(sent.flow == sender.flows.index(flow)),
+        received.where(~np.isin(received.flow, receiver.reverse_of(flow))),
     )
 
 
-def one_capture(
-    flows: CaptureFlows, flow: CapturedFlow, notes: list[str]
-) -> tuple[Payloads, Payloads] | None:
+def one_capture(capture: Capture, flow: CapturedFlow) -> tuple[Datagrams, Datagrams] | None:
     """Return the datagrams at the two ends in one capture; None if it has one end only."""
-    everything = flows.payloads()
-    number = flows.names.index(flow)
-    mine = _where(everything, everything.flow == number)
-    back = [k for k, name in enumerate(flows.names) if name.is_reverse_of(flow)]
-    others = _where(everything, ~np.isin(everything.flow, [number, *back]))
-    if not len(mine.t_ns):
+    everything, number = capture.complete, capture.flows.index(flow)
+    mine = everything.where(everything.flow == number)
+    others = everything.where(~np.isin(everything.flow, [number, *capture.reverse_of(flow)]))
+    received, sent = _matches(mine, others)
+    if not len(sent):
         return None
-    matches = _matches(mine, others)
-    if not len(matches.sent):
-        return None
-    of_flow = others.flow[matches.received]
+    of_flow = others.flow[received]
     counts = np.bincount(of_flow)
-    delays_ns = others.t_ns[matches.received] - mine.t_ns[matches.sent]
+    delays_ns = others.t_ns[received] - mine.t_ns[sent]
     # A reverse flow with the same payloads (an echo) takes longer.
     likely = np.flatnonzero(2 * counts > counts.max())
     medians = {int(k): float(np.median(delays_ns[of_flow == k])) for k in likely}
     other = min(medians, key=lambda k: abs(medians[k]))
-    notes.append(f"the other end: {flows.names[other]}")
-    theirs = _where(others, others.flow == other)
+    capture.notes.append(f"the other end: {capture.flows[other]}")
+    theirs = others.where(others.flow == other)
     return (mine, theirs) if medians[other] >= 0 else (theirs, mine)
 
 
 def matched_trace(
-    sent: Payloads, received: Payloads, clocks_differ: bool, most: int, notes: list[str]
+    sent: Datagrams, received: Datagrams, clocks_differ: bool, most: int, notes: list[str]
 ) -> PacketTrace:
     """Return the trace of the sent datagrams.
 
@@ -199,15 +187,15 @@ def matched_trace(
             "cannot be matched; if they are numbered, give the receiver's capture with "
             "--sequence-at OFFSET:BYTES"
         )
-    matches = _matches(sent, received)
-    arrived, first = np.unique(matches.sent, return_index=True)
+    here, there = _matches(sent, received)
+    arrived, first = np.unique(there, return_index=True)
     if not len(arrived):
         raise ValueError(
             "none of the complete datagrams sent is in the receiver's capture; are both captures "
             "of whole packets (tcpdump -s 0), and of the same time?"
         )
-    if len(matches.sent) > len(arrived):
-        notes.append(f"duplicates at the receiver: {len(matches.sent) - len(arrived)}")
+    if len(there) > len(arrived):
+        notes.append(f"duplicates at the receiver: {len(there) - len(arrived)}")
     for where, outside in (("first", arrived[0]), ("last", len(sent.t_ns) - 1 - arrived[-1])):
         if outside:
             notes.append(
@@ -215,7 +203,7 @@ def matched_trace(
                 "did not run then, they are no losses"
             )
     received_ns = np.zeros(len(sent.t_ns), np.int64)
-    received_ns[arrived] = received.t_ns[matches.received[first]]
+    received_ns[arrived] = received.t_ns[here[first]]
     lost = np.ones(len(sent.t_ns), bool)
     lost[arrived] = False
     trace = packet_trace(
@@ -224,17 +212,14 @@ def matched_trace(
     return relative_delays(trace) if clocks_differ else trace
 
 
-def _where(payloads: Payloads, flags: NDArray[np.bool_]) -> Payloads:
-    return Payloads(*(column[flags] for column in payloads))
-
-
-def _matches(sent: Payloads, received: Payloads) -> _Matches:
+def _matches(sent: Datagrams, received: Datagrams) -> tuple[Int64s, Int64s]:
+    """Return the places of received datagrams with the payload of a sent one, and of the latter."""
     if not len(sent.hashes):
-        return _Matches(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     hashes, places = np.unique(sent.hashes, return_index=True)
     at = np.minimum(np.searchsorted(hashes, received.hashes), len(hashes) - 1)
     known = np.flatnonzero(hashes[at] == received.hashes)
-    return _Matches(known, places[at[known]])
+    return known, places[at[known]]
 
 
 class SequenceField(NamedTuple):
@@ -270,12 +255,12 @@ class _Numbered(NamedTuple):
 
 
 def _numbered(
-    flows: CaptureFlows, flow: CapturedFlow, read: Callable[[bytes], tuple[int, int] | None]
+    capture: Capture, flow: CapturedFlow, read: Callable[[bytes], tuple[int, int] | None]
 ) -> _Numbered:
     """Return the numbers, times of arrival and of sending of a flow, and check its direction."""
     columns = array("q"), array("q"), array("q")
     outbound = 0
-    for datagram in flows.datagrams():
+    for datagram in capture.read():
         if datagram.flow == flow and (fields := read(datagram.payload)) is not None:
             outbound += datagram.is_outbound
             values = fields[0], datagram.t_ns, fields[1]
@@ -298,9 +283,7 @@ def _first_of_each(numbered: _Numbered, notes: list[str]) -> _Numbered:
     return _Numbered(*(column[first] for column in numbered))
 
 
-def trace_of_probe(
-    flows: CaptureFlows, flow: CapturedFlow, most_packets: int, notes: list[str]
-) -> PacketTrace:
+def trace_of_probe(capture: Capture, flow: CapturedFlow, most_packets: int) -> PacketTrace:
     """Return the trace of a probe of `noack measure`: the datagrams have their sending times."""
     sessions: Counter[int] = Counter()
 
@@ -314,7 +297,7 @@ def trace_of_probe(
         sessions[content.session] += 1
         return content.sequence, content.sent_ns
 
-    numbered = _numbered(flows, flow, read)
+    numbered = _numbered(capture, flow, read)
     if not len(numbered.number):
         raise ValueError(
             "has one end only, and no datagrams of `noack measure`; give the captures of both "
@@ -322,7 +305,7 @@ def trace_of_probe(
         )
     if len(sessions) > 1:
         raise ValueError(f"the flow has {len(sessions)} probes; capture them one by one")
-    numbered = _first_of_each(numbered, notes)
+    numbered = _first_of_each(numbered, capture.notes)
     nothing_lost = np.zeros(len(numbered.number), bool)
     trace = packet_trace(
         numbered.sent_ns, numbered.received_ns, nothing_lost, numbered.number,
@@ -332,11 +315,7 @@ def trace_of_probe(
 
 
 def trace_of_numbers(
-    flows: CaptureFlows,
-    flow: CapturedFlow,
-    field: SequenceField,
-    most_packets: int,
-    notes: list[str],
+    capture: Capture, flow: CapturedFlow, field: SequenceField, most_packets: int
 ) -> PacketTrace:
     """Return the trace of a sender with a constant period; the payloads have a number each."""
     bits = 8 * field.size_bytes
@@ -345,7 +324,7 @@ def trace_of_numbers(
         number = field.read(payload)
         return None if number is None or number >= _MOST else (number, 0)
 
-    numbered = _numbered(flows, flow, read)
+    numbered = _numbered(capture, flow, read)
     if len(numbered.number) < 2:
         raise ValueError(
             f"fewer than two datagrams have a sequence number at {field.offset}:{field.size_bytes}"
@@ -353,7 +332,7 @@ def trace_of_numbers(
     order = np.argsort(numbered.received_ns, kind="stable")
     number = _unwrapped(numbered.number[order], bits)
     numbered = _first_of_each(
-        numbered._replace(number=number, received_ns=numbered.received_ns[order]), notes
+        numbered._replace(number=number, received_ns=numbered.received_ns[order]), capture.notes
     )
     k, received_ns = (
         numbered.number - numbered.number[0],
@@ -366,7 +345,7 @@ def trace_of_numbers(
         )
     period_ns = max(envelope_slope(k, received_ns), 0.0)
     sent_ns = np.rint(period_ns * k).astype(np.int64)
-    notes.append(
+    capture.notes.append(
         f"the capture has no sending times: the sender's period is assumed to be constant, "
         f"{period_ns / 1e6:.6g} ms (lower envelope of the arrivals); delays are relative"
     )
@@ -389,11 +368,9 @@ def _unwrapped(number: Int64s, bits: int) -> NDArray[np.int64]:
 class CaptureOptions:
     """How to read captures."""
 
-    flow: int = 1
-    """Which flow, by its number of datagrams; 1 is the largest."""
+    flow: int = 1  # Which flow, by its number of datagrams; 1 is the largest
     sequence_at: SequenceField | None = None
-    clocks_differ: bool | None = None
-    """None: only if there are two captures."""
+    clocks_differ: bool | None = None  # None: only if there are two captures
     most_packets: int = MAX_PACKETS
 
 
@@ -403,39 +380,34 @@ def read_captures(files: Sequence[IO[bytes]], options: CaptureOptions) -> Packet
     Raises:
         ValueError: one line; it is not a capture, or the datagrams cannot be matched.
     """
-    flows = CaptureFlows(files[0])
-    flow = flows.choose(options.flow)
-    notes = flows.notes
+    capture = Capture(files[0])
+    flow = capture.choose(options.flow)
     try:
-        trace = _trace(flows, flow, files[1:], options, notes)
+        trace = _trace(capture, flow, files[1:], options)
     except TraceRecordError as error:
         raise ValueError(f"datagram {error.row + 1} of the flow {error}") from None
-    return trace.noted(*notes)
+    return trace.noted(*capture.notes)
 
 
 def _trace(
-    flows: CaptureFlows,
-    flow: CapturedFlow,
-    others: Sequence[IO[bytes]],
-    options: CaptureOptions,
-    notes: list[str],
+    capture: Capture, flow: CapturedFlow, others: Sequence[IO[bytes]], options: CaptureOptions
 ) -> PacketTrace:
     most = options.most_packets
     if options.sequence_at is not None:
         if others:
             raise ValueError("--sequence-at needs the receiver's capture only")
-        return trace_of_numbers(flows, flow, options.sequence_at, most, notes)
+        return trace_of_numbers(capture, flow, options.sequence_at, most)
     if others:
-        receiver = CaptureFlows(others[0])
-        notes += receiver.notes
-        ends = two_captures(flows, flow, receiver)
+        receiver = Capture(others[0])
+        capture.notes += receiver.notes
+        ends = two_captures(capture, flow, receiver)
     else:
-        both_ends = one_capture(flows, flow, notes)
+        both_ends = one_capture(capture, flow)
         if both_ends is None:
-            return trace_of_probe(flows, flow, most, notes)
+            return trace_of_probe(capture, flow, most)
         ends = both_ends
     differ = bool(others) if options.clocks_differ is None else options.clocks_differ
-    return matched_trace(*ends, differ, most, notes)
+    return matched_trace(*ends, differ, most, capture.notes)
 
 
 def _read(file: IO[bytes], most_packets: int, clocks_differ: bool) -> PacketTrace:

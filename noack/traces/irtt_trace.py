@@ -58,7 +58,6 @@ def _texts(file: IO[bytes]) -> Iterator[str]:
 
 
 def _entries(texts: Iterator[str]) -> Iterator[Any]:
-    """Yield the entries of ``round_trips``."""
     text = ""
     for piece in texts:
         text += piece

@@ -46,14 +46,10 @@ class TraceRecordError(ValueError):
 class PacketTrace:
     """k packets of one flow; :func:`packet_trace` makes one from records."""
 
-    sequence: Int64s
-    """(k,) Numbers, each greater than the one before by 1."""
-    sent_ns: Int64s
-    """(k,) Since the first sending; not descending."""
-    received_ns: Int64s
-    """(k,) Since the first sending; −1 for a lost packet."""
-    notes: tuple[str, ...] = ()
-    """Lines for a report about how the trace was obtained."""
+    sequence: Int64s  # (k,) Numbers, each greater than the one before by 1
+    sent_ns: Int64s  # (k,) Since the first sending; not descending
+    received_ns: Int64s  # (k,) Since the first sending; −1 for a lost packet
+    notes: tuple[str, ...] = ()  # Lines for a report about how the trace was obtained
 
     def __len__(self) -> int:
         return len(self.sequence)

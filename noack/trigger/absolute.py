@@ -4,10 +4,8 @@ Stability is practical: the state ends in a neighbourhood of 0 of the size of δ
 inter-event time is positive for bounded states, as e_s grows from 0 at a bounded rate.
 """
 
-from dataclasses import dataclass
 from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
@@ -23,8 +21,9 @@ class AbsoluteSettings(WeightedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="absolute", delta=0.05)
 
-    def trigger_policy(self, model: ModelMatrices) -> "AbsoluteTrigger":
-        return AbsoluteTrigger(self.delta, self.weight_matrix)
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        form = error_form(len(model.A), self.weight_matrix)
+        return TriggerRule(form, floor=self.delta, weight=self.weight_matrix)
 
     @property
     def description(self) -> str:
@@ -37,15 +36,3 @@ class AbsoluteSettings(WeightedSettings):
     @property
     def least_threshold(self) -> float:
         return self.delta
-
-
-@dataclass(frozen=True)
-class AbsoluteTrigger:
-    """Send-on-delta; δ > 0 in the units of ‖W x‖."""
-
-    delta: float
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        return TriggerRule(error_form(n, self.weight), floor=self.delta)

@@ -1,14 +1,13 @@
 """The base of policies that combine a rule with an interval."""
 
-from dataclasses import dataclass
+from abc import abstractmethod
 from typing import TYPE_CHECKING, Self
 
 from pydantic import field_validator
 
-from noack.core.linear_systems import Matrix
 from noack.settings.section import Rows
-from noack.trigger.policy_settings import Interval, PolicySettings
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.policy_settings import Interval, ModelMatrices, PolicySettings, nanoseconds
+from noack.trigger.trigger_rule import TriggerRule, require_rule
 
 if TYPE_CHECKING:
     AnyTrigger = PolicySettings  # noack.config.sections inserts the union of all policies
@@ -28,6 +27,14 @@ class CombinedSettings(PolicySettings):
         if rule.beyond_exact is not None:
             raise ValueError(f'"{rule.policy}" cannot be combined; let the class test the interval')
         return rule
+
+    @abstractmethod
+    def combined(self, rule: TriggerRule, interval_ns: int) -> TriggerRule:
+        """Return a rule with the interval."""
+
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        rule = require_rule(self.rule.trigger_policy(model))
+        return self.combined(rule, nanoseconds(self.interval_s))
 
     @property
     def weight(self) -> Rows | None:
@@ -56,19 +63,3 @@ class CombinedSettings(PolicySettings):
 
     def check_period(self, measured_ns: int, key: str = "trigger") -> None:
         self.rule.check_period(measured_ns, f"{key}.rule")
-
-
-@dataclass(frozen=True)
-class CombinedTrigger:
-    """A rule with an interval."""
-
-    rule: Policy
-    interval_ns: int
-
-    @property
-    def weight(self) -> Matrix | None:
-        return self.rule.weight
-
-    @property
-    def initial_dynamic_variable(self) -> float:
-        return self.rule.initial_dynamic_variable

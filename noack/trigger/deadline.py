@@ -6,9 +6,8 @@ if the controller receives nothing for T_max, an update was lost. The rule's err
 
 from typing import Literal, Self
 
-from noack.trigger.combined import CombinedSettings, CombinedTrigger
+from noack.trigger.combined import CombinedSettings
 from noack.trigger.mixed import MixedSettings
-from noack.trigger.policy_settings import ModelMatrices, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -21,20 +20,16 @@ class DeadlineSettings(CombinedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="deadline", rule=MixedSettings.example(n), interval_s=1.0)
 
-    def trigger_policy(self, model: ModelMatrices) -> "DeadlineTrigger":
-        return DeadlineTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
+    def combined(self, rule: TriggerRule, interval_ns: int) -> TriggerRule:
+        return with_deadline(rule, interval_ns)
 
     @property
     def description(self) -> str:
         return f"{self.rule.description}, or {self.interval_s:g} s after the last event"
 
 
-class DeadlineTrigger(CombinedTrigger):
-    """A rule with a deadline."""
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        rule = self.rule.trigger_rule(n)
-        return rule._replace(
-            longest_ns=min(rule.longest_ns, self.interval_ns),
-            shortest_ns=min(rule.shortest_ns, self.interval_ns),
-        )
+def with_deadline(rule: TriggerRule, interval_ns: int) -> TriggerRule:
+    """Return a rule with an event at the latest this time after the last one."""
+    return rule._replace(
+        longest_ns=min(rule.longest_ns, interval_ns), shortest_ns=min(rule.shortest_ns, interval_ns)
+    )

@@ -7,13 +7,8 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 """
 
 import math
-from dataclasses import dataclass
 from typing import Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
@@ -36,8 +31,10 @@ class DecayingSettings(WeightedSettings):
     def example(cls, n: int) -> Self:
         return cls(beta=0.5, alpha_per_s=0.25)
 
-    def trigger_policy(self, model: ModelMatrices) -> "DecayingTrigger":
-        return DecayingTrigger(self.beta, self.alpha_per_s, self.floor, self.weight_matrix)
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        W = self.weight_matrix
+        form = error_form(len(model.A), W)
+        return TriggerRule(form, self.beta, self.alpha_per_s, self.floor, weight=W)
 
     @property
     def description(self) -> str:
@@ -64,27 +61,3 @@ def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:
     """Return max(β e^{−αt}, ε) with its numbers."""
     decay = f"{beta:g} e^(−{alpha_per_s:g} t)"
     return f"max({decay}, {floor:g})" if floor else decay
-
-
-@dataclass(frozen=True)
-class DecayingTrigger:
-    """The paper's policy; β > 0 and ε ≥ 0 in the units of ‖W x‖, α > 0 per second."""
-
-    beta: float
-    alpha_per_s: float
-    floor: float = 0.0
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        form = error_form(n, self.weight)
-        return TriggerRule(form, self.beta, self.alpha_per_s, self.floor)
-
-    def threshold(self, t_ns: float) -> float:
-        """max(β e^{−αt}, ε)."""
-        return max(self.beta * math.exp(-self.alpha_per_s * t_ns * 1e-9), self.floor)
-
-    def thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
-        """Return the threshold at k times, (k,)."""
-        decayed = self.beta * np.exp(-self.alpha_per_s * t_ns * 1e-9)
-        return np.asarray(np.maximum(decayed, self.floor))

@@ -6,9 +6,8 @@ compares may exceed the threshold.
 
 from typing import Literal, Self
 
-from noack.trigger.combined import CombinedSettings, CombinedTrigger
+from noack.trigger.combined import CombinedSettings
 from noack.trigger.lyapunov import LyapunovSettings
-from noack.trigger.policy_settings import ModelMatrices, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule
 
 
@@ -21,22 +20,18 @@ class DwellSettings(CombinedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="dwell", rule=LyapunovSettings.example(n), interval_s=0.1)
 
-    def trigger_policy(self, model: ModelMatrices) -> "DwellTrigger":
-        return DwellTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
+    def combined(self, rule: TriggerRule, interval_ns: int) -> TriggerRule:
+        return with_dwell_time(rule, interval_ns)
 
     @property
     def description(self) -> str:
         return f"{self.rule.description}, not within {self.interval_s:g} s of the last event"
 
 
-class DwellTrigger(CombinedTrigger):
-    """A rule with a dwell time."""
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        """The rule's, after the dwell time; an event that is due before happens at its end."""
-        rule = self.rule.trigger_rule(n)
-        return rule._replace(
-            idle_ns=max(rule.idle_ns, self.interval_ns),
-            longest_ns=max(rule.longest_ns, self.interval_ns),
-            shortest_ns=max(rule.shortest_ns, self.interval_ns),
-        )
+def with_dwell_time(rule: TriggerRule, interval_ns: int) -> TriggerRule:
+    """Return a rule after the dwell time; an event that is due before happens at its end."""
+    return rule._replace(
+        idle_ns=max(rule.idle_ns, interval_ns),
+        longest_ns=max(rule.longest_ns, interval_ns),
+        shortest_ns=max(rule.shortest_ns, interval_ns),
+    )

@@ -8,8 +8,6 @@ arrives. From the same state on, events are never earlier than those of the stat
 updates are lost, the same holds as for the relative rule.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -17,7 +15,7 @@ from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
-from noack.trigger.trigger_rule import DynamicVariable, QuadraticForm, TriggerRule, quadratic_form
+from noack.trigger.trigger_rule import DynamicVariable, TriggerRule, quadratic_form
 
 
 class DynamicSettings(LyapunovFunctionSettings):
@@ -39,12 +37,9 @@ class DynamicSettings(LyapunovFunctionSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="dynamic", sigma=0.5, theta_s=0.5, decay_per_s=0.5, eta_0=1.0)
 
-    def trigger_policy(self, model: ModelMatrices) -> "DynamicTrigger":
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         P, Q = self.lyapunov_function(model)
-        return DynamicTrigger(
-            self.sigma, self.theta_s, self.decay_per_s, P, Q, model.B @ model.K, self.eta_0,
-            self.weight_matrix,
-        )  # fmt: skip
+        return dynamic_rule(self, P, Q, model.B @ model.K)
 
     @property
     def description(self) -> str:
@@ -54,29 +49,13 @@ class DynamicSettings(LyapunovFunctionSettings):
         )
 
 
-@dataclass(frozen=True)
-class DynamicTrigger:
-    """The dynamic rule; P, Q and BK of shape (n, n), θ ≥ 0 and λ ≥ 0. Events do not reset η."""
-
-    sigma: float
-    theta_s: float
-    decay_per_s: float
-    P: Matrix
-    Q: Matrix
-    BK: Matrix
-    initial_dynamic_variable: float = 0.0
-    weight: Matrix | None = None
-
-    @cached_property
-    def _forms(self) -> tuple[QuadraticForm, QuadraticForm]:
-        """−θw and w."""
-        n, cross = len(self.P), self.P @ self.BK
-        w = np.zeros((2 * n, 2 * n))
-        w[:n, :n] = self.sigma * self.Q
-        w[:n, n:] = -cross
-        w[n:, :n] = -cross.T
-        return quadratic_form(-self.theta_s * w), quadratic_form(w)
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        compared, gain = self._forms
-        return TriggerRule(compared, dynamic_variable=DynamicVariable(self.decay_per_s, gain))
+def dynamic_rule(settings: DynamicSettings, P: Matrix, Q: Matrix, BK: Matrix) -> TriggerRule:
+    """Return the rule with these matrices, (n, n) each. Events do not reset η."""
+    n, cross = len(P), P @ BK
+    w = np.zeros((2 * n, 2 * n))
+    w[:n, :n] = settings.sigma * Q
+    w[:n, n:] = -cross
+    w[n:, :n] = -cross.T
+    eta = DynamicVariable(settings.decay_per_s, quadratic_form(w), settings.eta_0)
+    compared = quadratic_form(-settings.theta_s * w)
+    return TriggerRule(compared, dynamic_variable=eta, weight=settings.weight_matrix)

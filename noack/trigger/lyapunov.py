@@ -9,7 +9,6 @@ an event again. So no minimum inter-event time is known under losses: the rule n
 dwell time.
 """
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -33,25 +32,18 @@ class LyapunovSettings(LyapunovFunctionSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="lyapunov", rate_per_s=0.3)
 
-    def trigger_policy(self, model: ModelMatrices) -> "LyapunovTrigger":
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         P, _ = self.lyapunov_function(model)
         factor = np.ascontiguousarray(np.linalg.cholesky(P).T)
-        return LyapunovTrigger(factor, self.rate_per_s, self.weight_matrix)
+        return lyapunov_rule(factor, self.rate_per_s, self.weight_matrix)
 
     @property
     def description(self) -> str:
         return f"V(x) > V(x(t_k)) e^(−{self.rate_per_s:g} (t−t_k))"
 
 
-@dataclass(frozen=True)
-class LyapunovTrigger:
-    """The envelope rule; ``factor`` is L with P = LᵀL, shape (n, n), and ρ > 0."""
-
-    factor: Matrix
-    rate_per_s: float
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        form = QuadraticForm(state_map(n, self.factor), empty_map(n))
-        return TriggerRule(form, rate_per_s=self.rate_per_s / 2, from_event=True)
+def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None) -> TriggerRule:
+    """Return the rule of V(x) = ‖L x‖², (n, n), and ρ > 0."""
+    n = len(factor)
+    form = QuadraticForm(state_map(n, factor), empty_map(n))
+    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

@@ -7,7 +7,6 @@ events may accumulate near the origin. σ = 0 is send-on-delta. With ε > 0 stab
 and the minimum inter-event time positive for bounded states.
 """
 
-from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
@@ -30,8 +29,8 @@ class MixedSettings(WeightedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="mixed", sigma=0.1, epsilon=0.05)
 
-    def trigger_policy(self, model: ModelMatrices) -> "MixedTrigger":
-        return MixedTrigger(self.sigma, self.epsilon, self.weight_matrix)
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        return mixed_rule(len(model.A), self.sigma, self.epsilon, self.weight_matrix)
 
     @property
     def description(self) -> str:
@@ -46,17 +45,7 @@ class MixedSettings(WeightedSettings):
         return self.epsilon
 
 
-@dataclass(frozen=True)
-class MixedTrigger:
-    """The mixed rule; σ > 0 without a unit, ε ≥ 0 in the units of ‖W x‖."""
-
-    sigma: float
-    epsilon: float = 0.0
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        down: Matrix = self.sigma * state_map(n, self.weight)
-        return TriggerRule(
-            QuadraticForm(error_map(n, self.weight), np.asarray(down)), floor=self.epsilon
-        )
+def mixed_rule(n: int, sigma: float, epsilon: float, weight: Matrix | None) -> TriggerRule:
+    """Return the rule for n states; σ > 0 without a unit, ε ≥ 0 in the units of ‖W x‖."""
+    down = np.asarray(sigma * state_map(n, weight))
+    return TriggerRule(QuadraticForm(error_map(n, weight), down), floor=epsilon, weight=weight)

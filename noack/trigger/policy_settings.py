@@ -26,12 +26,9 @@ Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 class ModelMatrices(NamedTuple):
     """The model and the gain that sensor and controller know."""
 
-    A: Matrix
-    """Â, (n, n)."""
-    B: Matrix
-    """B̂, (n, m)."""
-    K: Matrix
-    """Gain, (m, n)."""
+    A: Matrix  # Â, (n, n)
+    B: Matrix  # B̂, (n, m)
+    K: Matrix  # Gain, (m, n)
 
 
 class PolicySettings(ScenarioSection):
@@ -58,7 +55,7 @@ class PolicySettings(ScenarioSection):
 
     @abstractmethod
     def trigger_policy(self, model: ModelMatrices) -> Policy:
-        """Return the behaviour that these settings describe.
+        """Return what these settings describe: a rule as data, or code.
 
         Raises:
             CallerError: the policy cannot be used with this model.

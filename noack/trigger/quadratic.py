@@ -4,18 +4,15 @@
 period by construction. A heartbeat transmits after a number of periods without an event.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Rows, require_shape
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import NEVER_NS, QuadraticForm, TriggerRule, quadratic_form
+from noack.trigger.trigger_rule import NEVER_NS, TriggerRule, quadratic_form
 
 
 class QuadraticSettings(WeightedSettings):
@@ -37,10 +34,12 @@ class QuadraticSettings(WeightedSettings):
         Q = tuple(map(tuple, diagonal))
         return cls(policy="quadratic", Q=Q, epsilon=0.0025, period_s=0.05)
 
-    def trigger_policy(self, model: ModelMatrices) -> "QuadraticTrigger":
-        return QuadraticTrigger(
-            np.array(self.Q), nanoseconds(self.period_s), self.epsilon, self.heartbeat,
-            self.weight_matrix,
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        period_ns = nanoseconds(self.period_s)
+        return TriggerRule(
+            quadratic_form(np.array(self.Q)), floor=float(np.sqrt(self.epsilon)),
+            grid_ns=period_ns, weight=self.weight_matrix,
+            longest_ns=self.heartbeat * period_ns if self.heartbeat else NEVER_NS,
         )  # fmt: skip
 
     @property
@@ -65,25 +64,3 @@ class QuadraticSettings(WeightedSettings):
                 f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
                 "between measurements"
             )
-
-
-@dataclass(frozen=True)
-class QuadraticTrigger:
-    """The quadratic rule on a grid; Q is symmetric, shape (2n, 2n), on z = (x, e_s)."""
-
-    Q: Matrix
-    period_ns: int
-    epsilon: float = 0.0
-    heartbeat: int = 0
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    @cached_property
-    def _form(self) -> QuadraticForm:
-        return quadratic_form(self.Q)
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        return TriggerRule(
-            self._form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
-            longest_ns=self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS,
-        )  # fmt: skip

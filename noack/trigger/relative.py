@@ -5,9 +5,9 @@ The mixed rule without its constant; see :mod:`noack.trigger.mixed`.
 
 from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
-from noack.trigger.mixed import MixedTrigger
+from noack.trigger.mixed import mixed_rule
 from noack.trigger.policy_settings import ModelMatrices, Share, WeightedSettings
+from noack.trigger.trigger_rule import TriggerRule
 
 
 class RelativeSettings(WeightedSettings):
@@ -21,8 +21,8 @@ class RelativeSettings(WeightedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="relative", sigma=0.2)
 
-    def trigger_policy(self, model: ModelMatrices) -> MixedTrigger:
-        return relative_trigger(self.sigma, self.weight_matrix)
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        return mixed_rule(len(model.A), self.sigma, 0.0, self.weight_matrix)
 
     @property
     def description(self) -> str:
@@ -31,8 +31,3 @@ class RelativeSettings(WeightedSettings):
     @property
     def least_threshold(self) -> float:
         return 0.0
-
-
-def relative_trigger(sigma: float, weight: Matrix | None = None) -> MixedTrigger:
-    """Return the relative rule; σ > 0 without a unit."""
-    return MixedTrigger(sigma, 0.0, weight)

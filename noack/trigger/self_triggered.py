@@ -10,16 +10,14 @@ without being tested. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010;
 Gronwall's.)
 """
 
-from dataclasses import dataclass
 from typing import Literal, Self
 
 from pydantic import model_validator
 
-from noack.core.linear_systems import Matrix
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.decaying import decaying_text
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
-from noack.trigger.trigger_rule import Forecast, QuadraticForm, TriggerRule, empty_map
+from noack.trigger.trigger_rule import Forecast, TriggerRule, no_form
 
 
 class SelfTriggeredSettings(WeightedSettings):
@@ -60,13 +58,15 @@ class SelfTriggeredSettings(WeightedSettings):
             mismatch_per_s=1.0, shortest_s=0.1, longest_s=5.0,
         )  # fmt: skip
 
-    def trigger_policy(self, model: ModelMatrices) -> "SelfTrigger":
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         forecast = Forecast(
             self.beta, self.alpha_per_s, self.floor,
             self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
         )  # fmt: skip
-        shortest_ns, longest_ns = nanoseconds(self.shortest_s), nanoseconds(self.longest_s)
-        return SelfTrigger(forecast, shortest_ns, longest_ns, self.weight_matrix)
+        return TriggerRule(
+            no_form(len(model.A)), shortest_ns=nanoseconds(self.shortest_s),
+            longest_ns=nanoseconds(self.longest_s), forecast=forecast, weight=self.weight_matrix,
+        )  # fmt: skip
 
     @property
     def description(self) -> str:
@@ -80,21 +80,3 @@ class SelfTriggeredSettings(WeightedSettings):
     @property
     def least_threshold(self) -> float:
         return self.floor
-
-
-@dataclass(frozen=True)
-class SelfTrigger:
-    """The self-triggered rule; the next event is τ_min > 0 to τ_max after the last one."""
-
-    forecast: Forecast
-    shortest_ns: int
-    longest_ns: int
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        return TriggerRule(
-            QuadraticForm(empty_map(n), empty_map(n)),
-            longest_ns=self.longest_ns, shortest_ns=self.shortest_ns,
-            forecast=self.forecast, weight=self.weight,
-        )  # fmt: skip

@@ -9,10 +9,8 @@ e_s grows from 0 at a bounded rate. A live sensor integrates by the trapezoidal 
 measurements; exact simulation integrates e_s itself.
 """
 
-from dataclasses import dataclass
 from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
@@ -28,22 +26,10 @@ class SendOnAreaSettings(WeightedSettings):
     def example(cls, n: int) -> Self:
         return cls(policy="send_on_area", delta_s=0.02)
 
-    def trigger_policy(self, model: ModelMatrices) -> "SendOnAreaTrigger":
-        return SendOnAreaTrigger(self.delta_s, self.weight_matrix)
+    def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
+        form = error_form(len(model.A), self.weight_matrix)
+        return TriggerRule(form, floor=self.delta_s, integrates=True, weight=self.weight_matrix)
 
     @property
     def description(self) -> str:
         return f"∫‖e_s‖ dt since the last event > {self.delta_s:g}"
-
-
-@dataclass(frozen=True)
-class SendOnAreaTrigger:
-    """Send-on-area; δ > 0 in the units of ‖W x‖ times seconds."""
-
-    delta_s: float
-    weight: Matrix | None = None
-    initial_dynamic_variable = 0.0
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        form = error_form(n, self.weight)
-        return TriggerRule(form, floor=self.delta_s, integrates=True)

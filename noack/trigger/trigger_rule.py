@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
@@ -30,36 +31,27 @@ NEVER_NS = math.inf
 class QuadraticForm(NamedTuple):
     """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
 
-    up: Matrix
-    """P, shape (p, 2n)."""
-    down: Matrix
-    """N, shape (q, 2n); q = 0 for none."""
+    up: Matrix  # P, shape (p, 2n)
+    down: Matrix  # N, shape (q, 2n); q = 0 for none
 
 
 class DynamicVariable(NamedTuple):
     """Girard's dynamic variable: η̇ = −λη + ψ(z)."""
 
-    decay_per_s: float
-    """λ."""
-    gain: QuadraticForm
-    """ψ."""
+    decay_per_s: float  # λ
+    gain: QuadraticForm  # ψ
+    initial: float = 0.0  # η at the start
 
 
 class Forecast(NamedTuple):
     """The assumed growth of the sensor's error, and its threshold (:mod:`.self_triggered`)."""
 
-    beta: float
-    """β > 0."""
-    alpha_per_s: float
-    """α > 0."""
-    floor: float
-    """ε ≥ 0."""
-    growth_per_s: float
-    """L ≥ 0."""
-    mismatch_per_s: float
-    """a ≥ 0."""
-    disturbance_per_s: float
-    """b ≥ 0."""
+    beta: float  # β > 0
+    alpha_per_s: float  # α > 0
+    floor: float  # ε ≥ 0
+    growth_per_s: float  # L ≥ 0
+    mismatch_per_s: float  # a ≥ 0
+    disturbance_per_s: float  # b ≥ 0
 
 
 class TriggerRule(NamedTuple):
@@ -88,12 +80,32 @@ class TriggerRule(NamedTuple):
     """With a forecast: the next event is not due before this time after an event."""
     forecast: Forecast | None = None
     weight: Matrix | None = None
-    """W of the ‖x‖_W that the forecast begins with, (n, n); None is the identity."""
+    """W of the norm in which errors are shown, and of the ‖x‖_W that a forecast begins with,
+    (n, n); None is the identity."""
+
+    @property
+    def is_decaying(self) -> bool:
+        """Whether it is the paper's: it compares ‖W e_s‖ with max(c e^{−ρt}, f), and no more."""
+        return self.level > 0 and self.idle_ns == -math.inf and self.longest_ns == NEVER_NS
+
+    @property
+    def initial_dynamic_variable(self) -> float:
+        """η at the start; 0 for a rule without η."""
+        return 0.0 if self.dynamic_variable is None else self.dynamic_variable.initial
 
     @property
     def fading_per_s(self) -> float:
         """α of a threshold that decays from the run's start on; 0 for other thresholds."""
         return 0.0 if self.from_event else self.rate_per_s
+
+    def threshold(self, t_ns: float) -> float:
+        """Return max(c e^{−ρt}, f)."""
+        return max(self.level * math.exp(-self.rate_per_s * t_ns * 1e-9), self.floor)
+
+    def thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
+        """Return the threshold at k times, (k,)."""
+        decayed = self.level * np.exp(-self.rate_per_s * t_ns * 1e-9)
+        return np.asarray(np.maximum(decayed, self.floor))
 
 
 def error_map(n: int, weight: Matrix | None = None) -> Matrix:
@@ -116,6 +128,11 @@ def empty_map(n: int) -> Matrix:
     return np.zeros((0, 2 * n))
 
 
+def no_form(n: int) -> QuadraticForm:
+    """Compare nothing."""
+    return QuadraticForm(empty_map(n), empty_map(n))
+
+
 def quadratic_form(Q: Matrix) -> QuadraticForm:
     """The form zᵀQz of a symmetric matrix, (2n, 2n), as the difference of two squares."""
     values, vectors = np.linalg.eigh(Q)
@@ -123,38 +140,24 @@ def quadratic_form(Q: Matrix) -> QuadraticForm:
     return QuadraticForm(rows[values > 0], rows[values < 0])
 
 
-class Policy(Protocol):
-    """An event-triggering policy: a trigger rule, W and η at the start."""
-
-    @property
-    def weight(self) -> Matrix | None:
-        """W of the norm in which errors are shown, (n, n); None is the identity."""
-        ...
-
-    def trigger_rule(self, n: int) -> TriggerRule:
-        """The trigger rule, for n states."""
-        ...
-
-    @property
-    def initial_dynamic_variable(self) -> float:
-        """η at the start; 0 for a policy without η."""
-        ...
-
-
 @dataclass(frozen=True)
 class CodedPolicy:
     """A policy that decides by code of its own, and so has no trigger rule."""
 
     weight: Matrix | None
-    new_trigger: Callable[[], "EventTrigger"]
-    """Returns a trigger that has not started."""
-    why_no_rule: str
-    """What a user is told where a trigger rule is needed."""
-    initial_dynamic_variable = 0.0
+    new_trigger: Callable[[], "EventTrigger"]  # Returns a trigger that has not started
+    why_no_rule: str  # What a user is told where a trigger rule is needed
 
-    def trigger_rule(self, n: int) -> TriggerRule:
-        """Raise a CallerError."""
-        raise CallerError(self.why_no_rule)
+
+Policy = TriggerRule | CodedPolicy
+"""What decides about events."""
+
+
+def require_rule(policy: Policy) -> TriggerRule:
+    """Return a policy's rule; raise CallerError if it has none."""
+    if isinstance(policy, CodedPolicy):
+        raise CallerError(policy.why_no_rule)
+    return policy
 
 
 class EventTrigger(Protocol):
@@ -186,31 +189,22 @@ _NEVER_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
-def fill_rule(
-    structure: Any,
-    rule: TriggerRule,
-    weight: Matrix | None,
-    initial_dynamic_variable: float,
-    memory: CoreMemory,
-) -> None:
-    """Fill a ``noack_trigger_rule``; its matrices live in ``memory``.
+def fill_rule(structure: Any, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
+    """Fill a ``noack_trigger_rule`` for n states; its matrices live in ``memory``.
 
-    Args:
-        structure: the structure.
-        rule: the rule.
-        weight: W of the norm that is recorded, (n, n); None is the identity.
-        initial_dynamic_variable: η at the start.
-        memory: keeps the matrices.
+    Raises:
+        ValueError: the rule is for another number of states.
     """
     dynamic, forecast = rule.dynamic_variable, rule.forecast
     memory.fill(structure, {
         "level": rule.level, "rate_per_s": rule.rate_per_s, "floor": rule.floor,
         "from_event": rule.from_event, "integrates": rule.integrates,
-        "is_dynamic": dynamic is not None, "initial": initial_dynamic_variable,
+        "is_dynamic": dynamic is not None, "initial": rule.initial_dynamic_variable,
         "decay_per_s": 0.0 if dynamic is None else dynamic.decay_per_s,
         "grid_ns": _whole_ns(rule.grid_ns), "idle_ns": _whole_ns(rule.idle_ns),
         "shortest_ns": _whole_ns(rule.shortest_ns), "longest_ns": _whole_ns(rule.longest_ns),
-        "forecasts": forecast is not None, "weight": weight, "forecast_weight": rule.weight,
+        "forecasts": forecast is not None, "weight": rule.weight,
+        "forecast_weight": None if forecast is None else rule.weight,
     })  # fmt: skip
     if forecast is not None:
         memory.fill(structure, {
@@ -223,6 +217,8 @@ def fill_rule(
     for prefix, form in forms.items():
         for name in ("up", "down"):
             matrix = None if form is None else getattr(form, name)
+            if matrix is not None and matrix.shape[1] != 2 * n:
+                raise ValueError(f"trigger: expected {2 * n} columns, found {matrix.shape[1]}")
             setattr(structure, f"{prefix}{name}_rows", 0 if matrix is None else len(matrix))
             if matrix is not None and len(matrix):
                 setattr(structure, f"{prefix}{name}", memory.reals(matrix))

@@ -10,8 +10,9 @@ from benchmarks._report import MeasurementError, Rounds
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS
 from cosim.live.progress import progress_text
+from noack.runtime.control_messages import RunProgress
 
-ACCOUNT = {
+ACCOUNT: dict[str, Any] = {
     "t_s": 0.0, "events": 1, "deliveries": 1, "longest_loss_burst": 0, "x_norm": 1.0, "live": None,
 }  # fmt: skip
 ROOT = Path(__file__).parents[2]
@@ -75,11 +76,11 @@ def test_lateness_is_judged_against_cyclictest(
 def test_the_earliest_progress_line_bounds_the_time_of_the_first_step() -> None:
     lines = [
         Line(100.9, "noack: something else"),
-        Line(102.0, progress_text(ACCOUNT | {"t_s": 0.25}, 20.0)),
+        Line(102.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.25}), 20.0)),
         Line(
-            102.2, progress_text(ACCOUNT | {"t_s": 0.5}, 20.0)
+            102.2, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.5}), 20.0)
         ),  # the epoch is at 101.75 or earlier
-        Line(103.0, progress_text(ACCOUNT | {"t_s": 1.0}, 20.0)),
+        Line(103.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 1.0}), 20.0)),
     ]
     assert first_step_s(100.0, lines) == pytest.approx(1.75)
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from cosim.simulation.batch import run_with_events
 from cosim.simulation.exact_simulation import ExactSimulation
 from noack.core.core_library import LIBRARY, core, ffi, load_core
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.send_on_area import SendOnAreaTrigger
+from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import random_population, random_setting
 from tests.cosim.simulation.batch.test_policies import POLICIES
+from tests.trigger_rules import area_rule, decaying_rule
 
 ANY_DOUBLE = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
 
@@ -47,7 +47,7 @@ def test_matrices_and_states_of_any_numbers(
             shape
         )
 
-    trigger = SendOnAreaTrigger(0.1, None) if area else DecayingTrigger(0.5, 1.0, 0.1)
+    trigger = area_rule(0.1, None) if area else decaying_rule(0.5, 1.0, 0.1)
     simulation = ExactSimulation(
         any_of(n, n), any_of(1, n), trigger, horizon_s=2.0, known_start=measure > 2,
         delivered=np.array([True, False]), most_events=20, measure=measure,
@@ -61,7 +61,7 @@ def test_matrices_and_states_of_any_numbers(
 
 def test_what_does_not_fit_is_refused() -> None:
     plain = {"horizon_s": 1.0, "known_start": True}
-    one, trigger = np.eye(2), DecayingTrigger(0.5, 1.0)
+    one, trigger = np.eye(2), decaying_rule(0.5, 1.0)
     for wrong in (
         {"horizon_s": np.nan}, {"horizon_s": -1.0}, {"settle": np.inf}, {"measure": 9},
         {"measure": -1}, {"fading_per_s": -1.0}, {"most_events": -1}, {"event_places": 3},
@@ -80,7 +80,7 @@ def test_what_does_not_fit_is_refused() -> None:
         assert core.noack_exact_check(simulation.core) != ffi.NULL, field
 
 
-def _refused(one: np.ndarray, trigger: DecayingTrigger, numbers: dict[str, object]) -> None:
+def _refused(one: np.ndarray, trigger: TriggerRule, numbers: dict[str, object]) -> None:
     """Change a simulation's numbers, and check it again."""
     simulation = ExactSimulation(one, one, trigger, horizon_s=1.0, known_start=True)
     for name, value in numbers.items():

@@ -13,6 +13,7 @@ from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings, require_scores
+from tests.netem.feature_examples import EXAMPLES, IMPAIRED, keeps_loss, names_file
 
 _TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
     lambda name: name not in SHAPES
@@ -53,7 +54,7 @@ def values(annotation: Any, metadata: list[Any]) -> st.SearchStrategy[Any]:
 @st.composite
 def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
     """Return an example of a feature, possibly with other valid values."""
-    example = draw(st.sampled_from(feature.examples()))
+    example = draw(st.sampled_from(EXAMPLES[feature]))
     fields = type(example).model_fields
     names = draw(st.sets(st.sampled_from(sorted(fields)), max_size=3))
     update = {name: draw(values(fields[name].annotation, fields[name].metadata)) for name in names}
@@ -96,21 +97,14 @@ def _settings(
 
 
 def _is_computable(one: Impairment) -> bool:
-    """Whether it names no file, and keeps no loss rate, which the others may make impossible."""
-    if getattr(getattr(one, "loss", None), "keep", False):
-        return False
-    return getattr(getattr(one, "loss", one), "file", None) is None
+    return not names_file(one) and not keeps_loss(one)
 
 
 _ANY = st.one_of([varied(kind) for kind in IMPAIRMENTS])
 settings = _settings(_ANY, most=1_000_000)
 """All valid settings, including names of files."""
 computable = _settings(_ANY.filter(_is_computable))
-harsh = _settings(
-    st.sampled_from([
-        one for kind in IMPAIRMENTS for one in kind.examples() if _is_computable(one)
-    ])
-)  # fmt: skip
+harsh = _settings(st.sampled_from([one for one in IMPAIRED if _is_computable(one)]))
 """Examples of the features in any order, with short times."""
 capped = harsh.filter(lambda one: one.impairments and one.mansd is not None).map(
     lambda one: one.model_copy(update={"first_delivered": True})

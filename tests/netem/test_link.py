@@ -165,9 +165,7 @@ def test_neither_payload_nor_size_changes_the_losses() -> None:
 
 
 @given(st.lists(st.binary(max_size=100), min_size=1, max_size=20))
-def test_survivors_leave_unchanged_and_all_datagrams_are_recorded(
-    data: list[bytes],
-) -> None:
+def test_survivors_leave_unchanged_and_all_datagrams_are_recorded(data: list[bytes]) -> None:
     link = new_link("loss 60% mansd 1")
     for k, payload in enumerate(data):
         message = Datagram(7, payload)

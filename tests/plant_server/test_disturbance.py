@@ -72,9 +72,7 @@ def test_disturbances_have_their_distributions_and_are_independent(
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
 
 
-def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(
-    disturbed: dict[str, Any],
-) -> None:
+def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(disturbed: dict[str, Any]) -> None:
     one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
     assert one is not None
     assert other is not None

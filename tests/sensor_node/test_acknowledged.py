@@ -11,16 +11,15 @@ from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import tables
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.decaying import DecayingTrigger
 from sensor_node.sensor import Sensor
 from tests.machine_parts import machine, state_of
+from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
 GRID_NS = 10 * MS
 H = np.array([[0.0, 1.0], [-2.0, -3.0]])
-ALWAYS = AbsoluteTrigger(1e-9)
+ALWAYS = absolute_rule(1e-9)
 
 
 def measurement(k: int, x: Sequence[float]) -> Message:
@@ -78,7 +77,7 @@ def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_tim
 
 
 def test_it_does_not_retransmit_if_the_rule_is_no_longer_met() -> None:
-    policy, timeout_ns = DecayingTrigger(1.0, 1e-9), 2 * GRID_NS
+    policy, timeout_ns = decaying_rule(1.0, 1e-9), 2 * GRID_NS
     one = machine(Sensor(np.zeros((2, 2)), policy, np.zeros(2), timeout_ns=timeout_ns))
     assert split(one.handle(measurement(1, [2.0, 0.0]), 0))[0]
     assert split(one.handle(measurement(3, [0.5, 0.0]), 0))[0] == []

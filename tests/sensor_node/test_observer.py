@@ -26,9 +26,9 @@ from noack.observers.observer_settings import (
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
-from noack.trigger.absolute import AbsoluteTrigger
 from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import machine, sensor_of
+from tests.trigger_rules import absolute_rule
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])
@@ -90,7 +90,7 @@ def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> LoopMachines:
     """A sensor with a Luenberger observer that starts at a known estimate."""
     start = np.array(x_hat)
     observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
-    return machine(Sensor(np.zeros((2, 2)), AbsoluteTrigger(1.0), observer=observer))
+    return machine(Sensor(np.zeros((2, 2)), absolute_rule(1.0), observer=observer))
 
 
 def test_the_kalman_filter_converges_to_the_observer_with_the_steady_gain() -> None:
@@ -195,9 +195,7 @@ def estimates(outputs: Sequence[Output]) -> Vector:
     return found
 
 
-def test_a_restarted_sensor_restarts_its_observer_and_reports_it(
-    observed: dict[str, Any],
-) -> None:
+def test_a_restarted_sensor_restarts_its_observer_and_reports_it(observed: dict[str, Any]) -> None:
     observed["network"]["initial_sync"] = "known_state"
     scenario = resolved(observed)
     t_ns, y, u = 400_000_000, 0.7, 0.1

@@ -15,9 +15,9 @@ from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.decaying import DecayingTrigger
 from sensor_node.sensor import Sensor
 from tests.machine_parts import machine, sensor_of, state_of
+from tests.trigger_rules import decaying_rule
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))
@@ -52,7 +52,7 @@ def next_on_grid_ns(t_s: float) -> int:
 def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
     """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
     x0, beta = 2.0, 0.3
-    sensor = machine(Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([x0])))
+    sensor = machine(Sensor(ZOH, decaying_rule(beta, 1.0, n=1), np.array([x0])))
     sent = updates(feed(sensor, lambda t: x0 * math.exp(-t), 3.0))
     expected = [next_on_grid_ns(math.log(1 + beta / x0))]
     while expected[-1] <= 3_000_000_000:
@@ -64,7 +64,7 @@ def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:
     beta = 0.1
     for x, events in ((beta, 0), (math.nextafter(beta, 1), 1)):
-        sensor = machine(Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([0.0])))
+        sensor = machine(Sensor(ZOH, decaying_rule(beta, 1.0, n=1), np.array([0.0])))
         assert len(updates(sensor.handle(measurement(0, 0, [x]), 0))) == events
 
 
@@ -90,7 +90,7 @@ def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
 ) -> None:
     H, W, run = system
     x0 = run[0][1] + 0.02
-    sensor = machine(Sensor(H, DecayingTrigger(0.2, 0.5, floor, W), x0 if known else None))
+    sensor = machine(Sensor(H, decaying_rule(0.2, 0.5, floor, W, len(H)), x0 if known else None))
     reset_ns, reset = (0, x0) if known else (0, None)
     for k, (t_ns, x) in enumerate(run):
         outputs = sensor.handle(measurement(k, t_ns, x), t_ns)
@@ -114,7 +114,7 @@ def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
 
 
 def test_an_update_carries_the_measured_state_and_its_time() -> None:
-    sensor = machine(Sensor(np.zeros((2, 2)), DecayingTrigger(0.1, 1.0)))
+    sensor = machine(Sensor(np.zeros((2, 2)), decaying_rule(0.1, 1.0)))
     outputs: list[Output] = []
     for k, x in enumerate([[1.0, 2.0], [1.0, 2.05], [3.0, 2.0], [3.0, 7.0]]):
         outputs += sensor.handle(measurement(10 + k, k * GRID_NS, x), k * GRID_NS + 777)
@@ -139,7 +139,7 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     lateness_ns = np.sort(rng.integers(0, 5 * 10**9, 200))
     runs = []
     for late_ns in (np.zeros(200, int), lateness_ns):
-        sensor, outputs = machine(Sensor(np.array([[-0.4]]), DecayingTrigger(0.2, 0.5))), []
+        sensor, outputs = machine(Sensor(np.array([[-0.4]]), decaying_rule(0.2, 0.5, n=1))), []
         for k in range(200):
             message = measurement(k, k * GRID_NS, [math.sin(3 * k * GRID_NS * 1e-9)])
             outputs += sensor.handle(message, k * GRID_NS + int(late_ns[k]))
@@ -153,7 +153,7 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
 
 
 def test_the_sensor_acts_on_measurements_only() -> None:
-    sensor = machine(Sensor(ZOH, DecayingTrigger(0.5, 0.25)))
+    sensor = machine(Sensor(ZOH, decaying_rule(0.5, 0.25, n=1)))
     sensor.handle(measurement(0, 0, [1.0]), 0)
     assert sensor.next_deadline_ns() is None
     assert not sensor.on_timer(10**9)

@@ -75,17 +75,17 @@ def measure_of(
     """Make a loop's measure; its level decays at α unless ``rate_per_s`` is given."""
     n, trigger = system.loop.n, system.decaying
     if objective is Objective.INTER_EVENT:
-        return Measure(objective, None, trigger.beta)
+        return Measure(objective, None, trigger.level)
     output = np.zeros((n, 3 * n))
     if objective is Objective.ERROR:
-        output[:, 2 * n :] = weight_of(system) / trigger.beta
+        output[:, 2 * n :] = weight_of(system) / trigger.level
     else:
         output[:, :n] = np.eye(n)
     if objective is Objective.COST:
-        return Measure(objective, output, trigger.beta)
-    rate_per_s = trigger.alpha_per_s if rate_per_s is None else rate_per_s
-    floor = trigger.floor if rate_per_s == trigger.alpha_per_s else 0.0
-    return Measure(objective, output, trigger.beta, rate_per_s, floor)
+        return Measure(objective, output, trigger.level)
+    rate_per_s = trigger.rate_per_s if rate_per_s is None else rate_per_s
+    floor = trigger.floor if rate_per_s == trigger.rate_per_s else 0.0
+    return Measure(objective, output, trigger.level, rate_per_s, floor)
 
 
 def weight_of(system: ContinuousLoop) -> Matrix:

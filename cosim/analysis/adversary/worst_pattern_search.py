@@ -244,7 +244,7 @@ def cost_ceiling(
         return None
     gain = pushed.through(np.eye(loop.n)).integral() * missing
     P = solve_continuous_lyapunov(closed.T, -np.eye(loop.n))
-    rate, beta = 2 * models.alpha_per_s, trigger.beta
+    rate, beta = 2 * models.alpha_per_s, trigger.level
 
     def ceiling(nodes: Nodes) -> Vector:
         x, rest_s = nodes.z[:, : loop.n], horizon_s - nodes.t_s
@@ -259,7 +259,7 @@ def cost_ceiling(
 def _models(system: ContinuousLoop) -> ErrorGains:
     """Return the gains at the threshold's rate if the models decay faster, otherwise at rate 0."""
     loop, weight = system.loop, weight_of(system)
-    gains = ErrorGains(loop.H, loop.K, weight, system.decaying.alpha_per_s)
+    gains = ErrorGains(loop.H, loop.K, weight, system.decaying.rate_per_s)
     try:
         gains.missing(Output.GAIN, 1, 0.0)
     except NotDecayingError:

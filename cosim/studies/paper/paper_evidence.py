@@ -31,7 +31,7 @@ from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1, theorem_2
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, Any]
 Mode = Literal["model", "zoh"]
@@ -265,7 +265,7 @@ def _slow_model(M: int) -> Numbers:
     """
     A, model = np.diag([1.0, -1.0]), np.diag([1.0, -0.1])
     B, K = np.eye(2)[:, :1], np.array([[-3.0, 0.0]])
-    trigger = DecayingTrigger(1.0, 0.5, 0.0, None)
+    trigger = TriggerRule(error_form(2), 1.0, 0.5)
     loop = LoopMatrices(
         A_model=model, B_model=B, K=K, H=model + B @ K, A=A, B=B, x0=np.array([1.0, 5.0]),
         weight=None, state_names=entry_names("x", 2), input_names=entry_names("u", 1),
@@ -278,12 +278,12 @@ def _slow_model(M: int) -> Numbers:
     )
     ends = [state for i, state in enumerate(run.before) if i % M == 0 and i > 0]
     return {
-        "alpha_per_s": trigger.alpha_per_s,
+        "alpha_per_s": trigger.rate_per_s,
         "closed_per_s": -spectral_abscissa(A + B @ K),
         "model_per_s": -spectral_abscissa(loop.H),
         "deliveries_s": [state.t_s for state in ends],
         "thresholds": [
-            float(np.linalg.norm(state.e_c)) * math.exp(trigger.alpha_per_s * state.t_s)
+            float(np.linalg.norm(state.e_c)) * math.exp(trigger.rate_per_s * state.t_s)
             for state in ends
         ],
         "first_ratios": (np.diff(run.event_s)[1:5] / run.event_s[1:5]).tolist(),
@@ -340,7 +340,7 @@ def _theorem_1(scenario: Scenario, representative: int) -> Numbers:
     deltas, closest = [], []
     for first, following in itertools.pairwise(arrived.tolist()):
         longest = [_longest_s(run, j) for j in range(first + 1, following)]
-        deltas.append(theorem_1(H, trigger.alpha_per_s, longest))
+        deltas.append(theorem_1(H, trigger.rate_per_s, longest))
         closest += (np.array(longest) / np.diff(run.event_s[first + 1 : following + 1])).tolist()
     return {"stretches": len(deltas), "largest": max(deltas), "interval_ratio": max(closest)}
 
@@ -350,7 +350,7 @@ def _longest_s(run: ContinuousRun, event: int) -> float:
     t_s = np.linspace(run.event_s[event], run.event_s[event + 1], _SAMPLES)
     samples = run.system.sample(run.after[event], t_s)
     interval = Interval(t_s, np.linalg.norm(samples.x, axis=1), np.linalg.norm(samples.x_s, axis=1))
-    return longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, trigger.alpha_per_s)
+    return longest_interval_s(interval, trigger.level, trigger.rate_per_s, trigger.rate_per_s)
 
 
 def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
@@ -361,7 +361,7 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
     from scipy.optimize import brentq
 
     run = run_continuous(resolved_draw(scenario, representative, "zoh"))
-    beta, alpha_per_s = run.system.decaying.beta, run.system.decaying.alpha_per_s
+    beta, alpha_per_s = run.system.decaying.level, run.system.decaying.rate_per_s
     gamma = float(open_loop_eigenvalues(lane_following({}).A).real.max())
 
     def solved_s(eta: float, level: float) -> float:

@@ -1,20 +1,13 @@
 """At most m losses among any K consecutive packets: the (m, K) constraint."""
 
-from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import Constraint, Table, Word
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import Constraint
 from noack.impairments.loss_guarantee import LossesInWindow
-from noack.impairments.words import COUNT, WordReader
-
-
-def _read(reader: WordReader) -> Table:
-    losses = reader.value(COUNT)
-    if not reader.accept("in"):
-        reader.wrong(f"the number of packets is missing, e.g. atmost {losses} in 10")
-    return {"losses": losses, "window": reader.value(COUNT)}
+from noack.impairments.words import COUNT
 
 
 class AtMost(Constraint):
@@ -26,9 +19,12 @@ class AtMost(Constraint):
     window: Annotated[int, Field(ge=1, le=10_000)]
     """K: number of consecutive packets; more than ``losses``."""
 
-    words: ClassVar = (
-        Word("atmost", "atmost 3 in 10", _read, grammar="atmost M in K"),
-        Word("in", "atmost 3 in 10", after="atmost M"),
+    clauses: ClassVar = (
+        Clause(
+            "atmost",
+            "atmost 3 in 10",
+            (Part(("losses",), COUNT, "M"), Part(("window",), COUNT, "K", "in", "atmost 3 in 10")),
+        ),
     )
 
     @model_validator(mode="after")
@@ -39,11 +35,6 @@ class AtMost(Constraint):
             )
         return self
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        pairs = ((0, 1), (1, 2), (1, 3), (2, 5), (3, 10), (5, 7))
-        return [cls(losses=losses, window=window) for losses, window in pairs]
-
     @property
     def rule(self) -> LossesInWindow:
         return LossesInWindow(self.losses, self.window)
@@ -51,9 +42,6 @@ class AtMost(Constraint):
     @property
     def scope(self) -> str:
         return f"maximum for {self.window} packets"
-
-    def text(self) -> str:
-        return f"atmost {self.losses} in {self.window}"
 
     def meaning(self) -> str:
         return (

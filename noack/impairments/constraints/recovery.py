@@ -1,11 +1,11 @@
 """At least h consecutive deliveries between two loss bursts."""
 
-from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from noack.impairments.feature import Constraint, Word
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import Constraint
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts
 from noack.impairments.words import COUNT
 
@@ -20,16 +20,9 @@ class Recovery(Constraint):
     deliveries: Annotated[int, Field(ge=1, le=10_000)]
     """h: minimum number of consecutive deliveries."""
 
-    words: ClassVar = (
-        Word(
-            "recover", "mansd 2 recover 3", lambda reader: {"deliveries": reader.value(COUNT)},
-            grammar="recover H",
-        ),
-    )  # fmt: skip
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [cls(deliveries=deliveries) for deliveries in (1, 2, 3, 7)]
+    clauses: ClassVar = (
+        Clause("recover", "mansd 2 recover 3", (Part(("deliveries",), COUNT, "H"),)),
+    )
 
     @property
     def rule(self) -> DeliveriesBetweenBursts:
@@ -38,9 +31,6 @@ class Recovery(Constraint):
     @property
     def scope(self) -> str:
         return "recovery"
-
-    def text(self) -> str:
-        return f"recover {self.deliveries}"
 
     def meaning(self) -> str:
         return (

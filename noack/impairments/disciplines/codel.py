@@ -1,24 +1,14 @@
 """CoDel, controlled delay (RFC 8289); see native/impairments/codel.c."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, FiniteFloat
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import QueueDiscipline, Stage, Table, Word
-from noack.impairments.words import COUNT, OWN_TIME_S, WordReader, time_text
-
-
-def _read(reader: WordReader) -> Table:
-    table: Table = {}
-    for word, key in (("target", "target_s"), ("interval", "interval_s")):
-        if reader.accept(word):
-            table[key] = reader.value(OWN_TIME_S)
-    if reader.accept("mtu"):
-        table["mtu_bytes"] = reader.value(COUNT)
-    return table
-
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import QueueDiscipline, Stage
+from noack.impairments.words import COUNT, OWN_TIME_S, time_text
 
 _TimeS = Annotated[FiniteFloat, Field(ge=1e-6, le=3600)]
 _EXAMPLE = "rate 10mbit queue 1000 codel target 5ms interval 100ms"
@@ -35,24 +25,24 @@ class Codel(QueueDiscipline):
     mtu_bytes: Annotated[int, Field(ge=0, le=65_535)] = 1500
     """A packet with at most this number of bytes before it in the queue is not dropped."""
 
-    words: ClassVar = (
-        Word("codel", _EXAMPLE, _read, grammar="codel [target T] [interval T] [mtu BYTES]"),
-        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval")),
-        Word("mtu", f"{_EXAMPLE} mtu 1200", after="rate RATE codel"),
+    clauses: ClassVar = (
+        Clause(
+            "codel",
+            _EXAMPLE,
+            (
+                Part(("target_s",), OWN_TIME_S, "T", "target", _EXAMPLE),
+                Part(("interval_s",), OWN_TIME_S, "T", "interval", _EXAMPLE),
+                Part(("mtu_bytes",), COUNT, "BYTES", "mtu", f"{_EXAMPLE} mtu 1200"),
+            ),
+            least=0,
+            implied={"kind": "codel"},
+        ),
     )
     tc_missing: ClassVar = "the discipline codel, which is a qdisc of its own"
 
     @property
     def prediction_note(self) -> str:
         return "as long as no queue overflows or CoDel drops"
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [cls(), cls(target_s=1e-5, interval_s=1e-4, mtu_bytes=0)]
-
-    def text(self) -> str:
-        words = f"codel target {time_text(self.target_s)} interval {time_text(self.interval_s)}"
-        return words if self.mtu_bytes == 1500 else f"{words} mtu {self.mtu_bytes}"
 
     def meaning(self) -> str:
         return (

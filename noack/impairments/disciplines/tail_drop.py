@@ -11,9 +11,6 @@ class TailDrop(QueueDiscipline):
 
     kind: Literal["tail_drop"] = "tail_drop"
 
-    def text(self) -> str:
-        return ""
-
     def meaning(self) -> str:
         return "more are dropped"
 

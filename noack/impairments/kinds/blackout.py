@@ -1,46 +1,41 @@
 """Blackouts: intervals of time in which all packets are lost."""
 
-import re
-import shlex
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import shortened
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word, add_numbers
+from noack.impairments.clauses import Clause, Part, file_name
+from noack.impairments.feature import FileFeature, Impairment, Stage, StageTables, add_numbers
 from noack.impairments.markov_chain import Chain, NotPredictableError
-from noack.impairments.words import OWN_TIME_S, TIME, WordReader, time_text
+from noack.impairments.words import OWN_TIME_S, Quantity, time_text
 from noack.settings.user_files import NamedFile
 
-_EXPECTED = "intervals of time, e.g. 2s-3s,5s-5500ms"
 MOST_INTERVALS = 1_000_000
 MOST_S = 1e9
 _TimeS = Annotated[FiniteFloat, Field(ge=0, le=MOST_S)]
 
 
-def _read(reader: WordReader) -> Table:
-    intervals: list[tuple[float, ...]] = []
-    for part in reader.word(_EXPECTED).split(","):
-        match = re.fullmatch(f"({TIME})-({TIME})", part)
-        if match is None:
-            reader.wrong(f"expected {_EXPECTED}")
-        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in match.groups()))
-    return {"intervals_s": intervals, **_read_every(reader)}
+def _read_intervals(word: str) -> list[tuple[float, float]]:
+    parts = (part.partition("-") for part in word.split(","))
+    return [(OWN_TIME_S.read(begin), OWN_TIME_S.read(end)) for begin, _, end in parts]
 
 
-def _read_outages(reader: WordReader) -> Table:
-    return {"file": reader.file("a file of outages"), **_read_every(reader)}
+def _write_intervals(intervals_s: Sequence[tuple[float, float]]) -> str:
+    return ",".join(f"{time_text(begin_s)}-{time_text(end_s)}" for begin_s, end_s in intervals_s)
 
 
-def _read_every(reader: WordReader) -> Table:
-    return {"every_s": reader.value(OWN_TIME_S)} if reader.accept("every") else {}
+_INTERVALS = Quantity("intervals of time, e.g. 2s-3s,5s-5500ms", _read_intervals, _write_intervals)
 
 
-class Blackout(Impairment):
+def _every(example: str) -> Part:
+    return Part(("every_s",), OWN_TIME_S, "T", "every", example)
+
+
+class Blackout(FileFeature, Impairment):
     """All packets that arrive during given intervals of time are lost."""
 
     kind: Literal["blackout"] = "blackout"
@@ -53,11 +48,20 @@ class Blackout(Impairment):
     every_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e9)] | None = None
     """The intervals repeat after this time."""
 
-    words: ClassVar = (
-        Word("blackout", "blackout 2s-3s", _read, grammar="blackout T-T[,T-T...] [every T]"),
-        Word("every", "blackout 2s-3s every 10s", after="blackout BEGIN-END"),
-        Word("outages", "outages outages.txt", _read_outages, grammar="outages FILE [every T]"),
-        Word("every", "outages outages.txt every 60s", after="outages FILE"),
+    clauses: ClassVar = (
+        Clause(
+            "blackout",
+            "blackout 2s-3s",
+            (
+                Part(("intervals_s",), _INTERVALS, "T-T[,T-T...]"),
+                _every("blackout 2s-3s every 10s"),
+            ),
+        ),
+        Clause(
+            "outages",
+            "outages outages.txt",
+            (file_name("a file of outages"), _every("outages outages.txt every 60s")),
+        ),
     )
     tc_missing: ClassVar = "blackouts"
 
@@ -69,21 +73,6 @@ class Blackout(Impairment):
             _require_order(self.intervals_s, self.every_s)
         return self
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [
-            cls(intervals_s=((0.0, 0.01), (0.02, 0.03)), every_s=0.05),
-            cls(intervals_s=((0.001, 0.02),)),
-            cls(file="my outages.txt", every_s=60.0),
-        ]
-
-    def text(self) -> str:
-        every = "" if self.every_s is None else f" every {time_text(self.every_s)}"
-        if self.intervals_s is None:
-            return f"outages {shlex.quote(self.file or '')}{every}"
-        parts = (f"{time_text(a)}-{time_text(b)}" for a, b in self.intervals_s)
-        return f"blackout {','.join(parts)}{every}"
-
     def meaning(self) -> str:
         every = "" if self.every_s is None else f", every {time_text(self.every_s)}"
         if self.intervals_s is None:
@@ -93,9 +82,8 @@ class Blackout(Impairment):
         return f"loses every packet from {', '.join(parts)}{more} after the start{every}"
 
     def stage(self, tables: StageTables) -> Stage:
-        if self.intervals_s is None:
-            raise ValueError(f"{self.file}: the intervals have not been read")
-        begins_and_ends = zip(*self.intervals_s, strict=True)
+        self.require_content()
+        begins_and_ends = zip(*(self.intervals_s or ()), strict=True)
         times_ns = [round(t_s * NS_PER_S) for times_s in begins_and_ends for t_s in times_s]
         begin, end = add_numbers(tables.integers, times_ns)
         period_ns = round((self.every_s or 0) * NS_PER_S)
@@ -104,10 +92,7 @@ class Blackout(Impairment):
     def chains(self) -> Sequence[Chain]:
         raise NotPredictableError("losses in a blackout depend on when packets arrive")
 
-    def without_files(self, folder: Path, place: str) -> Self:
-        if self.file is None:
-            return self
-        file = NamedFile(self.file, folder, place)
+    def read_file(self, file: NamedFile) -> Self:
         intervals_s = []
         for number, line in file.lines():
             try:

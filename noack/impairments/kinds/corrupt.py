@@ -2,7 +2,8 @@
 
 from typing import ClassVar, Literal
 
-from noack.impairments.feature import CorrelatedChance, Impairment, Word, read_chance
+from noack.impairments.clauses import Clause
+from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment
 from noack.impairments.words import brief_percent
 from noack.settings.section import Probability
 
@@ -14,13 +15,10 @@ class Corrupt(CorrelatedChance, Impairment):
     probability: Probability
     """Probability of a flipped bit."""
 
-    words: ClassVar = (Word("corrupt", "corrupt 1%", read_chance, grammar="corrupt P [CORR]"),)
+    clauses: ClassVar = (Clause("corrupt", "corrupt 1%", CHANCE),)
     behaviour: ClassVar = "corrupt"
     action: ClassVar = "corrupt"
     flips_bits: ClassVar = True
-
-    def text(self) -> str:
-        return f"corrupt {self.chance_text}"
 
     def meaning(self) -> str:
         how = self.correlation_meaning

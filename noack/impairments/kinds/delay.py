@@ -9,20 +9,20 @@ import math
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self, get_args
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
+from noack.impairments.clauses import Clause, Part, Table, Word
 from noack.impairments.feature import (
     TC_CORRELATION,
+    FileFeature,
     Impairment,
     Stage,
     StageTables,
-    Table,
-    Word,
     add_numbers,
 )
 from noack.impairments.words import (
@@ -32,6 +32,7 @@ from noack.impairments.words import (
     TIME_S,
     WordReader,
     brief_percent,
+    list_of,
     percent_text,
     time_text,
 )
@@ -54,45 +55,35 @@ _UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _DELAY = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z]*)")
 
 
-def _read(reader: WordReader) -> Table:
-    """Read a delay; the clauses after its numbers may stand in any order."""
-    table: Table = {"delay_s": reader.value(TIME_S)}
-    if reader.number_follows():
-        table["jitter_s"] = reader.value(TIME_S)
-        if reader.number_follows():
-            table["correlation"] = reader.value(CORRELATION)
-    while True:
-        if reader.accept("distribution"):
-            _once(reader, table, "distribution")
-            _read_distribution(reader, table)
-        elif reader.accept("samples"):
-            _once(reader, table, "distribution")
-            table["distribution"] = "empirical"
-            expected = "delays with their units, e.g. 1ms,2ms,10ms"
-            table["samples_s"] = reader.values(OWN_TIME_S, expected)
-        elif reader.accept("lossrel"):
-            _once(reader, table, "loss_correlation")
-            table["loss_correlation"] = reader.value(SIGNED_PERCENT)
-        else:
-            return table
+@dataclass(frozen=True)
+class _JitterPart(Part):
+    """The jitter, which a distribution other than the uniform one needs."""
+
+    def is_default(self, settings: Any) -> bool:
+        return super().is_default(settings) and settings.distribution in ("uniform", "empirical")
+
+    def described(self, after: str) -> Iterator[Word]:
+        yield Word("jitter", "delay 10ms 2ms", after)
 
 
-def _once(reader: WordReader, table: Table, key: str) -> None:
-    if key in table:
-        reader.wrong("this delay has one already")
+@dataclass(frozen=True)
+class _DistributionPart(Part):
+    """The name of a distribution, or of a file."""
+
+    def read(self, reader: WordReader, table: Table) -> None:
+        name = reader.file(f"one of {', '.join(SHAPES)}, or a file")
+        if name not in SHAPES:
+            table |= {"distribution": "empirical", "file": name}
+            return
+        table["distribution"] = name
+        if "jitter_s" not in table:
+            reader.wrong("has no effect without jitter; write delay TIME JITTER distribution NAME")
+
+    def is_default(self, settings: Any) -> bool:
+        return settings.distribution == "uniform" or settings.samples_s is not None
 
 
-def _read_distribution(reader: WordReader, table: Table) -> None:
-    name = reader.file(f"one of {', '.join(SHAPES)}, or a file")
-    if name not in SHAPES:
-        table |= {"distribution": "empirical", "file": name}
-        return
-    table["distribution"] = name
-    if "jitter_s" not in table:
-        reader.wrong("has no effect without jitter; write delay TIME JITTER distribution NAME")
-
-
-_GRAMMAR = f"delay T [JITTER [CORR]] [distribution {'|'.join(SHAPES)}|FILE] [lossrel P]"
+_SAMPLES = list_of(OWN_TIME_S, "delays with their units, e.g. 1ms,2ms,10ms")
 _DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
 _Samples = Annotated[
     tuple[Annotated[FiniteFloat, Field(ge=-MOST_DELAY_S, le=MOST_DELAY_S)], ...],
@@ -100,7 +91,7 @@ _Samples = Annotated[
 ]
 
 
-class Delay(Impairment):
+class Delay(FileFeature, Impairment):
     """Delays a packet by a constant time plus a random time; negative sums count as 0."""
 
     kind: Literal["delay"] = "delay"
@@ -123,16 +114,29 @@ class Delay(Impairment):
     """Correlation with the preceding loss model: positive values delay packets in its bad state
     more."""
 
-    words: ClassVar = (
-        Word("delay", "delay 10ms", _read, grammar=_GRAMMAR),
-        Word("latency", "delay 10ms", _read),
-        Word("jitter", "delay 10ms 2ms", after="delay TIME"),
-        Word("distribution", "delay 10ms 2ms distribution normal", after="delay TIME JITTER"),
-        Word(
-            "samples", "delay 0s samples 1ms,2ms,10ms", after="delay TIME",
-            grammar="delay T samples T,T,... [lossrel P]",
+    clauses: ClassVar = (
+        Clause(
+            "delay",
+            "delay 10ms",
+            (
+                Part(("delay_s",), TIME_S, "TIME"),
+                _JitterPart(("jitter_s",), TIME_S, "JITTER"),
+                Part(("correlation",), CORRELATION, "CORR"),
+                _DistributionPart(
+                    ("distribution",), None, f"{'|'.join(SHAPES)}|FILE", "distribution",
+                    "delay 10ms 2ms distribution normal",
+                ),
+                Part(
+                    ("samples_s",), _SAMPLES, "T,T,...", "samples", "delay 0s samples 1ms,2ms,10ms",
+                    {"distribution": "empirical"},
+                ),
+                Part(
+                    ("loss_correlation",), SIGNED_PERCENT, "P", "lossrel",
+                    "loss 5% delay 10ms 2ms lossrel 50%",
+                ),
+            ),
+            ("latency",),
         ),
-        Word("lossrel", "loss 5% delay 10ms 2ms lossrel 50%", after="delay TIME"),
     )  # fmt: skip
     delays: ClassVar = True
 
@@ -165,17 +169,6 @@ class Delay(Impairment):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         varies = bool(self.jitter_s or self.samples_s or self.file)
         return delayed or varies or self.delay_s > 0, reordered or varies
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        shapes: tuple[Distribution, ...] = ("uniform", "normal", "pareto", "paretonormal")
-        return [
-            cls(delay_s=0.0005),
-            *(cls(delay_s=0.004, jitter_s=0.004, distribution=shape) for shape in shapes),
-            cls(jitter_s=0.0005, correlation=0.7),
-            cls(delay_s=0.01, jitter_s=0.01, distribution="normal", loss_correlation=0.8),
-            cls(distribution="empirical", samples_s=(0.0, 0.001, 0.002, 0.009)),
-        ]
 
     def text(self) -> str:
         words = ["delay", time_text(self.delay_s)]
@@ -238,8 +231,7 @@ class Delay(Impairment):
         return low
 
     def stage(self, tables: StageTables) -> Stage:
-        if self.file is not None:
-            raise ValueError(f"{self.file}: the delays have not been read")
+        self.require_content()
         begin, end = add_numbers(
             tables.reals, sorted(t_s * NS_PER_S for t_s in self.samples_s or ())
         )
@@ -256,10 +248,8 @@ class Delay(Impairment):
         }
         return Stage(self.kind, numbers)
 
-    def without_files(self, folder: Path, place: str) -> Self:
-        if self.file is None:
-            return self
-        samples_s = read_samples(self.file, self.jitter_s, MOST_DELAY_S, folder, place)
+    def read_file(self, file: NamedFile) -> Self:
+        samples_s = _read_samples(file, self.jitter_s)
         return self.model_copy(update={"samples_s": samples_s, "file": None, "jitter_s": 0.0})
 
     def tc_text(self) -> str:
@@ -282,23 +272,9 @@ class Delay(Impairment):
         return notes
 
 
-def read_samples(
-    name: str, jitter_s: float, most_s: float, folder: Path, place: str
-) -> tuple[float, ...]:
-    """Return the delays in a file, in seconds; the jitter scales a distribution table.
-
-    Args:
-        name: name of the file, relative to ``folder``.
-        jitter_s: the jitter.
-        most_s: maximum delay.
-        folder: the folder.
-        place: position of the file name in the settings, for messages.
-
-    Raises:
-        CallerError: one line; the file cannot be read, or has wrong content.
-    """
-    file = NamedFile(name, folder, place)
-    if Path(name).suffix == TABLE_SUFFIX:
+def _read_samples(file: NamedFile, jitter_s: float) -> tuple[float, ...]:
+    """Return the delays in a file, in seconds; the jitter scales a distribution table."""
+    if file.path.suffix == TABLE_SUFFIX:
         if jitter_s == 0:
             file.wrong("a distribution table is scaled by the jitter, which is 0; give a jitter")
         samples_s = [jitter_s * entry / _TABLE_SCALE for entry in _table(file)]
@@ -311,8 +287,8 @@ def read_samples(
         samples_s = list(_observed_s(file))
     if not 2 <= len(samples_s) <= MAX_SAMPLES:
         file.wrong(f"has {len(samples_s)} delays; expected 2 to {MAX_SAMPLES}")
-    if max(map(abs, samples_s)) > most_s:
-        file.wrong(f"has a delay beyond {most_s:g} s")
+    if max(map(abs, samples_s)) > MOST_DELAY_S:
+        file.wrong(f"has a delay beyond {MOST_DELAY_S:g} s")
     return tuple(samples_s)
 
 

@@ -2,7 +2,8 @@
 
 from typing import ClassVar, Literal
 
-from noack.impairments.feature import CorrelatedChance, Impairment, Word, read_chance
+from noack.impairments.clauses import Clause
+from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment
 from noack.impairments.words import brief_percent
 from noack.settings.section import Probability
 
@@ -14,15 +15,10 @@ class Duplicate(CorrelatedChance, Impairment):
     probability: Probability
     """Probability of a copy."""
 
-    words: ClassVar = (
-        Word("duplicate", "duplicate 1%", read_chance, grammar="duplicate P [CORR]"),
-    )
+    clauses: ClassVar = (Clause("duplicate", "duplicate 1%", CHANCE),)
     behaviour: ClassVar = "duplicate"
     action: ClassVar = "duplicate"
     copies: ClassVar = True
-
-    def text(self) -> str:
-        return f"duplicate {self.chance_text}"
 
     def meaning(self) -> str:
         how = self.correlation_meaning

@@ -1,38 +1,44 @@
 """Loss, by one of the loss models."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
+from noack.impairments.clauses import Clause, Table, Word
+from noack.impairments.feature import Impairment, Stage, StageTables
 from noack.impairments.loss_models import LOSS_MODELS, Loss
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.words import WordReader
 
-_MODELS = {
-    word.name: (model, word) for model in LOSS_MODELS for word in model.words if word.read
-}  # fmt: skip
+_MODELS = {clause.word: (model, clause) for model in LOSS_MODELS for clause in model.clauses}
 LOSS_WORDS = tuple(_MODELS)
 """Words after ``loss`` that select a model."""
 
 
-def _read(reader: WordReader) -> Table:
-    if reader.number_follows():
-        name = "random"
-    else:
-        name = reader.word(f"a percentage, e.g. 5%, or one of {', '.join(LOSS_WORDS)}")
-    if name not in _MODELS:
-        for model in LOSS_MODELS:
-            called = model.model_fields["model"].default
-            if name.startswith(called.partition("_")[0]):
-                reader.wrong(f"no such word; here it is {model.words[0].example}")
-        reader.unknown(name, LOSS_WORDS)
-    model, word = _MODELS[name]
-    assert word.read is not None
-    loss = {"model": model.model_fields["model"].default, **word.read(reader)}
-    if reader.accept("ecn"):
-        reader.wrong("this emulator cannot mark packets: it sees payloads, not IP headers")
-    return {"loss": loss}
+class _LossClause(Clause):
+    """The clauses of the loss models, after ``loss``; a percentage begins that of random loss."""
+
+    def read(self, reader: WordReader) -> Table:
+        if reader.number_follows():
+            name = "random"
+        else:
+            name = reader.word(f"a percentage, e.g. 5%, or one of {', '.join(LOSS_WORDS)}")
+        if name not in _MODELS:
+            for model in LOSS_MODELS:
+                called = model.model_fields["model"].default
+                if name.startswith(called.partition("_")[0]):
+                    reader.wrong(f"no such word; here it is {model.clauses[0].example}")
+            reader.unknown(name, LOSS_WORDS)
+        model, clause = _MODELS[name]
+        loss = {"model": model.model_fields["model"].default, **clause.read(reader)}
+        if reader.accept("ecn"):
+            reader.wrong("this emulator cannot mark packets: it sees payloads, not IP headers")
+        return {"loss": loss}
+
+    def described(self, before: str = "") -> Iterator[Word]:
+        yield from (Word(name, self.example, before) for name in (self.word, *self.synonyms))
+        for _, clause in _MODELS.values():
+            yield from clause.described(self.word)
 
 
 class LossOf(Impairment):
@@ -42,21 +48,7 @@ class LossOf(Impairment):
     loss: Loss
     """The loss model."""
 
-    words: ClassVar = (
-        Word("loss", "loss 30%", _read),
-        Word("drop", "loss 30%", _read),
-        *(
-            word._replace(
-                read=None, after=word.after or "loss",
-                grammar=word.grammar and f"loss {word.grammar}",
-            )
-            for model in LOSS_MODELS for word in model.words
-        ),
-    )  # fmt: skip
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [cls(loss=loss) for model in LOSS_MODELS for loss in model.examples()]
+    clauses: ClassVar = (_LossClause("loss", "loss 30%", synonyms=("drop",)),)
 
     def text(self) -> str:
         return f"loss {self.loss.text()}"

@@ -1,9 +1,6 @@
 """Delivery opportunities from a trace of mahimahi; see native/impairments/opportunities.c."""
 
-import shlex
-from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -12,45 +9,30 @@ from pydantic import Field, model_validator
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import shortened
+from noack.impairments.clauses import Clause, FileOr, Part
 from noack.impairments.feature import (
     LONGEST_NS,
+    OFFSET,
+    FileFeature,
     Impairment,
     Offset,
     Stage,
     StageTables,
-    Table,
-    Word,
     add_numbers,
     offset_meaning,
     offset_ns,
-    offset_text,
-    read_offset,
     require_inside,
 )
-from noack.impairments.words import COUNT, SIGNED_COUNT, WordReader, brief_number
+from noack.impairments.words import COUNT, SIGNED_COUNT, brief_number, list_of
 from noack.settings.user_files import NamedFile
 
 OPPORTUNITY_BYTES: int = core.NOACK_OPPORTUNITY_BYTES
 MOST_TIMES = 2_000_000
 _NS_PER_MS = NS_PER_S // 1000
 _LONGEST_MS = LONGEST_NS // _NS_PER_MS
-_QUEUE = 1000
-_HEADERS_BYTES = 32
-_EXPECTED = "times in ms that do not descend, e.g. 0,1,5"
 
 
-def _read(reader: WordReader) -> Table:
-    name = reader.file("a file with delivery opportunities, in ms")
-    table: Table = {"times_ms": reader.values(COUNT, _EXPECTED)} if name == "at" else {"file": name}
-    return reader.options(table, {
-        "overhead": ("overhead_bytes", lambda reader: reader.value(SIGNED_COUNT)),
-        "queue": ("queue", lambda reader: reader.value(COUNT)),
-        "bytes": ("queue_bytes", lambda reader: reader.value(COUNT)),
-        "from": ("offset_s", read_offset),
-    })  # fmt: skip
-
-
-class Opportunities(Impairment):
+class Opportunities(FileFeature, Impairment):
     """A link that delivers packets at recorded times, from a finite queue, as mahimahi does."""
 
     kind: Literal["opportunities"] = "opportunities"
@@ -61,28 +43,36 @@ class Opportunities(Impairment):
         Field(min_length=1, max_length=MOST_TIMES),
     ] | None = None  # fmt: skip
     """Instead of a file: these times, which do not descend; they repeat after the last."""
-    queue: Annotated[int, Field(ge=1, le=1_000_000)] = _QUEUE
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """Maximum number of packets that wait; further packets are dropped."""
     queue_bytes: Annotated[int, Field(ge=1, le=2**40)] | None = None
     """Maximum number of bytes that wait; by default not limited."""
-    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = _HEADERS_BYTES
+    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = 32
     """Bytes added to each payload; 32: UDP, IPv4, and 4 bytes of a TUN device, as in mahimahi."""
     offset_s: Offset = 0.0
     """Begin at this time of the trace, in seconds; random: at a time that the seed chooses."""
 
-    words: ClassVar = (
-        Word(
-            "opportunities", "opportunities trace.up", _read,
-            grammar="opportunities FILE [overhead N] [queue N] [bytes N] [from T|random]",
+    clauses: ClassVar = (
+        Clause(
+            "opportunities",
+            "opportunities trace.up",
+            (
+                FileOr(
+                    ("times_ms",), list_of(COUNT, "times in ms that do not descend, e.g. 0,1,5"),
+                    "N,N,...", "at", "opportunities at 0,1,5",
+                    expected="a file with delivery opportunities, in ms",
+                ),
+                Part(
+                    ("overhead_bytes",), SIGNED_COUNT, "N", "overhead",
+                    "opportunities trace.up overhead 28",
+                ),
+                Part(("queue",), COUNT, "N", "queue", "opportunities trace.up queue 20"),
+                Part(("queue_bytes",), COUNT, "N", "bytes", "opportunities trace.up bytes 30000"),
+                Part(
+                    ("offset_s",), OFFSET, "T|random", "from", "opportunities trace.up from random"
+                ),
+            ),
         ),
-        Word(
-            "at", "opportunities at 0,1,5", after="opportunities",
-            grammar="opportunities at N,N,...",
-        ),
-        Word("overhead", "opportunities trace.up overhead 28", after="opportunities FILE"),
-        Word("queue", "opportunities trace.up queue 20", after="opportunities FILE"),
-        Word("bytes", "opportunities trace.up bytes 30000", after="opportunities FILE"),
-        Word("from", "opportunities trace.up from random", after="opportunities FILE"),
     )  # fmt: skip
     delays: ClassVar = True
     tc_missing: ClassVar = "delivery opportunities"
@@ -136,31 +126,6 @@ class Opportunities(Impairment):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         return True, False  # it serves in the order of arrival
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        times_ms = (0, 0, 1, 2, 2, 2, 5)
-        return [
-            cls(times_ms=times_ms, queue=2),
-            cls(times_ms=times_ms, queue=50, queue_bytes=4000, offset_s="random"),
-            cls(times_ms=(1,), queue=1, overhead_bytes=-10, offset_s=0.0005),
-            cls(times_ms=(0, 20), queue=5),
-            cls(file="a trace.up"),
-        ]
-
-    def text(self) -> str:
-        if self.times_ms is None:
-            name = self.file or ""
-            words = ["opportunities", shlex.quote("./at" if name == "at" else name)]
-        else:
-            words = ["opportunities", "at", ",".join(map(str, self.times_ms))]
-        if self.overhead_bytes != _HEADERS_BYTES:
-            words.append(f"overhead {self.overhead_bytes}")
-        if self.queue != _QUEUE:
-            words.append(f"queue {self.queue}")
-        if self.queue_bytes is not None:
-            words.append(f"bytes {self.queue_bytes}")
-        return " ".join(words) + offset_text(self.offset_s)
-
     def meaning(self) -> str:
         what = self.file
         if self.times_ms is not None:
@@ -178,9 +143,8 @@ class Opportunities(Impairment):
         )
 
     def stage(self, tables: StageTables) -> Stage:
-        if self.times_ms is None:
-            raise ValueError(f"{self.file}: the delivery opportunities have not been read")
-        begin, end = add_numbers(tables.integers, self.times_ms)
+        self.require_content()
+        begin, end = add_numbers(tables.integers, self.times_ms or ())
         numbers = {
             "begin": begin,
             "end": end,
@@ -190,10 +154,7 @@ class Opportunities(Impairment):
         }
         return Stage(self.kind, numbers, queue_places=2 * self.queue)
 
-    def without_files(self, folder: Path, place: str) -> Self:
-        if self.file is None:
-            return self
-        file = NamedFile(self.file, folder, place)
+    def read_file(self, file: NamedFile) -> Self:
         read = self.model_copy(update={"times_ms": _times_ms(file), "file": None})
         require_inside(self.offset_s, read.length_ns, file)
         return read

@@ -1,43 +1,47 @@
 """A bottleneck with a finite queue, and a discipline for the queue."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from noack.impairments.clauses import Clause, Part, Table, Word
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.feature import Impairment, Stage, StageTables, Table, Word
-from noack.impairments.words import (
-    COUNT,
-    RATE_BPS,
-    SIGNED_COUNT,
-    WordReader,
-    rate_text,
-    without_defaults,
-)
+from noack.impairments.feature import Impairment, Stage, StageTables
+from noack.impairments.words import COUNT, RATE_BPS, SIGNED_COUNT, WordReader, rate_text
 
-_QUEUE = 1000
-_HEADERS_BYTES = 28
 _TC_HEADERS_BYTES = 42
 """Bytes that tc adds to a payload on an Ethernet device: headers of Ethernet, IPv4 and UDP."""
 
 
-def _read(reader: WordReader) -> Table:
-    table: Table = {"rate_bps": reader.value(RATE_BPS)}
-    for key, signs in (("overhead_bytes", "-"), ("cell_bytes", ""), ("cell_overhead_bytes", "-")):
-        if not reader.number_follows(signs):
-            break
-        table[key] = reader.value(SIGNED_COUNT)
-    if reader.accept("queue"):
-        table["queue"] = reader.value(COUNT)
-    for discipline in DISCIPLINES:
-        for word in discipline.words:
-            if word.read is not None and reader.accept(word.name):
-                kind = discipline.model_fields["kind"].default
-                table["discipline"] = {"kind": kind, **word.read(reader)}
-    return table
+@dataclass(frozen=True)
+class _DisciplinePart(Part):
+    """A discipline of the queue, by the clause that its kind has."""
+
+    @property
+    def _clause(self) -> Clause:
+        return next(
+            clause for kind in DISCIPLINES for clause in kind.clauses if clause.word == self.word
+        )
+
+    @property
+    def grammar(self) -> str:
+        return self._clause.grammar
+
+    def read(self, reader: WordReader, table: Table) -> None:
+        table["discipline"] = self._clause.read(reader)
+
+    def is_default(self, settings: Any) -> bool:
+        return self._clause not in settings.discipline.clauses
+
+    def text(self, settings: Any) -> str:
+        return str(settings.discipline.text())
+
+    def described(self, after: str) -> Iterator[Word]:
+        yield from (word._replace(grammar="") for word in self._clause.described(after))
 
 
 class Rate(Impairment):
@@ -46,9 +50,9 @@ class Rate(Impairment):
     kind: Literal["rate"] = "rate"
     rate_bps: Annotated[int, Field(ge=1, le=10**12)]
     """Bits per second."""
-    queue: Annotated[int, Field(ge=1, le=1_000_000)] = _QUEUE
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """Maximum number of packets that wait or are being sent; further packets are dropped."""
-    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = _HEADERS_BYTES
+    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = 28
     """Bytes added to each payload; 28: the headers of UDP and IPv4."""
     cell_bytes: Annotated[int, Field(ge=0, le=65_535)] = 0
     """Payload of a link-layer cell, e.g. 48; 0: no cells."""
@@ -57,18 +61,21 @@ class Rate(Impairment):
     discipline: Discipline = TailDrop.model_construct()
     """Which packets the queue drops."""
 
-    words: ClassVar = (
-        Word(
-            "rate", "rate 1mbit", _read,
-            grammar="rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue N]",
-        ),
-        Word("queue", "rate 1mbit queue 20", after="rate RATE"),
-        *(
-            word._replace(
-                read=None, after=word.after or "rate RATE",
-                grammar=word.grammar and f"rate RATE ... {word.grammar}",
-            )
-            for discipline in DISCIPLINES for word in discipline.words
+    clauses: ClassVar = (
+        Clause(
+            "rate",
+            "rate 1mbit",
+            (
+                Part(("rate_bps",), RATE_BPS, "RATE"),
+                Part(("overhead_bytes",), SIGNED_COUNT, "OVERHEAD"),
+                Part(("cell_bytes",), COUNT, "CELL"),
+                Part(("cell_overhead_bytes",), SIGNED_COUNT, "CELL_OVERHEAD"),
+                Part(("queue",), COUNT, "N", "queue", "rate 1mbit queue 20"),
+                *(
+                    _DisciplinePart(("discipline",), word=clause.word)
+                    for kind in DISCIPLINES for clause in kind.clauses
+                ),
+            ),
         ),
     )  # fmt: skip
     delays: ClassVar = True
@@ -113,26 +120,6 @@ class Rate(Impairment):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         return True, False  # it serves in the order of arrival
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        disciplines = [example for kind in DISCIPLINES for example in kind.examples()]
-        rates = ((5_000_000, 1), (5_000_000, 50), (10**8, 5))
-        return [
-            *(
-                cls(rate_bps=rate_bps, queue=queue, discipline=discipline)
-                for rate_bps, queue in rates for discipline in disciplines
-            ),
-            cls(rate_bps=10**9, overhead_bytes=-10, cell_bytes=48, cell_overhead_bytes=5),
-        ]  # fmt: skip
-
-    def text(self) -> str:
-        numbers = (self.overhead_bytes, self.cell_bytes, self.cell_overhead_bytes)
-        given = without_defaults(numbers, (_HEADERS_BYTES, 0, 0))
-        words = ["rate", rate_text(self.rate_bps), *given]
-        if self.queue != _QUEUE:
-            words.append(f"queue {self.queue}")
-        return " ".join(filter(None, [*map(str, words), self.discipline.text()]))
-
     def meaning(self) -> str:
         text = (
             f"forwards {rate_text(self.rate_bps)} per second, one packet after the other, each "
@@ -144,10 +131,8 @@ class Rate(Impairment):
         return text
 
     def stage(self, tables: StageTables) -> Stage:
-        names = ("rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes")
-        return self.discipline.queue_stage(
-            {name: getattr(self, name) for name in names}, self.queue
-        )
+        names = {"rate_bps", "overhead_bytes", "cell_bytes", "cell_overhead_bytes"}
+        return self.discipline.queue_stage(self.model_dump(include=names), self.queue)
 
     def tc_text(self) -> str:
         cells = (self.cell_bytes, self.cell_overhead_bytes)

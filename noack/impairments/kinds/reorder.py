@@ -1,28 +1,14 @@
 """Reordering: a packet leaves at once instead of being delayed."""
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from noack.impairments.feature import (
-    CorrelatedChance,
-    Impairment,
-    Stage,
-    StageTables,
-    Table,
-    Word,
-    read_chance,
-)
-from noack.impairments.words import COUNT, WordReader, brief_percent
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment, Stage, StageTables
+from noack.impairments.words import COUNT, brief_percent
 from noack.settings.section import Probability
-
-
-def _read(reader: WordReader) -> Table:
-    table: Table = {**read_chance(reader)}
-    if reader.accept("gap"):
-        table["gap"] = reader.value(COUNT)
-    return table
 
 
 class Reorder(CorrelatedChance, Impairment):
@@ -34,30 +20,21 @@ class Reorder(CorrelatedChance, Impairment):
     gap: Annotated[int, Field(ge=1, le=2**40)] = 1
     """Only every ``gap``-th packet can be reordered."""
 
-    words: ClassVar = (
-        Word("reorder", "delay 10ms reorder 5%", _read, grammar="reorder P [CORR] [gap N]"),
-        Word(
-            "gap", "delay 10ms gap 5", lambda reader: {"gap": reader.value(COUNT)}, grammar="gap N"
+    clauses: ClassVar = (
+        Clause(
+            "reorder",
+            "delay 10ms reorder 5%",
+            (*CHANCE, Part(("gap",), COUNT, "N", "gap", "delay 10ms reorder 5% gap 5")),
         ),
+        Clause("gap", "delay 10ms gap 5", (Part(("gap",), COUNT, "N"),)),
     )
-
     behaviour: ClassVar = "reorder"
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        chances = ((0.0, 1), (0.5, 1), (0.9, 2), (1.0, 4))
-        alone = [cls(probability=p, gap=gap) for p, gap in chances]
-        return [*alone, cls(probability=0.5, correlation=0.7, gap=3)]
 
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         return delayed, reordered or (delayed and self.probability > 0)
 
     def delay_range_s(self, least_s: float, largest_s: float) -> tuple[float, float]:
         return 0.0, largest_s
-
-    def text(self) -> str:
-        gap = f" gap {self.gap}" if self.gap != 1 else ""
-        return f"reorder {self.chance_text}{gap}"
 
     def meaning(self) -> str:
         which = f"{brief_percent(self.probability)} of the packets"

@@ -1,40 +1,34 @@
 """Replay of a packet trace; see native/impairments/replay.c."""
 
-import re
-import shlex
 from bisect import bisect_left
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from noack.core.clock import NS_PER_S
+from noack.impairments.clauses import Clause, FileOr, Part, flag
 from noack.impairments.feature import (
     LONGEST_NS,
+    OFFSET,
+    FileFeature,
     Impairment,
     Offset,
     Stage,
     StageTables,
-    Table,
-    Word,
     add_numbers,
     offset_meaning,
     offset_ns,
-    offset_text,
-    read_offset,
     require_inside,
 )
 from noack.impairments.markov_chain import NotPredictableError, Pattern
 from noack.impairments.words import (
     OWN_TIME_NS,
     PERCENT,
-    TIME,
-    WordReader,
+    Quantity,
     brief_number,
     brief_percent,
-    percent_text,
     time_ns_text,
 )
 from noack.settings.section import Probability
@@ -44,36 +38,34 @@ from noack.traces.trace_formats import find_trace, read_trace
 
 MOST_RECORDS = 1_000_000
 LONGEST_DELAY_NS = 3600 * NS_PER_S
-_EXPECTED = "records of sending time and delay, e.g. 0ms+12ms,50ms+lost"
 
 
-def _read(reader: WordReader) -> Table:
-    name = reader.file("a file with a packet trace")
-    table: Table = _read_records(reader) if name == "records" else {"file": name}
-    return reader.options(table, {
-        "by": ("by", lambda reader: reader.word("packet or time")),
-        "from": ("offset_s", read_offset),
-        "share": ("delay_share", lambda reader: reader.value(PERCENT)),
-        "relative": ("clocks_differ", lambda _: True),
-        "once": ("repeat", lambda _: False),
-    })  # fmt: skip
-
-
-def _read_records(reader: WordReader) -> Table:
+def _read_records(word: str) -> tuple[list[int], list[int]]:
     sent_ns, delays_ns = [], []
-    for part in reader.word(_EXPECTED).split(","):
-        match = re.fullmatch(rf"({TIME})\+({TIME}|lost)", part)
-        if match is None:
-            reader.wrong(f"expected {_EXPECTED}")
-        sent_ns.append(reader.read(match[1], OWN_TIME_NS))
-        delays_ns.append(LOST_NS if match[2] == "lost" else reader.read(match[2], OWN_TIME_NS))
-    return {"sent_ns": sent_ns, "delays_ns": delays_ns}
+    for part in word.split(","):
+        sent, _, delay = part.partition("+")
+        sent_ns.append(OWN_TIME_NS.read(sent))
+        delays_ns.append(LOST_NS if delay == "lost" else OWN_TIME_NS.read(delay))
+    return sent_ns, delays_ns
 
 
+def _write_records(records: tuple[Sequence[int], Sequence[int]]) -> str:
+    return ",".join(
+        f"{time_ns_text(sent_ns)}+{'lost' if delay_ns < 0 else time_ns_text(delay_ns)}"
+        for sent_ns, delay_ns in zip(*records, strict=True)
+    )
+
+
+_RECORDS = Quantity(
+    "records of sending time and delay, in whole ns, e.g. 0ms+12ms,50ms+lost",
+    _read_records,
+    _write_records,
+)
+_BY = Quantity("packet or time", str)
 _Records = Annotated[tuple[int, ...], Field(min_length=1, max_length=MOST_RECORDS)]
 
 
-class Replay(Impairment):
+class Replay(FileFeature, Impairment):
     """Replays a packet trace: each packet is lost or delayed as a recorded packet was."""
 
     kind: Literal["replay"] = "replay"
@@ -97,20 +89,22 @@ class Replay(Impairment):
     """true: the file's sending and receiving times are of different clocks. The delays are then
     counted from the smallest one."""
 
-    words: ClassVar = (
-        Word(
-            "replay", "replay trace.csv", _read,
-            grammar="replay FILE [by packet|time] [from T|random] [share P] [relative] [once]",
+    clauses: ClassVar = (
+        Clause(
+            "replay",
+            "replay trace.csv",
+            (
+                FileOr(
+                    ("sent_ns", "delays_ns"), _RECORDS, "T+T,T+lost,...", "records",
+                    "replay records 0ms+12ms,50ms+lost", expected="a file with a packet trace",
+                ),
+                Part(("by",), _BY, "packet|time", "by", "replay trace.csv by time"),
+                Part(("offset_s",), OFFSET, "T|random", "from", "replay trace.csv from random"),
+                Part(("delay_share",), PERCENT, "P", "share", "replay trace.csv share 50%"),
+                flag("relative", "replay trace.csv relative", "clocks_differ", True),
+                flag("once", "replay trace.csv once", "repeat", False),
+            ),
         ),
-        Word(
-            "records", "replay records 0ms+12ms,50ms+lost", after="replay",
-            grammar="replay records T+T,T+lost,...",
-        ),
-        Word("by", "replay trace.csv by time", after="replay FILE"),
-        Word("from", "replay trace.csv from random", after="replay FILE"),
-        Word("share", "replay trace.csv share 50%", after="replay FILE"),
-        Word("relative", "replay trace.csv relative", after="replay FILE"),
-        Word("once", "replay trace.csv once", after="replay FILE"),
     )  # fmt: skip
     delays: ClassVar = True
     tc_missing: ClassVar = "traces of packets"
@@ -158,37 +152,6 @@ class Replay(Impairment):
         varies = self.delays_ns is None or len(set(self.delays_ns) - {LOST_NS}) > 1
         return True, reordered or varies
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        ms = 10**6
-        sent_ns = (0, ms, ms, 4 * ms, 5 * ms, 5 * ms + 1)
-        delays_ns = (3 * ms, -1, 9 * ms, 2 * ms, -1, 0)
-        records = cls(sent_ns=sent_ns, delays_ns=delays_ns)
-        updates: Sequence[Table] = (
-            {"by": "time", "offset_s": "random", "delay_share": 0.3},
-            {"repeat": False, "offset_s": 0.002},
-            {"by": "time", "repeat": False},
-        )
-        others = [records.model_copy(update=update) for update in updates]
-        lost = cls(sent_ns=(0,), delays_ns=(-1,))
-        return [records, *others, lost, cls(file="a trace.csv", clocks_differ=True)]
-
-    def text(self) -> str:
-        if self.sent_ns is not None and self.delays_ns is not None:
-            pairs = zip(self.sent_ns, self.delays_ns, strict=True)
-            words = "records " + ",".join(
-                f"{time_ns_text(at)}+{'lost' if delay < 0 else time_ns_text(delay)}"
-                for at, delay in pairs
-            )
-        else:
-            name = self.file or ""
-            words = shlex.quote("./records" if name == "records" else name)
-        by = " by time" if self.by == "time" else ""
-        share = f" share {percent_text(self.delay_share)}" if self.delay_share != 1 else ""
-        relative = " relative" if self.clocks_differ else ""
-        once = "" if self.repeat else " once"
-        return f"replay {words}{by}{offset_text(self.offset_s)}{share}{relative}{once}"
-
     def meaning(self) -> str:
         what = self.file
         if self.delays_ns is not None:
@@ -210,9 +173,8 @@ class Replay(Impairment):
         )
 
     def stage(self, tables: StageTables) -> Stage:
-        if self.sent_ns is None or self.delays_ns is None:
-            raise ValueError(f"{self.file}: the trace has not been read")
-        times_begin, _ = add_numbers(tables.integers, self.sent_ns)
+        self.require_content()
+        times_begin, _ = add_numbers(tables.integers, self.sent_ns or ())
         begin, end = add_numbers(tables.integers, self._applied_ns())
         first_ns = offset_ns(self.offset_s, self.length_ns, tables)
         by_time = self.by == "time"
@@ -220,7 +182,7 @@ class Replay(Impairment):
             "begin": begin,
             "end": end,
             "times_begin": times_begin,
-            "offset": first_ns if by_time else bisect_left(self.sent_ns, first_ns),
+            "offset": first_ns if by_time else bisect_left(self.sent_ns or (), first_ns),
             "period_ns": self.length_ns if by_time else 0,
             "once": int(not self.repeat),
         }
@@ -239,8 +201,7 @@ class Replay(Impairment):
         return applied_ns
 
     def chains(self) -> Sequence[Pattern]:
-        if self.delays_ns is None:
-            raise NotPredictableError(f"{self.file} has not been read")
+        self.require_content(NotPredictableError)
         if not self._loses:
             return ()
         if self.by == "time":
@@ -249,11 +210,8 @@ class Replay(Impairment):
             raise NotPredictableError("a trace that is replayed once has no long-run loss rate")
         return (Pattern(np.array(self.delays_ns) < 0),)
 
-    def without_files(self, folder: Path, place: str) -> Self:
-        if self.file is None:
-            return self
-        file = NamedFile(self.file, folder, place)
-        path = find_trace(self.file, folder, file.named)
+    def read_file(self, file: NamedFile) -> Self:
+        path = find_trace(file.name, file.folder, file.named)
         trace = read_trace(
             path, place=file.named, clocks_differ=self.clocks_differ, most_packets=MOST_RECORDS
         )

@@ -1,18 +1,12 @@
 """Bernoulli losses: each packet is lost with a probability, independently unless correlated."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
-from noack.impairments.feature import CorrelatedChance, Impairment, LossModel, Word, read_chance
-from noack.impairments.words import WordReader, brief_percent
+from noack.impairments.clauses import Clause, flag
+from noack.impairments.feature import CHANCE, CorrelatedChance, Impairment, LossModel
+from noack.impairments.words import brief_percent
 from noack.settings.section import Correlation, Probability
-
-
-def _read(reader: WordReader) -> dict[str, Any]:
-    table: dict[str, Any] = {**read_chance(reader)}
-    if reader.accept("keep"):
-        table["keep"] = True
-    return table
 
 
 class BernoulliLoss(CorrelatedChance, LossModel):
@@ -27,20 +21,17 @@ class BernoulliLoss(CorrelatedChance, LossModel):
     """true: ``probability`` is the loss rate after the guarantee and the other impairments; the
     probability of a loss is computed from it."""
 
-    words: ClassVar = (
-        Word("random", "loss 30%", _read, grammar="P [CORR] [keep]"),
-        Word("keep", "loss 30% keep mansd 4", after="loss P"),
+    clauses: ClassVar = (
+        Clause(
+            "random",
+            "loss 30%",
+            (*CHANCE, flag("keep", "loss 30% keep mansd 4", "keep", True)),
+            is_bare=True,
+        ),
     )
     behaviour: ClassVar = "bernoulli"
     action: ClassVar = "lose"
     gives_score: ClassVar = True
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [*super().examples(), cls(probability=0.1, keep=True)]
-
-    def text(self) -> str:
-        return self.chance_text + (" keep" if self.keep else "")
 
     def meaning(self) -> str:
         how = self.correlation_meaning or ", each independently"
@@ -55,4 +46,4 @@ class BernoulliLoss(CorrelatedChance, LossModel):
         return "a loss rate that is kept" if self.keep else ""
 
     def tc_text(self) -> str:
-        return f"random {self.chance_text}"
+        return f"random {self.model_copy(update={'keep': False}).text()}"

@@ -9,21 +9,13 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import LossModel, Stage, StageTables
 from noack.impairments.markov_chain import Chain
-from noack.impairments.words import PERCENT, WordReader, brief_percent, percent_text, percents_text
+from noack.impairments.words import PERCENT, brief_percent, percent_text
 from noack.settings.section import Probability
 
-
-def _read(reader: WordReader) -> Table:
-    """Read the transitions; p13 alone makes independent losses, as in tc."""
-    p13 = reader.value(PERCENT)
-    table: Table = {"p13": p13, "p31": 1 - p13}
-    for key in ("p31", "p32", "p23", "p14"):
-        if not reader.number_follows():
-            break
-        table[key] = reader.value(PERCENT)
-    return table
+_NAMES = ("p13", "p31", "p32", "p23", "p14")
 
 
 class FourStateLoss(LossModel):
@@ -45,8 +37,13 @@ class FourStateLoss(LossModel):
     p14: Probability = 0.0
     """Probability of a single loss within a gap."""
 
-    words: ClassVar = (
-        Word("state", "loss state 1% 10%", _read, grammar="state P13 [P31 [P32 [P23 [P14]]]]"),
+    clauses: ClassVar = (
+        Clause(
+            "state",
+            "loss state 1% 10%",
+            tuple(Part((name,), PERCENT, name.upper()) for name in _NAMES),
+            complement=True,
+        ),
     )
 
     @model_validator(mode="after")
@@ -57,17 +54,6 @@ class FourStateLoss(LossModel):
             raise ValueError("p13: p13 + p14 must not exceed 1")
         return self
 
-    @property
-    def _shares(self) -> tuple[float, ...]:
-        return (self.p13, self.p31, self.p32, self.p23, self.p14)
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [cls(p13=0.3, p31=0.4, p32=0.2, p23=0.7, p14=0.1), cls(p13=0.1, p31=0.3)]
-
-    def text(self) -> str:
-        return f"state {percents_text(self._shares, (None, None, 0.0, 1.0, 0.0))}"
-
     def meaning(self) -> str:
         return (
             "loses by a Markov chain of four states: bursts begin with probability "
@@ -77,8 +63,7 @@ class FourStateLoss(LossModel):
         )
 
     def stage(self, tables: StageTables) -> Stage:
-        names = ("p13", "p31", "p32", "p23", "p14")
-        return Stage(self.model, dict(zip(names, self._shares, strict=True)))
+        return Stage(self.model, self.model_dump(include=set(_NAMES)))
 
     def chains(self) -> Sequence[Chain]:
         moves = np.array([
@@ -90,4 +75,4 @@ class FourStateLoss(LossModel):
         return (Chain(np.eye(4)[0], np.maximum(moves, 0.0), np.array([0.0, 0.0, 1.0, 1.0])),)
 
     def tc_text(self) -> str:
-        return f"state {' '.join(map(percent_text, self._shares))}"
+        return f"state {' '.join(percent_text(getattr(self, name)) for name in _NAMES)}"

@@ -17,50 +17,23 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
-from noack.impairments.feature import (
-    Impairment,
-    LossModel,
-    Stage,
-    StageTables,
-    Table,
-    Word,
-)
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import Impairment, LossModel, Stage, StageTables
 from noack.impairments.markov_chain import Chain, NotPredictableError
 from noack.impairments.words import (
     NUMBER,
     OWN_TIME_S,
     PERCENT,
-    WordReader,
     brief_number,
     brief_percent,
-    number_text,
     percent_text,
-    percents_text,
     time_text,
 )
 from noack.settings.section import Probability
 
-
-def _read_chain(reader: WordReader) -> Table:
-    """Read the probabilities; p alone makes independent losses, as in tc."""
-    p = reader.value(PERCENT)
-    table: Table = {"good_to_bad": p, "bad_to_good": 1 - p}
-    for key in ("bad_to_good", "loss_in_bad", "loss_in_good"):
-        if not reader.number_follows():
-            break
-        table[key] = reader.value(PERCENT)
-    return table | _read_state(reader)
-
-
-def _read_means(reader: WordReader) -> Table:
-    table = {"mean_loss": reader.value(PERCENT), "mean_burst": reader.value(NUMBER)}
-    return table | _read_state(reader)
-
-
-def _read_state(reader: WordReader) -> Table:
-    if not reader.accept("common"):
-        return {}
-    return {"state": "link", "step_s": reader.value(OWN_TIME_S)}
+_COMMON = Part(
+    ("step_s",), OWN_TIME_S, "STEP", "common", "loss gemodel 1% 10% common 20ms", {"state": "link"}
+)
 
 
 class GilbertElliottLoss(LossModel):
@@ -89,14 +62,28 @@ class GilbertElliottLoss(LossModel):
     step_s: Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)] | None = None
     """Time between two steps of the link's state, for state = "link"."""
 
-    words: ClassVar = (
-        Word("gemodel", "loss gemodel 1% 10%", _read_chain, grammar="gemodel P [R [1-H [1-K]]]"),
-        Word("burst", "loss burst 5% 3", _read_means, grammar="burst MEAN_LOSS MEAN_BURST"),
-        Word(
-            "common",
-            "loss gemodel 1% 10% common 20ms",
-            after="loss gemodel P R",
-            grammar="gemodel|burst ... common STEP",
+    clauses: ClassVar = (
+        Clause(
+            "gemodel",
+            "loss gemodel 1% 10%",
+            (
+                Part(("good_to_bad",), PERCENT, "P"),
+                Part(("bad_to_good",), PERCENT, "R"),
+                Part(("loss_in_bad",), PERCENT, "1-H"),
+                Part(("loss_in_good",), PERCENT, "1-K"),
+                _COMMON,
+            ),
+            complement=True,
+        ),
+        Clause(
+            "burst",
+            "loss burst 5% 3",
+            (
+                Part(("mean_loss",), PERCENT, "MEAN_LOSS"),
+                Part(("mean_burst",), NUMBER, "MEAN_BURST"),
+                _COMMON,
+            ),
+            least=2,
         ),
     )
     gives_score: ClassVar = True
@@ -137,28 +124,6 @@ class GilbertElliottLoss(LossModel):
         if self.mean_loss is not None and self.mean_burst is not None:
             return self._shortest_burst() / self.mean_burst, 1 / self.mean_burst
         return self.good_to_bad or 0.0, self.bad_to_good or 0.0
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        shares = ((0.1, 0.5, 0.0, 1.0), (0.5, 0.1, 0.1, 0.9), (1.0, 0.0, 0.0, 1.0), (0, 0, 0.1, 1))
-        chains = [
-            cls(good_to_bad=p, bad_to_good=r, loss_in_good=good, loss_in_bad=bad)
-            for p, r, good, bad in shares
-        ]
-        means = cls(mean_loss=0.4, mean_burst=3.0)
-        common = {"state": "link", "step_s": 0.002}
-        return [
-            *chains,
-            means,
-            *(example.model_copy(update=common) for example in (chains[1], means)),
-        ]
-
-    def text(self) -> str:
-        common = "" if self.step_s is None else f" common {time_text(self.step_s)}"
-        if self.mean_loss is not None and self.mean_burst is not None:
-            return f"burst {percent_text(self.mean_loss)} {number_text(self.mean_burst)}{common}"
-        shares = (*self.transitions, self.loss_in_bad, self.loss_in_good)
-        return f"gemodel {percents_text(shares, (None, None, 1.0, 0.0))}{common}"
 
     def meaning(self) -> str:
         p, r = self.transitions

@@ -2,7 +2,8 @@
 
 from typing import ClassVar, Literal
 
-from noack.impairments.feature import LossModel, StageTables, Word
+from noack.impairments.clauses import Clause
+from noack.impairments.feature import LossModel, StageTables
 
 
 class NoLoss(LossModel):
@@ -10,10 +11,7 @@ class NoLoss(LossModel):
 
     model: Literal["lossless"] = "lossless"
 
-    words: ClassVar = (Word("none", "loss none", lambda reader: {}, grammar="none"),)
-
-    def text(self) -> str:
-        return "none"
+    clauses: ClassVar = (Clause("none", "loss none", least=0),)
 
     def meaning(self) -> str:
         return "loses nothing"

@@ -6,22 +6,21 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import LossModel, Stage, StageTables
 from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
-from noack.impairments.words import COUNT, WordReader
-
-_EXPECTED = "losses per packets, e.g. 2/100"
+from noack.impairments.words import COUNT, Quantity
 
 
-def _read(reader: WordReader) -> Table:
-    match = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
-    if match is None:
-        reader.wrong(f"expected {_EXPECTED}")
-    burst, period = (reader.read(part, COUNT) for part in match.groups())
-    table: Table = {"burst": burst, "period": period}
-    if reader.accept("from"):
-        table["first"] = reader.value(COUNT)
-    return table
+def _read_share(word: str) -> list[int]:
+    if re.fullmatch("[0-9]+/[0-9]+", word) is None:
+        raise ValueError
+    return list(map(int, word.split("/")))
+
+
+_SHARE = Quantity(
+    "losses per packets, e.g. 2/100", _read_share, lambda numbers: "/".join(map(str, numbers))
+)
 
 
 class PeriodicLoss(LossModel):
@@ -35,13 +34,16 @@ class PeriodicLoss(LossModel):
     first: Annotated[int, Field(ge=0, le=2**40)] = 0
     """Number of the first packet that is lost."""
 
-    words: ClassVar = (
-        Word(
-            "periodic", "loss periodic 2/100", _read,
-            grammar="periodic B/N [from K]  (B consecutive datagrams of every N, from number K on)",
+    clauses: ClassVar = (
+        Clause(
+            "periodic",
+            "loss periodic 2/100",
+            (
+                Part(("burst", "period"), _SHARE, "B/N"),
+                Part(("first",), COUNT, "K", "from", "loss periodic 2/100 from 3"),
+            ),
         ),
-        Word("from", "loss periodic 2/100 from 3", after="loss periodic BURST/PERIOD"),
-    )  # fmt: skip
+    )
     tc_missing: ClassVar = "losses by the packets' numbers"
 
     @model_validator(mode="after")
@@ -50,22 +52,12 @@ class PeriodicLoss(LossModel):
             raise ValueError(f"burst: must not exceed the period, {self.period}")
         return self
 
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        numbers = ((3, 1, 0), (9, 3, 5), (4, 0, 0), (2, 2, 7))
-        return [cls(period=period, burst=burst, first=first) for period, burst, first in numbers]
-
-    def text(self) -> str:
-        first = f" from {self.first}" if self.first else ""
-        return f"periodic {self.burst}/{self.period}{first}"
-
     def meaning(self) -> str:
         first = f", from number {self.first} on" if self.first else ""
         return f"loses {self.burst} consecutive packets of every {self.period} of a flow{first}"
 
     def stage(self, tables: StageTables) -> Stage:
-        numbers = {"period": self.period, "burst": self.burst, "first": self.first}
-        return Stage(self.model, numbers)
+        return Stage(self.model, self.model_dump(exclude={"model"}))
 
     def chains(self) -> Sequence[Pattern]:
         lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))

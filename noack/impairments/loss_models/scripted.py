@@ -6,19 +6,18 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from noack.impairments.feature import LossModel, Stage, StageTables, Table, Word, add_numbers
+from noack.impairments.clauses import Clause, Part
+from noack.impairments.feature import LossModel, Stage, StageTables, add_numbers
 from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
-from noack.impairments.words import COUNT, WordReader
+from noack.impairments.words import COUNT, Quantity, list_of
 
 MAX_SCRIPT = 10_000_000
-_EXPECTED = "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or none"
-
-
-def _read(reader: WordReader) -> Table:
-    table: Table = {"lost": [] if reader.accept("none") else reader.values(COUNT, _EXPECTED)}
-    if reader.accept("every"):
-        table["repeat_every"] = reader.value(COUNT)
-    return table
+_NUMBERS = list_of(COUNT, "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or none")
+_LOST = Quantity(
+    _NUMBERS.expected,
+    lambda word: [] if word == "none" else _NUMBERS.read(word),
+    lambda lost: _NUMBERS.text(lost) or "none",
+)
 
 
 class ScriptedLoss(LossModel):
@@ -30,9 +29,15 @@ class ScriptedLoss(LossModel):
     repeat_every: Annotated[int, Field(ge=0, le=2**40)] = 0
     """The script repeats after this number of packets; 0: it does not repeat."""
 
-    words: ClassVar = (
-        Word("script", "loss script 3,4,17", _read, grammar="script N,N,... [every N]"),
-        Word("every", "loss script 3,4 every 20", after="loss script NUMBERS"),
+    clauses: ClassVar = (
+        Clause(
+            "script",
+            "loss script 3,4,17",
+            (
+                Part(("lost",), _LOST, "N,N,..."),
+                Part(("repeat_every",), COUNT, "N", "every", "loss script 3,4 every 20"),
+            ),
+        ),
     )
     tc_missing: ClassVar = "losses by the packets' numbers"
 
@@ -43,14 +48,6 @@ class ScriptedLoss(LossModel):
         if self.repeat_every and self.lost and self.lost[-1] >= self.repeat_every:
             raise ValueError(f"repeat_every: the script is longer, up to {self.lost[-1]}")
         return self
-
-    @classmethod
-    def examples(cls) -> Sequence[Self]:
-        return [cls(lost=(0, 1, 2, 5, 8, 9)), cls(lost=(0, 1, 5), repeat_every=11), cls(lost=())]
-
-    def text(self) -> str:
-        every = f" every {self.repeat_every}" if self.repeat_every else ""
-        return f"script {','.join(map(str, self.lost)) or 'none'}{every}"
 
     def meaning(self) -> str:
         numbers = ", ".join(map(str, self.lost[:8])) + (", ..." if len(self.lost) > 8 else "")

@@ -5,7 +5,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from noack.impairments.feature import LossModel, Stage, StageTables, Word
+from noack.impairments.clauses import Clause
+from noack.impairments.feature import LossModel, Stage, StageTables
 from noack.impairments.markov_chain import Pattern
 
 
@@ -14,11 +15,8 @@ class WorstCaseLoss(LossModel):
 
     model: Literal["worst_case"] = "worst_case"
 
-    words: ClassVar = (Word("worst", "loss worst mansd 4", lambda reader: {}, grammar="worst"),)
+    clauses: ClassVar = (Clause("worst", "loss worst mansd 4", least=0),)
     tc_missing: ClassVar = "a worst case"
-
-    def text(self) -> str:
-        return "worst"
 
     def meaning(self) -> str:
         return "loses every packet that the cap allows to be lost"

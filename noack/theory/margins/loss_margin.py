@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of, policy_of
+from noack.config.resolution import loop_of, rule_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -308,7 +308,7 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
     Raises:
         CallerError: there is no longest time.
     """
-    rule, step_ns = policy_of(resolved).trigger_rule(loop_of(resolved).n), _step_ns(resolved)
+    rule, step_ns = rule_of(resolved), _step_ns(resolved)
     if rule.longest_ns == NEVER_NS:
         raise CallerError(
             f'trigger.policy = "{resolved.trigger.policy}": the margin needs a longest time '

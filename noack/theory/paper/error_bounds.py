@@ -29,8 +29,7 @@ from noack.core.linear_systems import (
     row_norms,
     transition,
 )
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import Policy, TriggerRule
 
 _PART_NUMBERS = 2**20
 """Numbers in the jumps that are computed at once."""
@@ -146,13 +145,13 @@ class ErrorMonitor:
             jumps = pairs.jumps if self._trigger.weight is None else pairs.jumps @ self._weight.T
             identity += np.bincount(pairs.at, row_norms(jumps), count)
             missed += pairs.sums(count)
-            if isinstance(self._trigger, DecayingTrigger):
+            if isinstance(self._trigger, TriggerRule) and self._trigger.is_decaying:
                 grown = self._growths.at(pairs.periods) * self._thresholds(pairs.event_ns)
                 printed += np.bincount(pairs.at, grown, count)
         return ErrorBounds(identity, printed, missed)
 
     def _thresholds(self, t_ns: NDArray[np.int64]) -> Vector:
-        if isinstance(self._trigger, DecayingTrigger):
+        if isinstance(self._trigger, TriggerRule) and self._trigger.is_decaying:
             return self._trigger.thresholds(t_ns)
         return np.full(len(t_ns), np.nan)
 

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.constraints import CONSTRAINTS
-from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
 from tests.fuzz.choices import Choices
+from tests.netem.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
 
 SANITIZED = True
 SEEDS = (
@@ -21,14 +20,7 @@ SEEDS = (
     *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
 )  # fmt: skip
 
-IMPAIRED = [
-    one
-    for kind in IMPAIRMENTS
-    for one in kind.examples()
-    if getattr(getattr(one, "loss", one), "file", None) is None
-    and not getattr(getattr(one, "loss", None), "keep", False)
-]
-CONSTRAINED = [one for kind in CONSTRAINTS for one in kind.examples()]
+_COMPUTABLE = [one for one in IMPAIRED if not names_file(one) and not keeps_loss(one)]
 _RECORDED = (RecordedDecision(0, 10, 20, 3, -1), RecordedDecision(3, 5, -1, 900, 7))
 _FIELDS = [(name, of.type.cname) for name, of in ffi.typeof("noack_link").fields]
 _SCALARS = [name for name, kind in _FIELDS if kind == "int64_t"]
@@ -80,7 +72,7 @@ def _link(choices: Choices) -> tuple[Any, dict[str, Any]] | None:
     """Return a link of numbers that the core accepts, and the arrays that it has; or None."""
     recorded = _RECORDED if choices.below(4) == 1 else ()
     settings = LinkSettings.model_construct(
-        impairments=tuple(choices.one(IMPAIRED) for _ in range(choices.below(4))),
+        impairments=tuple(choices.one(_COMPUTABLE) for _ in range(choices.below(4))),
         constraints=tuple(choices.one(CONSTRAINED) for _ in range(choices.below(3))),
         mansd=choices.one((None, 0, 1, 5)),
     )

@@ -3,14 +3,13 @@
 from netem.tc_words import EXAMPLES as ANY_WORD
 from netem.tc_words import parse, tc_command, text_of
 from noack.core.errors import CallerError
-from noack.impairments.constraints import CONSTRAINTS
-from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.kinds.delay import SHAPES
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.harness import refusal
+from tests.netem.feature_examples import CONSTRAINED, IMPAIRED
 
 EXAMPLES = (
-    *(one.text() for kind in (*IMPAIRMENTS, *CONSTRAINTS) for one in kind.examples()),
+    *(one.text() for one in (*IMPAIRED, *CONSTRAINED)),
     "mansd 4", "first", "limit 100", "seed 7", "slot 1ms", "ecn",
 )  # fmt: skip
 TOKENS = (

@@ -46,9 +46,7 @@ def emulator(
     """Run an emulator; yield its address and its process. SIGINT ends it."""
     command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to"]
     with subprocess.Popen(
-        [*command, f"{to[0]}:{to[1]}", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        [*command, f"{to[0]}:{to[1]}", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         try:
             assert process.stderr is not None

@@ -1,5 +1,6 @@
 """A relay without sockets; a test sets its reports."""
 
+import argparse
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from netem.relay_links import (
     LinkReport,
     LinkSpec,
 )
+from netem.stand_alone import _add_watching_options, check_watching_options
 from netem.tc_words import settings_of
 from noack.core.core_library import core
 from noack.impairments.link_settings import Counters, LinkSettings
@@ -82,6 +84,14 @@ class FakeRelay(Relay):
             self.settings[link, direction], counters, dict(self.unintended), 5,
             list(self.flows), self.delays.copy(), self.lateness.copy(),
         )  # fmt: skip
+
+
+def options(*arguments: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    _add_watching_options(parser)
+    given = parser.parse_args(arguments)
+    check_watching_options(given)
+    return given
 
 
 @contextmanager

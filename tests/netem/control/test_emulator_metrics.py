@@ -13,10 +13,10 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from netem import stand_alone
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import CommandQueue, statistics
-from netem.stand_alone import Options, attached
+from netem.stand_alone import attached
 from noack.runtime import metrics_server as servers
 from noack.runtime.address import text_of
-from tests.netem.control.relays import FakeRelay
+from tests.netem.control.relays import FakeRelay, options
 from tests.noack.runtime.test_metrics_server import read, slow_reader
 
 Values = dict[str, float]
@@ -74,7 +74,7 @@ def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(
     monkeypatch.setattr(stand_alone, "text_of", lambda at: asked.append(at) or text_of(at))
     with (
         ExitStack() as stack,
-        attached(relay, Options(metrics=":0")) as side,
+        attached(relay, options("--metrics", ":0")) as side,
         ThreadPoolExecutor() as pool,
     ):
         stack.enter_context(slow_reader(asked[0]))

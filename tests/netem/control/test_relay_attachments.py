@@ -1,4 +1,3 @@
-import argparse
 import io
 import json
 import sys
@@ -10,24 +9,14 @@ from pathlib import Path
 import pytest
 
 from netem.control.control_server import running
-from netem.stand_alone import Options, _add_watching_options, attached, options_of
+from netem.stand_alone import attached
 from noack.core.errors import CallerError
 from tests.netem.control.processes import press_q, read_until, terminal
-from tests.netem.control.relays import FakeRelay
+from tests.netem.control.relays import FakeRelay, options
 
 
-def options(*arguments: str) -> Options:
-    parser = argparse.ArgumentParser()
-    _add_watching_options(parser)
-    return options_of(parser.parse_args(arguments))
-
-
-def test_options() -> None:
-    assert options() == Options()
-    assert options("--control", "lab", "--stats", "0.5", "--view", "--stats-file", "x") == Options(
-        "lab", 0.5, Path("x"), view=True
-    )
-    assert options("--stats-file", "x") == Options(stats_s=1.0, stats_file=Path("x"))
+def test_a_file_alone_gets_a_line_each_second() -> None:
+    assert options("--stats-file", "x").stats == 1.0
 
 
 @pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "0.001"])
@@ -42,10 +31,9 @@ def test_json_lines_and_view_on_one_terminal_are_refused() -> None:
 
 
 def test_an_unwritable_file_is_reported_before_the_relay_runs(relay: FakeRelay) -> None:
-    wanted = Options(stats_s=1.0, stats_file=Path("/nowhere/x"))
     with (
         pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
-        attached(relay, wanted),
+        attached(relay, options("--stats-file", "/nowhere/x")),
     ):
         pass
 
@@ -55,7 +43,9 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     threads = threading.active_count()
     file = tmp_path / "lines"
     interval = sys.getswitchinterval()
-    with attached(relay, Options("lab", 0.01, file)) as side:
+    with attached(
+        relay, options("--control", "lab", "--stats", "0.01", "--stats-file", str(file))
+    ) as side:
         assert running() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
@@ -74,7 +64,7 @@ def test_a_full_disk_is_reported_and_the_relay_continues(
 ) -> None:
     error = io.StringIO()
     monkeypatch.setattr(sys, "stderr", error)
-    with attached(relay, Options(stats_s=0.01, stats_file=Path("/dev/full"))) as side:
+    with attached(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side:
         while not error.getvalue().endswith("\n"):
             side.commands.run_pending()
     assert error.getvalue() == (
@@ -90,7 +80,7 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
     with terminal(monkeypatch) as user:
         with ThreadPoolExecutor() as threads:
             drawn = threads.submit(press_q, user, "q ends", "→ up", "a message")
-            with attached(relay, Options(view=True)) as side:
+            with attached(relay, options("--view")) as side:
                 print("a message", file=sys.stderr)
                 late_s = time.monotonic() + 20
                 while not side.quit_requested and time.monotonic() < late_s:

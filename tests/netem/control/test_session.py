@@ -41,10 +41,7 @@ def test_an_error_of_the_emulator_itself_is_not_taken_for_a_used_name() -> None:
 
 @pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
 def test_unfit_names_are_refused(name: str) -> None:
-    with (
-        pytest.raises(CallerError, match="use letters, digits"),
-        published(name),
-    ):
+    with pytest.raises(CallerError, match="use letters, digits"), published(name):
         pass
 
 

@@ -132,3 +132,19 @@ def link(
     own = {"name": "test", "listen": (host, 0), "seed": 7} | others
     nothing = LinkSettings()
     return LinkSpec(to=to, forward=forward or nothing, reverse=reverse or nothing, **own)
+
+
+@contextmanager
+def relayed(
+    *settings: LinkSettings,
+    clients: int = 1,
+    host: str = HOSTS[4],
+    segment: bool = False,
+    taps: Sequence[Tap] = (),
+    **others: Any,
+) -> Iterator[Any]:
+    """Yield a server, clients, and a relay with a link between them; see :func:`link`."""
+    with endpoints(host, *[host] * clients) as (server, *sockets):
+        spec = link(name_of(server), *settings, host=host, **others)
+        with running([spec], segment=segment, taps=taps) as one:
+            yield server, *sockets, one

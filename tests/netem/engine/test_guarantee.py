@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
-from tests.netem.engine.relays import drain, endpoints, link, name_of, running
+from tests.netem.engine.relays import drain, relayed
 
 CLIENTS = 3
 
@@ -54,34 +54,32 @@ def test_the_cap_holds_in_both_directions_for_every_client(
 ) -> None:
     forward_cap = max(one.mansd or 0 for one in (forward, other or forward))
     reverse_cap = reverse.mansd or 0
-    with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
-        spec = link(name_of(server), forward, reverse)
-        with running([spec], segment=segment) as one:
-            sent = 0
-            for count in rounds:
-                for number in range(sent, sent + count):
-                    for client in clients:
-                        client.sendto(sealed(number, "there", 20 + number % 3), one.address())
-                sent += count
-                if other is not None:
-                    one.until(lambda: one.report().forward.counters.received > 0)
-                    one.relay.change("test", "forward", other)
-                    other = None
-            one.settle(sent * CLIENTS)
-            by_source = defaultdict(list)
-            for payload, source in drain(server):
-                by_source[source].append(payload)
-            assert len(by_source) == CLIENTS
-            for received in by_source.values():
-                assert longest_loss_burst(received, sent) <= forward_cap
-            for number in range(sent):
-                for source in by_source:
-                    server.sendto(sealed(number, "reverse", 30), source)
-            one.settle(sent * CLIENTS, "reverse")
-            for client in clients:
-                received = [payload for payload, _ in drain(client)]
-                assert longest_loss_burst(received, sent) <= reverse_cap
-            report = one.report()
+    with relayed(forward, reverse, clients=CLIENTS, segment=segment) as (server, *clients, one):
+        sent = 0
+        for count in rounds:
+            for number in range(sent, sent + count):
+                for client in clients:
+                    client.sendto(sealed(number, "there", 20 + number % 3), one.address())
+            sent += count
+            if other is not None:
+                one.until(lambda: one.report().forward.counters.received > 0)
+                one.relay.change("test", "forward", other)
+                other = None
+        one.settle(sent * CLIENTS)
+        by_source = defaultdict(list)
+        for payload, source in drain(server):
+            by_source[source].append(payload)
+        assert len(by_source) == CLIENTS
+        for received in by_source.values():
+            assert longest_loss_burst(received, sent) <= forward_cap
+        for number in range(sent):
+            for source in by_source:
+                server.sendto(sealed(number, "reverse", 30), source)
+        one.settle(sent * CLIENTS, "reverse")
+        for client in clients:
+            received = [payload for payload, _ in drain(client)]
+            assert longest_loss_burst(received, sent) <= reverse_cap
+        report = one.report()
     assert report.forward.counters.longest_loss_burst <= forward_cap
     assert report.reverse.counters.longest_loss_burst <= reverse_cap
     assert report.forward.unintended == report.reverse.unintended == {"lost_in_kernel": 0}

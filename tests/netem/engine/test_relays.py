@@ -31,6 +31,7 @@ from tests.netem.engine.relays import (
     endpoints,
     link,
     name_of,
+    relayed,
     running,
 )
 
@@ -194,10 +195,7 @@ def test_datagrams_of_any_size_and_their_copies_arrive(delay: str) -> None:
     reverse = settings_of(f"duplicate 100% {delay} corrupt 100%")
     random = np.random.default_rng(0)
     payloads = [random.bytes(size) for size in (0, 1, 511, 512, 513, 1472, 65_507)]
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), forward, reverse)]) as one,
-    ):
+    with relayed(forward, reverse) as (server, client, one):
         for payload in payloads:
             client.sendto(payload, one.address())
             (data, path), (copy, _) = one.receive(server, 2)
@@ -211,10 +209,7 @@ def test_datagrams_of_any_size_and_their_copies_arrive(delay: str) -> None:
 
 def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
     late, lossy = settings_of("delay 500ms mansd 1"), settings_of("loss worst mansd 1")
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), late)]) as one,
-    ):
+    with relayed(late) as (server, client, one):
         send_numbers(client, one.address(), 0, 4)
         one.until(lambda: one.report().forward.counters.received == 4)
         one.relay.change("test", "forward", lossy)
@@ -230,10 +225,7 @@ def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
 
 
 def test_idle_clients_are_forgotten_and_come_back_as_new_flows() -> None:
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), THIRD_LOST, idle_s=0.05)]) as one,
-    ):
+    with relayed(THIRD_LOST, idle_s=0.05) as (server, client, one):
         for flow in range(2):
             send_numbers(client, one.address(), 0, 4)
             one.settle(4 * (flow + 1))
@@ -245,10 +237,7 @@ def test_idle_clients_are_forgotten_and_come_back_as_new_flows() -> None:
 
 
 def test_a_client_with_datagrams_in_flight_is_not_idle() -> None:
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("delay 600ms"), idle_s=0.01)]) as one,
-    ):
+    with relayed(settings_of("delay 600ms"), idle_s=0.01) as (server, client, one):
         client.sendto(b"late", one.address())
         assert one.receive(server)[0][0] == b"late"
         one.until(lambda: one.report().clients == 0)
@@ -256,11 +245,7 @@ def test_a_client_with_datagrams_in_flight_is_not_idle() -> None:
 
 def test_a_client_with_unread_datagrams_is_not_idle() -> None:
     """A stall longer than the idle time does not make clients with queued datagrams idle."""
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("loss worst mansd 3"), idle_s=0.3)])
-        as one,
-    ):  # fmt: skip
+    with relayed(settings_of("loss worst mansd 3"), idle_s=0.3) as (_, client, one):
         client.sendto(b"0", one.address())
         one.settle(1)
         send_numbers(client, one.address(), 1, 4)
@@ -273,10 +258,7 @@ def test_a_client_with_unread_datagrams_is_not_idle() -> None:
 def test_more_clients_than_allowed_are_refused_and_counted(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    with (
-        endpoints(*[V4] * 4) as (server, *clients),
-        running([link(name_of(server), most_clients=2, idle_s=0.3)]) as one,
-    ):
+    with relayed(most_clients=2, idle_s=0.3, clients=3) as (server, *clients, one):
         for client in clients * 2:
             client.sendto(b"x", one.address())
         one.until(lambda: one.report().refused == 2)
@@ -291,10 +273,7 @@ def test_more_clients_than_allowed_are_refused_and_counted(
 def test_a_lack_of_file_descriptors_is_reported_and_counted(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    with (
-        endpoints(*[V4] * 13) as (server, *clients),
-        running([link(name_of(server))]) as one,
-    ):
+    with relayed(clients=12) as (server, *clients, one):
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         used = max(server.fileno(), *(client.fileno() for client in clients)) + 8
         resource.setrlimit(resource.RLIMIT_NOFILE, (used, hard))
@@ -326,10 +305,7 @@ def test_send_errors_are_counted_by_reason(
 def test_datagrams_beyond_the_available_memory_are_dropped_and_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), settings_of("delay 1000s"))]) as one,
-    ):
+    with relayed(settings_of("delay 1000s")) as (_, client, one):
         client.sendto(b"stored", one.address())
         one.until(lambda: one.report().forward.in_flight == 1)
         monkeypatch.setattr(relay_memory, "_HEADROOM_BYTES", 2**60)
@@ -355,10 +331,7 @@ def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("small_buffers")
 def test_all_kernel_drops_are_counted(version: int, capfd: pytest.CaptureFixture[str]) -> None:
     host, many = HOSTS[version], 300
-    with (
-        endpoints(host, host) as (server, client),
-        running([link(name_of(server), host=host)]) as one,
-    ):
+    with relayed(host=host) as (server, client, one):
         send_numbers(client, one.address(), 0, many)
         one.until(lambda: all_of(one.report().forward) == many)
         send_numbers(server, drain(server)[0][1], 0, many)
@@ -375,10 +348,7 @@ def test_all_kernel_drops_are_counted(version: int, capfd: pytest.CaptureFixture
 def test_all_kernel_drops_of_segmented_messages_are_counted() -> None:
     """Each segment counts, although the client sends them in one call."""
     messages, segments, size = 20, 64, 72
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server))], segment=True) as one,
-    ):
+    with relayed(segment=True) as (_, client, one):
         client.connect(one.address())
         client.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, size)
         for _ in range(messages):
@@ -390,10 +360,7 @@ def test_all_kernel_drops_of_segmented_messages_are_counted() -> None:
 @pytest.mark.parametrize("segment", [False, True])
 def test_segments_are_separate_datagrams(segment: bool) -> None:
     """The client sends one message, and the kernel cuts it into segments."""
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), THIRD_LOST)], segment=segment) as one,
-    ):
+    with relayed(THIRD_LOST, segment=segment) as (server, client, one):
         client.connect(one.address())
         sent: list[bytes] = []
         for size, count in ((1000, 60), (1400, 40), (8, 64), (30, 1)):
@@ -442,10 +409,7 @@ def test_taps_receive_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
     """There are more events than the buffer for events holds."""
     monkeypatch.setattr(relay_memory, "_EVENTS", 200)
     many, tap = 500, CountOnly()
-    with (
-        endpoints(V4, V4) as (server, client),
-        running([link(name_of(server), HALF_LOST)], taps=[tap]) as one,
-    ):
+    with relayed(HALF_LOST, taps=[tap]) as (_, client, one):
         send_numbers(client, one.address(), 0, many)
         one.settle(many)
         report = one.report()
@@ -479,15 +443,13 @@ def test_a_change_does_not_interrupt_a_replay() -> None:
     lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
     passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
     record = [lost, passed, lost, lost, passed, lost]
-    with endpoints(V4, V4) as (server, client):
-        spec = link(name_of(server), decisions={"forward": [record]})
-        with running([spec]) as one:
-            send_numbers(client, one.address(), 0, 3)
-            one.settle(3)
-            one.relay.change("test", "forward", settings_of("loss worst mansd 3"))
-            send_numbers(client, one.address(), 3, 10)
-            one.settle(10)
-            assert numbers(drain(server)) == [1, 4, 8]
+    with relayed(decisions={"forward": [record]}) as (server, client, one):
+        send_numbers(client, one.address(), 0, 3)
+        one.settle(3)
+        one.relay.change("test", "forward", settings_of("loss worst mansd 3"))
+        send_numbers(client, one.address(), 3, 10)
+        one.settle(10)
+        assert numbers(drain(server)) == [1, 4, 8]
 
 
 def test_file_descriptors_above_the_limit_of_select_work() -> None:

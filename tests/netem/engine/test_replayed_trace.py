@@ -14,7 +14,7 @@ from netem.tc_words import settings_of
 from noack.impairments.loss_prediction import read_files
 from noack.traces.packet_trace import PacketTrace
 from noack.traces.trace_formats import read_trace
-from tests.netem.engine.relays import HOSTS, drain, endpoints, link, name_of, running
+from tests.netem.engine.relays import HOSTS, drain, relayed
 
 PACKETS = 400
 
@@ -41,15 +41,13 @@ def bursts(lost: list[bool]) -> list[int]:
 def test_the_histogram_of_consecutive_losses_is_the_traces(family: int, tmp_path: Path) -> None:
     trace = lossy_trace(tmp_path / "trace.csv")
     forward = read_files(settings_of("replay trace.csv"), tmp_path)
-    with endpoints(HOSTS[family], HOSTS[family]) as (server, client):
-        spec = link(name_of(server), forward, host=HOSTS[family])
-        with running([spec]) as one:
-            for number in range(PACKETS):
-                client.sendto(number.to_bytes(4, "big"), one.address())
-                if number % 20 == 19:
-                    one.settle(number + 1)
-            received = [int.from_bytes(data, "big") for data, _ in drain(server)]
-            counters = one.report().forward.counters
+    with relayed(forward, host=HOSTS[family]) as (server, client, one):
+        for number in range(PACKETS):
+            client.sendto(number.to_bytes(4, "big"), one.address())
+            if number % 20 == 19:
+                one.settle(number + 1)
+        received = [int.from_bytes(data, "big") for data, _ in drain(server)]
+        counters = one.report().forward.counters
     newest, effective = -1, set()
     for number in received:
         if number > newest:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from netem.relay_links import LinkSpec
 from noack.impairments.link_settings import LinkSettings
 from tests.netem import any_settings
-from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
+from tests.netem.engine.relays import KeepAll, drain, name_of, relayed
 from tests.oracles.link import Datagram, Link
 
 CLIENTS = 3
@@ -60,17 +60,17 @@ def test_fates_and_order_are_the_machines(
     forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
 ) -> None:
     tap = KeepAll()
-    with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
-        spec = link(name_of(server), forward, reverse)
-        with running([spec], taps=[tap], segment=segment) as one:
-            for k, size in enumerate(sizes):
-                clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
-            one.settle(len(sizes))
-            received = drain(server)
-            for data, source in received:
-                server.sendto(data, source)
-            one.settle(len(received), "reverse")
-            sides = one.report().forward, one.report().reverse
+    parts = relayed(forward, reverse, clients=CLIENTS, taps=[tap], segment=segment)
+    with parts as (server, *clients, one):
+        for k, size in enumerate(sizes):
+            clients[k % CLIENTS].sendto(payload_of(k, size), one.address())
+        one.settle(len(sizes))
+        received = drain(server)
+        for data, source in received:
+            server.sendto(data, source)
+        one.settle(len(received), "reverse")
+        sides = one.report().forward, one.report().reverse
+        (spec,) = one.relay.specs
         ports = [name_of(client)[1] for client in clients]
         at_clients = [[data for data, _ in drain(client)] for client in clients]
         events, began_ns = tap.events, one.relay.began_unix_ns

@@ -99,10 +99,7 @@ tcs_delays = st.builds(
     distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
 )
 tcs_reorders = st.builds(
-    Reorder,
-    probability=st.floats(1e-6, 1),
-    correlation=correlations,
-    gap=st.integers(1, 2**32 - 1),
+    Reorder, probability=st.floats(1e-6, 1), correlation=correlations, gap=st.integers(1, 2**32 - 1)
 )
 
 

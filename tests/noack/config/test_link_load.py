@@ -14,13 +14,13 @@ from noack.config.link_load import link_loads, load_warnings, require_capacity, 
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
-from noack.impairments.feature import Impairment, StageTables
-from noack.impairments.kinds import IMPAIRMENTS
+from noack.impairments.feature import Impairment
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import require_scores
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
+from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
 PERIODIC = {"policy": "periodic", "period_s": 0.05}
@@ -210,14 +210,10 @@ def test_the_delay_after_a_queue_counts(content: dict[str, Any]) -> None:
 
 def _is_alone_valid(one: Impairment) -> bool:
     """Whether it needs no file, and no loss rate of several stages together."""
-    try:
-        one.stage(StageTables(scored=True))
-    except ValueError:
-        return False
-    return not getattr(getattr(one, "loss", None), "keep", False)
+    return not names_file(one) and not keeps_loss(one)
 
 
-EXAMPLES = [one for kind in IMPAIRMENTS for one in kind.examples() if _is_alone_valid(one)]
+EXAMPLES = [one for one in IMPAIRED if _is_alone_valid(one)]
 QUEUES = [
     Rate(rate_bps=round(7 * BITS / 0.05 * share), queue=queue)
     for share in (0.4, 0.7, 1.1, 2.5) for queue in (1, 4)

@@ -53,9 +53,7 @@ def test_model_and_plant_may_come_from_two_files(gain: str, tmp_path: Path) -> N
     assert load(tmp_path / "again.toml") == resolved
 
 
-def test_the_scenarios_gain_overrides_the_files_and_array_names_may_be_set(
-    tmp_path: Path,
-) -> None:
+def test_the_scenarios_gain_overrides_the_files_and_array_names_may_be_set(tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", A=0 * A, B=0 * B, A_lat=A, B_lat=B, K=K)
     names = 'names = { A = "A_lat", B = "B_lat" }'
     loaded = scenario(tmp_path, f'file = "two.npz"\n{names}\ngain = [[-9.0, -5.0]]')

@@ -148,12 +148,7 @@ def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     for found, expected in ((loop.A_model, paper.A), (loop.B_model, paper.B), (loop.K, paper.K)):
         np.testing.assert_array_equal(found, expected)
     rule = scenario.trigger
-    assert (rule.beta, rule.alpha_per_s, rule.floor, rule.weight) == (
-        0.5,
-        0.25,
-        0,
-        None,
-    )
+    assert (rule.beta, rule.alpha_per_s, rule.floor, rule.weight) == (0.5, 0.25, 0, None)
     assert scenario.network.mansd == 4
     # Only the six physical parameters are uncertain: a ∈ ±0.1, b ∈ ±0.05.
     off_A, off_B = np.abs(loop.A - loop.A_model), np.abs(loop.B - loop.B_model)

@@ -65,11 +65,7 @@ def test_a_saved_system_is_read_back(suffix: str, read: Any, tmp_path: Path) -> 
         (signal.StateSpace(A, B, C, D, dt=0.1), K, "dt is 0.1, so it is a system in discrete time"),
         (signal.StateSpace(A, B, C[:1], D[:1]), K, "C is not the identity"),
         (signal.StateSpace(A, B, C, D + 1), K, "D is not zero"),
-        (
-            signal.TransferFunction([1.0], [1.0, 2.0]),
-            K,
-            "TransferFunctionContinuous has no A",
-        ),
+        (signal.TransferFunction([1.0], [1.0, 2.0]), K, "TransferFunctionContinuous has no A"),
         (control_object(dt=True), K, "discrete time; the loop is in continuous time (MATLAB: d2c)"),
         ((A, B), -K, "u = K x does not stabilise the model"),
         ((A, B), -K, "u = -K x does: give -K"),

@@ -33,7 +33,6 @@ from noack.protocol.record_tables import (
     tables,
 )
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.trigger_rule import CodedPolicy
 from plant_server.plant import BLOCK, Plant
 from sensor_node.sensor import Sensor, sensors_of
@@ -54,6 +53,7 @@ from tests.noack.machines.any_machines import (
     sensor,
     sizes,
 )
+from tests.trigger_rules import absolute_rule
 from tests.wire_decoder import NO_VECTOR
 
 Part = Plant | Sensor | Controller
@@ -134,7 +134,7 @@ def test_a_users_trigger_that_asks_at_each_input_decides_as_the_rule(
         return Sensor(H, policy, x0, timeout_ns=timeout_ns if acknowledged else None,
                       observer=observing)  # fmt: skip
 
-    expected = outputs_of(own(AbsoluteTrigger(0.7)))
+    expected = outputs_of(own(absolute_rule(0.7)))
     user = UserTrigger(0.7)
     monkeypatch.setattr(sensor_node.sensor, "_SENT_PLACES", 1)
     found = outputs_of(own(CodedPolicy(None, lambda: user, "it is code")), rows=1)
@@ -215,7 +215,7 @@ def test_matrices_that_are_computed_again_have_the_same_bits(
     found = []
     for most in (1024, places):
         monkeypatch.setattr(noack.core.core_memory, "_MOST_PLACES", most)
-        one = machine(Sensor(H, AbsoluteTrigger(1.0)))
+        one = machine(Sensor(H, absolute_rule(1.0, n=3)))
         assert one.machines[0].model.transitions.places == most
         rows = [
             one.handle(Message(Flow.MEASUREMENT, k, int(t_ns), np.sin(k + np.arange(3.0))), 0)
@@ -250,7 +250,7 @@ def test_losses_of_many_loops_are_compared_with_the_guarantee_of_each(
 
 
 def test_a_message_that_a_machine_does_not_receive_is_refused() -> None:
-    own = machine(Sensor(np.zeros((1, 1)), AbsoluteTrigger(1.0)))
+    own = machine(Sensor(np.zeros((1, 1)), absolute_rule(1.0, n=1)))
     for flow, entries in ((Flow.ACKNOWLEDGEMENT, 0), (Flow.MEASUREMENT, 2), (Flow.UPDATE, 1)):
         with pytest.raises(ValueError, match=f"receives no {flow.name.lower()} of {entries} entr"):
             own.handle(Message(flow, 0, 0, np.zeros(entries)), 0)
@@ -418,7 +418,9 @@ def test_a_restarted_machine_continues_its_grid_under_other_numbers(
 
 def test_acknowledgements_of_updates_before_a_restart_change_nothing() -> None:
     again = machine(
-        Sensor(np.zeros((1, 1)), AbsoluteTrigger(0.1), first_number=GENERATION, timeout_ns=10 * MS)
+        Sensor(
+            np.zeros((1, 1)), absolute_rule(0.1, n=1), first_number=GENERATION, timeout_ns=10 * MS
+        )
     )
     again.handle(Message(Flow.MEASUREMENT, 5, 50 * MS, np.ones(1)), 50 * MS)
     (record,) = again.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 30 * MS, NO_VECTOR), 51 * MS)

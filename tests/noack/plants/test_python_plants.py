@@ -219,10 +219,7 @@ def test_a_file_changed_after_loading_is_not_executed(tmp_path: Path) -> None:
     ("slope", "expected"),
     [
         ("[-1e9 * (z[0] - math.cos(t_s)), 0.0]", "too stiff for an explicit integrator"),
-        (
-            "[1e9 * math.copysign(1.0, math.sin(1e9 * z[0]) - 0.1), 0.0]",
-            "integrated at 2.",
-        ),
+        ("[1e9 * math.copysign(1.0, math.sin(1e9 * z[0]) - 0.1), 0.0]", "integrated at 2."),
     ],
 )
 def test_a_failed_integration_is_not_reported_as_divergence(

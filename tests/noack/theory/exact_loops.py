@@ -14,9 +14,9 @@ from cosim.simulation.continuous import (
 )
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
-from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_rule import Policy
 from tests.oracles.lossy_loops import System
+from tests.trigger_rules import decaying_rule
 
 _MOST_EVENTS = 3000
 
@@ -47,7 +47,7 @@ def observe(
     """
     horizon_s = periods / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
     loop = loop_of(system)
-    trigger = policy or DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
+    trigger = policy or decaying_rule(system.beta, system.alpha, weight=loop.weight, n=loop.n)
     continuous = ContinuousLoop(loop, trigger)
     rng = np.random.default_rng(seed)
     for share in (1.0, 0.0, 0.6):

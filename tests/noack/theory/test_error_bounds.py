@@ -11,8 +11,9 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.paper.error_bounds import ErrorMonitor, MissedEvents, missed_sum
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule
 from tests.oracles.lossy_loops import seeds
+from tests.trigger_rules import decaying_rule
 
 STEP_NS = 1_000_000
 H = np.array([[-0.3, 1.0, 0.2], [-2.0, -0.1, 0.0], [0.5, 0.0, 0.4]])
@@ -110,9 +111,7 @@ def histories(draw: st.DrawFn) -> History:
     return History(H, weight, moments)
 
 
-def follow(
-    history: History, trigger: DecayingTrigger, at_once: int = 25
-) -> list[tuple[float, float]]:
+def follow(history: History, trigger: TriggerRule, at_once: int = 25) -> list[tuple[float, float]]:
     """Return both bounds at each moment; the monitor takes so many moments at once."""
     monitor, found = ErrorMonitor(history.H, trigger, PERIOD_NS), []
     for first in range(0, len(history.moments), at_once):
@@ -123,11 +122,11 @@ def follow(
     return found
 
 
-def explicit(history: History, trigger: DecayingTrigger, upto: int) -> tuple[float, float]:
+def explicit(history: History, trigger: TriggerRule, upto: int) -> tuple[float, float]:
     """Both sums, term by term, from the first event on."""
 
     def threshold(t_ns: int) -> float:
-        return max(trigger.beta * math.exp(-trigger.alpha_per_s * t_ns * NS), trigger.floor)
+        return max(trigger.level * math.exp(-trigger.rate_per_s * t_ns * NS), trigger.floor)
 
     H, W, now = history.H, history.weight, history.moments[upto]
     identity = 0.0 if now.event >= 0 else float(np.linalg.norm(W @ now.e_s))
@@ -146,7 +145,7 @@ def explicit(history: History, trigger: DecayingTrigger, upto: int) -> tuple[flo
 def test_both_bounds_are_the_explicit_sums(
     history: History, alpha: float, floor: float, at_once: int
 ) -> None:
-    trigger = DecayingTrigger(0.5, alpha, floor, history.weight)
+    trigger = decaying_rule(0.5, alpha, floor, history.weight)
     for upto, found in enumerate(follow(history, trigger, at_once)):
         expected = explicit(history, trigger, upto)
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
@@ -158,7 +157,7 @@ def test_the_identity_bounds_the_error_for_every_trigger_plant_and_network(
     history: History,
 ) -> None:
     """No assumption on trigger, plant or network."""
-    trigger = DecayingTrigger(1e-3, 1.0, 0.0, history.weight)
+    trigger = decaying_rule(1e-3, 1.0, 0.0, history.weight)
     largest = 0.0
     for moment, found in zip(history.moments, follow(history, trigger), strict=True):
         error = float(np.linalg.norm(history.weight @ moment.e_c))

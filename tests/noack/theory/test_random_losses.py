@@ -8,9 +8,9 @@ from noack.impairments.loss_prediction import LossProcess
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.random_losses.moments import moment_at_events, moments
-from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import loop_of
 from tests.oracles.lossy_loops import System, random_system
+from tests.trigger_rules import decaying_rule
 
 EVENTS = 12
 
@@ -64,7 +64,7 @@ def test_the_mean_at_events_is_below_its_bound_and_above_it_with_fewer_losses(se
     system = random_system(rng, mismatch=0.5, beta=0.01, known_start=False, spread=1.0)
     sums, squares = np.zeros(EVENTS), np.zeros(EVENTS)
     loop, runs = loop_of(system), 150
-    trigger = DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
+    trigger = decaying_rule(system.beta, system.alpha, weight=loop.weight, n=loop.n)
     continuous = ContinuousLoop(loop, trigger)
     for _ in range(runs):
         sizes = scaled_errors(system, continuous, rng.uniform(size=EVENTS + 1) < p)

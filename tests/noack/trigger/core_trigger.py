@@ -5,17 +5,16 @@ import numpy as np
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Vector
-from noack.trigger.trigger_rule import Policy, TriggerDecision, fill_rule, rule_rows
+from noack.trigger.trigger_rule import TriggerDecision, TriggerRule, fill_rule, rule_rows
 
 
 class CoreTrigger:
     """A policy that native/loop/trigger.c applies to n states."""
 
-    def __init__(self, policy: Policy, n: int) -> None:
+    def __init__(self, rule: TriggerRule, n: int) -> None:
         self._memory, self._n = CoreMemory(), n
-        rule = policy.trigger_rule(n)
         self._rule, self._state = ffi.new("noack_trigger_rule *"), ffi.new("noack_trigger_state *")
-        fill_rule(self._rule, rule, policy.weight, policy.initial_dynamic_variable, self._memory)
+        fill_rule(self._rule, rule, n, self._memory)
         self._state.auxiliary = self._rule.initial
         self._scratch = self._memory.zeros(2 * n + rule_rows(rule))
 

@@ -1,7 +1,11 @@
-"""The rule of each policy, written a second time, and its known properties."""
+"""Every policy at measurements, against the rules as they are stated; mistakes in settings.
+
+The exact simulator under every policy: tests/cosim/simulation/batch/test_policies.py; the search
+for the worst pattern: tests/cosim/analysis/adversary/test_policies.py.
+"""
 
 import math
-from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,146 +13,80 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from noack.config.resolution import loop_of, resolve, rule_of
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
-from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.deadline import DeadlineTrigger
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.dwell import DwellTrigger
-from noack.trigger.dynamic import DynamicTrigger
-from noack.trigger.lyapunov import LyapunovTrigger
-from noack.trigger.mixed import MixedTrigger
-from noack.trigger.periodic_trigger import PeriodicTrigger
-from noack.trigger.quadratic import QuadraticTrigger
-from noack.trigger.relative import relative_trigger
-from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_rule import Forecast, Policy
+from noack.trigger.lyapunov import LyapunovSettings
+from noack.trigger.policy_settings import ModelMatrices
+from noack.trigger.trigger_rule import Forecast
 from tests.noack.trigger.core_trigger import CoreTrigger
+from tests.oracles.trigger_rules import Trigger
+from tests.trigger_rules import EXAMPLES, absolute_rule, self_triggered_rule
 
 Vector = NDArray[np.float64]
-MS = 1_000_000
-S = 1_000_000_000
-W = np.array([[2.0, 0.5], [0.0, 1.0]])
-P = np.array([[2.0, 0.3], [0.3, 1.0]])
-Q = np.array([[1.0, 0.2], [0.2, 0.5]])
-BK = np.array([[0.0, 0.0], [1.0, -4.0]])
-FORM = np.array([
-    [-0.1, 0.0, 0.02, 0.0],
-    [0.0, -0.1, 0.0, 0.01],
-    [0.02, 0.0, 1.0, 0.1],
-    [0.0, 0.01, 0.1, 2.0],
-])  # fmt: skip
+DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
+RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
+N, MS, S = 2, 10**6, 10**9
+WEIGHT = [[2.0, 0.5], [0.0, 1.0]]
+FORM = [[-0.1, 0.0, 0.02, 0.0], [0.0, -0.1, 0.0, 0.01], [0.02, 0.0, 1.0, 0.1],
+        [0.0, 0.01, 0.1, 2.0]]  # fmt: skip
+TABLES: dict[str, dict[str, Any]] = {
+    **EXAMPLES,
+    "floor": EXAMPLES["decaying"] | {"floor": 0.4, "weight": WEIGHT},
+    "weighted mixed": EXAMPLES["mixed"] | {"sigma": 0.3, "weight": WEIGHT},
+    "weighted area": EXAMPLES["send_on_area"] | {"weight": WEIGHT},
+    "indefinite": EXAMPLES["quadratic"] | {"Q": FORM, "heartbeat": 6},
+    "late": EXAMPLES["deadline"] | {"interval_s": 0.2},
+    "dwell of periodic": EXAMPLES["dwell"]
+    | {"rule": {"policy": "periodic", "period_s": 0.07}, "interval_s": 0.1},
+    "late self-triggered": EXAMPLES["self_triggered"] | {"longest_s": 0.3, "weight": WEIGHT},
+}
 
 vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
-Rule = Callable[[float, Vector, Vector, Vector], float]
-"""Positive at an event; a function of t in s, x, e_s and the state at the last event (t = 0)."""
-
-STATIC: dict[str, tuple[Policy, Rule]] = {
-    "decaying": (
-        DecayingTrigger(0.5, 0.25, 0.01, W),
-        lambda t, x, e, x_k: norm(W @ e) - max(0.5 * math.exp(-0.25 * t), 0.01),
-    ),
-    "absolute": (AbsoluteTrigger(0.3, W), lambda t, x, e, x_k: norm(W @ e) - 0.3),
-    "relative": (
-        relative_trigger(0.2, W), lambda t, x, e, x_k: norm(W @ e) - 0.2 * norm(W @ x)
-    ),
-    "mixed": (
-        MixedTrigger(0.2, 0.1),
-        lambda t, x, e, x_k: norm(e) ** 2 - (0.2 * norm(x)) ** 2 - 0.1**2,
-    ),
-    "quadratic": (
-        QuadraticTrigger(FORM, MS, 0.05),
-        lambda t, x, e, x_k: (z := np.concatenate([x, e])) @ FORM @ z - 0.05,
-    ),
-    "lyapunov": (
-        LyapunovTrigger(np.linalg.cholesky(P).T, 0.7),
-        lambda t, x, e, x_k: x @ P @ x - (x_k @ P @ x_k) * math.exp(-0.7 * t),
-    ),
-}  # fmt: skip
 
 
 def norm(v: Vector) -> float:
     return float(np.linalg.norm(v))
 
 
-@pytest.mark.parametrize("name", STATIC)
-@given(data=st.data())
-def test_the_rule_is_the_published_one(name: str, data: st.DataObject) -> None:
-    policy, rule = STATIC[name]
-    x_k, x, e = (data.draw(vectors) for _ in range(3))
-    t_ms = data.draw(st.integers(1, 20_000))
-    trigger = CoreTrigger(policy, 2)
-    trigger.start(0, x_k)
-    found, excess = trigger.test(t_ms * MS, x, e), rule(t_ms / 1000, x, e, x_k)
-    if abs(excess) > 1e-9:
-        assert found.event == (excess > 0)
-        assert (found.left > found.right) == (excess > 0)
+def samples(seed: int, k: int) -> tuple[list[int], Vector]:
+    """Times every 10 ms, and z = (x, e_s) on smooth curves with a growing error."""
+    rng = np.random.default_rng(seed)
+    t_ns = 10 * MS * np.arange(1, k + 1)
+    phase, rate = rng.uniform(0, 6, 2 * N), rng.uniform(0.2, 3, 2 * N)
+    z = np.sin(phase + np.outer(t_ns * 1e-9, rate))
+    z[:, N:] *= (t_ns * 1e-9)[:, None] * rng.choice([0.01, 0.1, 1.0])
+    return t_ns.tolist(), z
 
 
-@given(st.lists(st.tuples(vectors, vectors), min_size=1, max_size=12), st.floats(0.1, 5.0))
-def test_the_dynamic_rule_integrates_its_variable(
-    samples: list[tuple[Vector, Vector]], theta_s: float
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("name", TABLES)
+def test_the_core_decides_as_the_rule_is_stated(
+    content: dict[str, Any], name: str, seed: int
 ) -> None:
-    """η between samples as the solution of η̇ = −λη + w with w held."""
-    policy = DynamicTrigger(0.3, theta_s, 0.8, P, Q, BK, initial_dynamic_variable=0.2)
-    trigger, eta, w = CoreTrigger(policy, 2), 0.2, 0.0
-    trigger.start(0, np.zeros(2))
-    for number, (x, e) in enumerate(samples, 1):
-        found = trigger.test(number * 10 * MS, x, e)
-        eta = math.exp(-0.8 * 0.01) * eta + (1 - math.exp(-0.8 * 0.01)) / 0.8 * w
-        w = 0.3 * x @ Q @ x - 2 * x @ P @ BK @ e
-        excess = -(max(eta, 0.0) + theta_s * w)
-        if abs(excess) > 1e-9:
-            assert found.event == (excess > 0)
+    table = TABLES[name]
+    scenario = resolve(validate(content | {"trigger": table}, "here"))
+    loop, start = loop_of(scenario), np.array([0.5, -0.3])
+    BK = loop.B_model @ loop.K
+    trigger, stated = CoreTrigger(rule_of(scenario), N), Trigger(table, loop.A_model + BK, BK)
 
+    def begin(t_ns: int, x: Vector) -> None:
+        trigger.start(t_ns, x)
+        stated.event(t_ns, x)
+        stated.measured(t_ns, x, np.zeros(N))
 
-def events_ms(policy: Policy, error: Callable[[int, int], float]) -> Iterator[int]:
-    """Events in the first second, tested every ms; the error depends on the last event's age."""
-    trigger, last = CoreTrigger(policy, 2), 0
-    trigger.start(0, np.ones(2))
-    for t_ms in range(1, 1001):
-        if trigger.test(t_ms * MS, np.ones(2), np.full(2, error(t_ms, t_ms - last))).event:
-            yield t_ms
-            last = t_ms
-            trigger.start(t_ms * MS, np.ones(2))
-
-
-def growing(t_ms: int, since_ms: int) -> float:
-    return 1e-3 * since_ms
-
-
-def silent(t_ms: int, since_ms: int) -> float:
-    return 0.0
-
-
-def test_periodic_transmits_at_a_fixed_period() -> None:
-    assert list(events_ms(PeriodicTrigger(70 * MS), growing)) == list(range(70, 1001, 70))
-
-
-def test_a_deadline_only_adds_an_event_after_silence() -> None:
-    rule = AbsoluteTrigger(0.1)  # after 71 ms of growth
-    assert list(events_ms(DeadlineTrigger(rule, 200 * MS), silent)) == list(range(200, 1001, 200))
-    assert list(events_ms(DeadlineTrigger(rule, 200 * MS), growing)) == list(
-        events_ms(rule, growing)
-    )
-    assert next(events_ms(DeadlineTrigger(rule, 50 * MS), growing)) == 50
-
-
-def test_a_dwell_time_only_delays_events() -> None:
-    rule = AbsoluteTrigger(0.1)
-    assert next(events_ms(rule, growing)) == 71
-    assert list(events_ms(DwellTrigger(rule, 100 * MS), growing)) == list(range(100, 1001, 100))
-    assert list(events_ms(DwellTrigger(rule, 50 * MS), growing)) == list(events_ms(rule, growing))
-    assert next(events_ms(DwellTrigger(PeriodicTrigger(30 * MS), 50 * MS), silent)) == 50
-    assert list(events_ms(DwellTrigger(rule, 50 * MS), silent)) == []
-
-
-def test_periodic_event_triggering_tests_on_its_grid_and_has_a_heartbeat() -> None:
-    Q = np.diag([0.0, 0.0, 1.0, 1.0])
-    assert list(events_ms(QuadraticTrigger(Q, 50 * MS, 0.01), growing)) == list(
-        range(100, 1001, 100)
-    )
-    silent_events = list(events_ms(QuadraticTrigger(Q, 50 * MS, 0.01, heartbeat=6), silent))
-    assert silent_events == [300, 600, 900]
+    begin(0, start)
+    for t_ns, z in zip(*samples(seed, 400), strict=True):
+        found = trigger.test(t_ns, z[:N], z[N:])
+        stated.measured(t_ns, z[:N], z[N:])
+        left, right = stated.sides(t_ns, z[:N], z[N:])
+        assert (found.left, found.right) == pytest.approx((left, right), rel=1e-9, abs=1e-12)
+        if abs(left - right) > 1e-9 or left == right == 0.0:
+            exceeds = left > right and stated.counts(t_ns, stated.rule)
+            assert found.event == (exceeds or t_ns >= stated.due_ns(stated.rule))
+        if found.event:
+            begin(t_ns, z[:N])
 
 
 @given(
@@ -159,7 +97,7 @@ def test_a_self_triggered_error_stays_below_the_threshold(
     L: float, a: float, b: float, x: Vector, floor: float, t_s: float
 ) -> None:
     """The extreme error d|e|/dt = L|e| + a|x| + b reaches it at the event, and not before."""
-    policy = SelfTrigger(Forecast(0.5, 0.25, floor, L, a, b), 1000, 10 * S)
+    policy = self_triggered_rule(Forecast(0.5, 0.25, floor, L, a, b), 1000, 10 * S)
     trigger, t_ns = CoreTrigger(policy, len(x)), round(t_s * 1e9)
     trigger.start(t_ns, x)
     tau_s, t_s = (trigger.latest_ns - t_ns) * 1e-9, t_ns * 1e-9
@@ -181,7 +119,49 @@ def test_a_self_triggered_error_stays_below_the_threshold(
 @given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=2).map(np.array), vectors)
 def test_the_compared_error_has_the_bits_of_its_norm(e_s: Vector, x: Vector) -> None:
     """Also if a run diverges: its squares overflow."""
-    trigger = CoreTrigger(AbsoluteTrigger(0.1), 2)
+    trigger = CoreTrigger(absolute_rule(0.1), 2)
     trigger.start(0, x)
     with np.errstate(over="ignore"):
         assert trigger.test(MS, x, e_s).left == exact_norm(e_s)
+
+
+def nested(rule: dict[str, Any]) -> dict[str, Any]:
+    inner = {"policy": "dwell", "interval_s": 0.1, "rule": rule}
+    return {"policy": "deadline", "interval_s": 1.0, "rule": inner}
+
+
+@pytest.mark.parametrize(
+    ("trigger", "expected"),
+    [
+        ({"policy": "absolute", "delta": 1e-300}, "trigger.delta = 1e-300: should be greater"),
+        ({"policy": "relative", "sigma": 1e300}, "trigger.sigma = 1e+300: should be less"),
+        ({"policy": "mixed", "sigma": 1.0, "epsilon": 1e200}, "trigger.epsilon = 1e+200: should"),
+        ({"policy": "lyapunov", "rate_per_s": 1e300}, "trigger.rate_per_s = 1e+300: should be"),
+        (DYNAMIC | {"decay_per_s": 1e6}, "trigger.decay_per_s = 1000000.0: should be less"),
+        (RULE, "trigger.period_s = 0.003: must be a whole number of the 0.002 s"),
+        (nested(RULE), "trigger.rule.rule.period_s = 0.003: must be a whole number"),
+        (
+            nested({"policy": "absolute", "delta": 1.0, "weight": [[1.0, 1.0], [1.0, 1.0]]}),
+            "trigger.rule.rule.weight = [[1.0, 1.0], [1.0, 1.0]]: W must be invertible",
+        ),
+    ],
+)
+def test_a_mistake_names_its_key(
+    content: dict[str, Any], trigger: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(CallerError) as found:
+        validate(content | {"trigger": trigger}, "here")
+    assert str(found.value).startswith(f"here: {expected}")
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
+    """One mode decays 1e16 times as slowly as the other; P is not positive definite as computed."""
+    B, K = (
+        np.array([[113.33624038521207], [43.17068933023515]]),
+        [[-3.896659939542095, -1.4842666344932138]],
+    )
+    settings = LyapunovSettings(policy="lyapunov", rate_per_s=0.3)
+    with pytest.raises(CallerError, match="within rounding"):
+        settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))

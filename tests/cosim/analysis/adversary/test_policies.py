@@ -19,16 +19,11 @@ from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify
+from tests.trigger_rules import EXAMPLES
 
-EXAMPLES = {
-    name: example.model_dump(mode="json", exclude_none=True)
-    for name, made in POLICIES.items()
-    if (example := made.example(2)) is not None
-}
 OWN = {
     "periodic": {"period_s": 0.25},
     "self_triggered": {"longest_s": 0.6},

@@ -71,7 +71,7 @@ def test_a_supremum_is_just_above_all_samples(resolved: Scenario) -> None:
     t_s = np.sort(np.concatenate([t_s, just_before_s]))
     samples = run.at(t_s)
     for objective, norms in (
-        (Objective.ERROR, run.e_c_norm(samples) / run.system.decaying.beta),
+        (Objective.ERROR, run.e_c_norm(samples) / run.system.decaying.level),
         (Objective.STATE, np.linalg.norm(samples.x, axis=1)),
     ):
         measure = measure_of(run.system, objective)

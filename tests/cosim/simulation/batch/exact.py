@@ -30,9 +30,9 @@ from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
-from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.trigger_rule import QuadraticForm
 from tests.oracles.link import UPDATE_LINK, Link
+from tests.trigger_rules import decaying_rule
 
 LOSSES = (
     NoLoss(),
@@ -60,7 +60,7 @@ def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
     return Setting(
         H=np.zeros((n, n)) if held else rng.uniform(-1, 1, (n, n)) * 2 / math.sqrt(n) - np.eye(n),
         K=rng.uniform(-1, 1, (m, n)) * 2 / math.sqrt(n),
-        trigger=DecayingTrigger(0.3, rng.choice([0.1, 1.0]), 0.1 if floor else 0.0, weight),
+        trigger=decaying_rule(0.3, rng.choice([0.1, 1.0]), 0.1 if floor else 0.0, weight, n),
         link=LinkSettings(
             impairments=tuple(impairments),
             mansd=int(rng.integers(0, 5)) if rng.random() < 0.9 else None,
@@ -123,7 +123,7 @@ def check_events(run: ContinuousRun, setting: Setting) -> int:
     error of 1e-12, amplified by a flat crossing.
     """
     n = len(setting.H)
-    rule, G = setting.trigger.trigger_rule(n), run.system.generator
+    rule, G = setting.trigger, run.system.generator
     eta = setting.trigger.initial_dynamic_variable
     checked = 0
     dynamic = rule.dynamic_variable
@@ -196,7 +196,7 @@ def cost_of(run: ContinuousRun, setting: Setting) -> float:
 
 def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]:
     """Times, ‖x‖ and ‖W e_c‖ e^{αt} from just after an event to just before the next."""
-    rule = setting.trigger.trigger_rule(len(setting.H))
+    rule = setting.trigger
     alpha = 0.0 if rule.from_event else rule.rate_per_s
     times_s, norms, errors = [], [], []
     for state, begin_s, end_s in pieces(run):

@@ -20,8 +20,6 @@ from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.link_settings import LinkSettings
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.quadratic import QuadraticTrigger
 from tests.cosim.simulation.batch.exact import (
     check_events,
     check_independence,
@@ -31,6 +29,7 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
+from tests.trigger_rules import decaying_rule, quadratic_rule
 
 SIZE = (4, 2)
 """States and inputs of most campaigns of the tests: each size is compiled anew."""
@@ -83,7 +82,7 @@ def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Populat
     turn = np.zeros((4, 4))
     turn[0, 1], turn[1, 0] = omega, -omega
     level = 2.0 * math.hypot(0.3, 0.4) * (1 - depth)
-    trigger = DecayingTrigger(level * 1e-3, 0.8, level) if floored else DecayingTrigger(level, 0.8)
+    trigger = decaying_rule(level * 1e-3 if floored else level, 0.8, level if floored else 0.0, n=4)
     setting = Setting(
         H=-alpha * np.eye(4), K=np.zeros((2, 4)), trigger=trigger, link=LinkSettings(),
         horizon_s=1.5 * math.pi / omega, known_start=True,
@@ -118,7 +117,7 @@ def test_the_supremum_between_events_is_certified() -> None:
 def test_a_diverging_loop_is_reported() -> None:
     fast = 100 * np.eye(4)
     setting = Setting(
-        H=fast, K=np.zeros((2, 4)), trigger=DecayingTrigger(0.5, 0.25), link=LinkSettings(),
+        H=fast, K=np.zeros((2, 4)), trigger=decaying_rule(0.5, 0.25, n=4), link=LinkSettings(),
         horizon_s=50.0, known_start=True,
     )  # fmt: skip
     start = np.array([[0.6, 0.8, 0.0, 0.0]])
@@ -170,9 +169,9 @@ def test_invalid_settings_are_refused() -> None:
         run_batch(Setting(**{**vars(setting), "link": late}), population)
     with pytest.raises(CallerError, match=r"trigger\.floor"):
         run_batch(
-            Setting(**{**vars(setting), "trigger": DecayingTrigger(1.0, 1.0), "horizon_s": 1e3}),
+            Setting(**{**vars(setting), "trigger": decaying_rule(1.0, 1.0), "horizon_s": 1e3}),
             population,
         )
-    wide = QuadraticTrigger(np.eye(6), 10**6)
+    wide = quadratic_rule(np.eye(6), 10**6)
     with pytest.raises(ValueError, match="trigger: expected 4 columns, found 6"):
         run_batch(Setting(**{**vars(setting), "trigger": wide}), population)

@@ -15,18 +15,7 @@ from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
-from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.deadline import DeadlineTrigger
-from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.dwell import DwellTrigger
-from noack.trigger.dynamic import DynamicTrigger
-from noack.trigger.lyapunov import LyapunovTrigger
-from noack.trigger.mixed import MixedTrigger
-from noack.trigger.periodic_trigger import PeriodicTrigger
-from noack.trigger.quadratic import QuadraticTrigger
-from noack.trigger.relative import relative_trigger
-from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_rule import Forecast, Policy
+from noack.trigger.trigger_rule import Forecast, TriggerRule
 from tests.cosim.simulation.batch.exact import (
     check_events,
     check_independence,
@@ -36,66 +25,83 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
+from tests.trigger_rules import (
+    absolute_rule,
+    area_rule,
+    decaying_rule,
+    dynamic_rule,
+    lyapunov_rule,
+    mixed_rule,
+    periodic_rule,
+    quadratic_rule,
+    self_triggered_rule,
+    with_deadline,
+    with_dwell_time,
+)
 
-Make = Callable[[np.random.Generator, int, Matrix | None], Policy]
+Make = Callable[[np.random.Generator, int, Matrix | None], TriggerRule]
 MS = 10**6
 
 
-def mixed(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
-    return MixedTrigger(0.05, rng.uniform(0.003, 0.05), W)
+def mixed(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
+    return mixed_rule(0.05, rng.uniform(0.003, 0.05), W, n)
 
 
-def decaying(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
-    return DecayingTrigger(0.2, 0.5, rng.choice([0.0, 0.1, 1.0]), W)
+def decaying(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
+    return decaying_rule(0.2, 0.5, rng.choice([0.0, 0.1, 1.0]), W, n)
 
 
-def lyapunov(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
-    return LyapunovTrigger(np.eye(n) + 0.1 * rng.uniform(-1, 1, (n, n)), 1.2, W)
+def lyapunov(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
+    return lyapunov_rule(np.eye(n) + 0.1 * rng.uniform(-1, 1, (n, n)), 1.2, W)
 
 
-def dynamic(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+def dynamic(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
     L = np.eye(n) + 0.3 * rng.uniform(-1, 1, (n, n))
     theta_s, decay_per_s = rng.choice([0.01, 0.5]), rng.choice([0.0, 1.0, 30.0])
     BK = 3 * rng.uniform(-1, 1, (n, n))
-    return DynamicTrigger(
+    return dynamic_rule(
         0.1, theta_s, decay_per_s, L.T @ L, np.eye(n), BK, rng.choice([0.0, 0.05]), W
     )
 
 
-def quadratic(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+def quadratic(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
     apart = 0.05 * rng.uniform(-1, 1, (2 * n, 2 * n))
     Q = np.diag([-0.02] * n + [1.0] * n) + apart + apart.T
     period_ns, heartbeat = int(rng.choice([100 * MS, 7 * MS, 1])), int(rng.choice([0, 6]))
     if period_ns == 1:
         period_ns, heartbeat = 33 * MS, 0
-    return QuadraticTrigger(Q, period_ns, rng.choice([0.0, 0.01]), heartbeat, W)
+    return quadratic_rule(Q, period_ns, rng.choice([0.0, 0.01]), heartbeat, W)
 
 
-def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
     growth_per_s = rng.choice([0.0, 2.0])
-    return SelfTrigger(Forecast(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1), 10 * MS, 1000 * MS, W)
+    return self_triggered_rule(
+        Forecast(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1), 10 * MS, 1000 * MS, W, n
+    )
 
 
 POLICIES: dict[str, Make] = {
-    "absolute": lambda rng, n, W: AbsoluteTrigger(0.01, W),
-    "relative": lambda rng, n, W: relative_trigger(rng.uniform(0.01, 0.05), W),
+    "absolute": lambda rng, n, W: absolute_rule(0.01, W, n),
+    "relative": lambda rng, n, W: mixed_rule(rng.uniform(0.01, 0.05), 0.0, W, n),
     "mixed": mixed,
+    "send_on_area": lambda rng, n, W: area_rule(0.01, W, n),
+    "dwell of send_on_area": lambda rng, n, W: with_dwell_time(area_rule(0.01, W, n), 120 * MS),
     "lyapunov": lyapunov,
     "dynamic": dynamic,
     "quadratic": quadratic,
-    "periodic": lambda rng, n, W: PeriodicTrigger(100 * MS, W),
+    "periodic": lambda rng, n, W: periodic_rule(100 * MS, W, n),
     "self_triggered": self_triggered,
-    "deadline of decaying": lambda *given: DeadlineTrigger(decaying(*given), 300 * MS),
-    "deadline of mixed": lambda *given: DeadlineTrigger(mixed(*given), 300 * MS),
-    "dwell of decaying": lambda *given: DwellTrigger(decaying(*given), 100 * MS),
-    "dwell of lyapunov": lambda *given: DwellTrigger(lyapunov(*given), 100 * MS),
-    "dwell of dynamic": lambda *given: DwellTrigger(dynamic(*given), 100 * MS),
-    "dwell of quadratic": lambda *given: DwellTrigger(quadratic(*given), 15 * MS + 3),
-    "dwell of deadline of self_triggered": lambda *given: DwellTrigger(
-        DeadlineTrigger(self_triggered(*given), 200 * MS), 50 * MS
+    "deadline of decaying": lambda *given: with_deadline(decaying(*given), 300 * MS),
+    "deadline of mixed": lambda *given: with_deadline(mixed(*given), 300 * MS),
+    "dwell of decaying": lambda *given: with_dwell_time(decaying(*given), 100 * MS),
+    "dwell of lyapunov": lambda *given: with_dwell_time(lyapunov(*given), 100 * MS),
+    "dwell of dynamic": lambda *given: with_dwell_time(dynamic(*given), 100 * MS),
+    "dwell of quadratic": lambda *given: with_dwell_time(quadratic(*given), 15 * MS + 3),
+    "dwell of deadline of self_triggered": lambda *given: with_dwell_time(
+        with_deadline(self_triggered(*given), 200 * MS), 50 * MS
     ),
-    "deadline within a dwell": lambda *given: DeadlineTrigger(
-        DwellTrigger(dynamic(*given), 300 * MS), 100 * MS
+    "deadline within a dwell": lambda *given: with_deadline(
+        with_dwell_time(dynamic(*given), 300 * MS), 100 * MS
     ),
 }
 NORM_OR_TIME = (
@@ -154,11 +160,11 @@ def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Populati
     """‖x‖ = e^{−αt}, ‖e_s‖ = 2 e^{−αt} sin(ωt/2): the relative rule is met when sin(ωt/2) > σ/2."""
     turn = omega * np.array([[0.0, 1.0], [-1.0, 0.0]])
     horizon_s = 1.5 * math.pi / omega
-    setting = known_loop(-alpha * np.eye(2), relative_trigger(sigma), horizon_s)
+    setting = known_loop(-alpha * np.eye(2), mixed_rule(sigma), horizon_s)
     return setting, draw_of(turn - alpha * np.eye(2))
 
 
-def known_loop(H: Matrix, trigger: Policy, horizon_s: float, **more: Any) -> Setting:
+def known_loop(H: Matrix, trigger: TriggerRule, horizon_s: float, **more: Any) -> Setting:
     """A loop without feedback and losses, from a known state."""
     return Setting(
         H=H, K=np.zeros((len(H) // 2, len(H))), trigger=trigger, link=LinkSettings(),
@@ -217,7 +223,7 @@ def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> N
 def test_an_oscillation_close_to_a_level_is_decided() -> None:
     """x rotates and no update arrives: ‖e_c‖ is constantly 1, just below the level 1 + 1e-10."""
     lost = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=None)
-    quiet = known_loop(np.zeros((4, 4)), PeriodicTrigger(1000 * MS), 20.0)
+    quiet = known_loop(np.zeros((4, 4)), periodic_rule(1000 * MS, n=4), 20.0)
     (row,) = run_batch(replace(quiet, link=lost, known_start=False), draw_of(rotation(100.0)))
     assert row["status"] == OK
     assert row["sup_e_c_scaled"] == pytest.approx(1.0, rel=1e-9)
@@ -226,7 +232,7 @@ def test_an_oscillation_close_to_a_level_is_decided() -> None:
 def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
     """x rotates with ‖x‖ = 1; the comparison with 1 + 1e-13 takes a million evaluations."""
     turn = rotation(3.0)
-    setting = known_loop(turn, AbsoluteTrigger(1.0), 4.0, settle=1 + 1e-13)
+    setting = known_loop(turn, absolute_rule(1.0, n=4), 4.0, settle=1 + 1e-13)
     (row,) = run_batch(setting, draw_of(turn))
     assert row["status"] == UNDECIDED
     assert math.isnan(row["cost"])
@@ -239,5 +245,5 @@ def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
 def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
     """Polynomials of 1e-10 s take too many steps; a float cannot represent steps of 1e-16 s."""
     fast = -rate_per_s * np.eye(4)
-    (row,) = run_batch(known_loop(fast, PeriodicTrigger(1000 * MS), 4.0), draw_of(fast))
+    (row,) = run_batch(known_loop(fast, periodic_rule(1000 * MS, n=4), 4.0), draw_of(fast))
     assert row["status"] == UNDECIDED

@@ -24,8 +24,9 @@ from cosim.simulation.continuous import (
 from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.continuous.next_event import next_event
+from tests.trigger_rules import decaying_rule
 
 
 def loop_with(
@@ -38,7 +39,7 @@ def loop_with(
 
 class Case(NamedTuple):
     loop: LoopMatrices
-    trigger: DecayingTrigger
+    trigger: TriggerRule
     lost: list[bool]
     known: bool
     horizon_s: float
@@ -68,7 +69,7 @@ def cases(draw: st.DrawFn) -> Case:
     floor = draw(st.sampled_from([0.0, 0.1]))
     return Case(
         loop_with(A, B, K, H, rng.uniform(-1, 1, n), W),
-        DecayingTrigger(0.3, draw(st.sampled_from([0.1, 1.0])), floor, W),
+        decaying_rule(0.3, draw(st.sampled_from([0.1, 1.0])), floor, W, n),
         draw(st.lists(st.booleans(), min_size=1, max_size=6)),
         draw(st.booleans()),
         horizon_s=2.0,
@@ -88,7 +89,7 @@ def integrated(case: Case) -> Iterator[tuple[float, Vector]]:
     )
 
     def excess(t_s: float, y: Vector) -> float:
-        threshold = max(trigger.beta * math.exp(-trigger.alpha_per_s * t_s), trigger.floor)
+        threshold = max(trigger.level * math.exp(-trigger.rate_per_s * t_s), trigger.floor)
         return float(np.linalg.norm(W @ (y[n : 2 * n] - y[:n]))) - threshold
 
     excess.terminal = True  # type: ignore[attr-defined]
@@ -175,7 +176,7 @@ def test_a_scalar_loop_has_closed_form_events(floored: bool, lost: tuple[bool, .
     w² − w = aβe^{−αt_i}/|v|.
     """
     a, b, k, beta = 0.7, 1.0, -2.0, 0.3
-    trigger = DecayingTrigger(1e-9 if floored else beta, a, beta if floored else 0.0)
+    trigger = decaying_rule(1e-9 if floored else beta, a, beta if floored else 0.0, n=1)
     loop = loop_with(
         np.array([[a]]), np.array([[b]]), np.array([[k]]), np.zeros((1, 1)), np.array([2.0])
     )
@@ -210,7 +211,7 @@ def turning(depth: float, omega: float, floored: bool) -> Case:
     A, B, K = turn - alpha * np.eye(2), np.ones((2, 1)), np.zeros((1, 2))
     peak = 2.0 * math.hypot(0.3, 0.4)
     level = peak * (1 - depth)
-    trigger = DecayingTrigger(level * 1e-3, 0.8, level) if floored else DecayingTrigger(level, 0.8)
+    trigger = decaying_rule(level * 1e-3, 0.8, level) if floored else decaying_rule(level, 0.8)
     loop = loop_with(A, B, K, -alpha * np.eye(2), np.array([0.3, 0.4]))
     return Case(loop, trigger, [False], True, horizon_s=1.5 * math.pi / omega)
 
@@ -263,14 +264,14 @@ def test_the_highest_of_many_near_misses_is_found() -> None:
     x0 = mix @ np.array([weights[0], 0, weights[1], 0, weights[2], 0])
     W = np.diag([1.0, *[1e-12] * 5])
     loop = loop_with(A, np.zeros((6, 1)), np.zeros((1, 6)), np.zeros((6, 6)), x0, W)
-    trigger = DecayingTrigger(1e-3, 1.0, level, W)
+    trigger = decaying_rule(1e-3, 1.0, level, W)
     run = Case(loop, trigger, [False], True, horizon_s).run()
     assert run.event_s[0] == pytest.approx(first_s, abs=1e-13 / math.sqrt(depth))
-    missed = DecayingTrigger(1e-3, 1.0, error(peak_s) * (1 + depth), W)
+    missed = decaying_rule(1e-3, 1.0, error(peak_s) * (1 + depth), W)
     assert Case(loop, missed, [False], True, horizon_s).run().event_s.size == 0
 
 
-def scalar_system(trigger: DecayingTrigger) -> ContinuousLoop:
+def scalar_system(trigger: TriggerRule) -> ContinuousLoop:
     """e_s grows like −x, x = e^t: ẋ = x, ẋ_s = 0."""
     one = np.ones((1, 1))
     return ContinuousLoop(loop_with(one, one, 0 * one, 0 * one, np.ones(1)), trigger)
@@ -282,7 +283,7 @@ def next_event_s(system: ContinuousLoop, state: LoopState, until_s: float) -> fl
 
 
 def test_an_error_from_the_threshold_on_exceeds_it_at_once() -> None:
-    system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
+    system = scalar_system(decaying_rule(1e-3, 1.0, 0.5, n=1))
     out = LoopState(1.0, np.array([1.0]), np.array([-0.5]), np.zeros(1))
     assert next_event_s(system, out, 9.0) == 1.0
     back = out._replace(e_s=np.array([0.4]))  # e_s = 1.4 − e^{t−1}: −½ when e^{t−1} = 1.9
@@ -292,7 +293,7 @@ def test_an_error_from_the_threshold_on_exceeds_it_at_once() -> None:
 
 def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
     """|e_s| = x₀(e^t − 1) reaches 1·e^{−t} first or the floor first, depending on x₀."""
-    system = scalar_system(DecayingTrigger(1.0, 1.0, 0.5))
+    system = scalar_system(decaying_rule(1.0, 1.0, 0.5, n=1))
     for x0 in (2.0, 0.6, 0.5, 0.4, 1e-6):
         state = LoopState(0.0, np.array([x0]), np.zeros(1), np.zeros(1))
         decaying = math.log((1 + math.sqrt(1 + 4 / x0)) / 2)
@@ -301,7 +302,7 @@ def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
 
 
 def test_an_event_at_the_horizon_counts_and_a_later_one_does_not() -> None:
-    system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
+    system = scalar_system(decaying_rule(1e-3, 1.0, 0.5, n=1))
     state = LoopState(0.0, np.ones(1), np.zeros(1), np.zeros(1))
     at_s = math.log1p(0.5)
     assert next_event_s(system, state, at_s * (1 - 1e-12)) is None
@@ -332,7 +333,7 @@ def test_a_small_mismatch_keeps_its_relative_accuracy() -> None:
     a, h, small = -1.0, -1.0 - 1e-9, 1e-9
     one = np.ones((1, 1))
     loop = loop_with(a * one, one, 0 * one, h * one, np.ones(1))
-    trigger = DecayingTrigger(1e-10, 0.1)
+    trigger = decaying_rule(1e-10, 0.1, n=1)
     run = Case(loop, trigger, [False], True, 5.0).run()
     excess = lambda t: -math.expm1(-small * t) * math.exp(a * t) - 1e-10 * math.exp(-0.1 * t)  # noqa: E731
     # E itself, −1 − (−1 − 1e-9), has a relative error of 1e-16/1e-9, and so has the time.
@@ -371,7 +372,7 @@ def test_a_diverging_loop_without_events_reports_the_time() -> None:
     """ẋ = 100 x, equal to the model: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
     one = np.ones((1, 1))
     loop = loop_with(100 * one, one, 0 * one, 100 * one, np.ones(1))
-    run = Case(loop, DecayingTrigger(0.5, 0.25), [False], True, 50.0).run()
+    run = Case(loop, decaying_rule(0.5, 0.25, n=1), [False], True, 50.0).run()
     assert run.diverged_at_s == pytest.approx(math.log(0.5e100) / 100.25, rel=1e-12)
     assert run.event_s.size == 0
     assert np.isfinite(run.at([0.0, run.reached_s]).x).all()
@@ -382,7 +383,7 @@ def test_events_that_accumulate_are_an_error() -> None:
     loop = loop_with(one, one, 0 * one, 0 * one, np.ones(1))
     with pytest.raises(TooManyEventsError, match="accumulate"):
         simulate_continuous(
-            ContinuousLoop(loop, DecayingTrigger(0.5, 1.0)), horizon_s=1e6, delivered=[],
+            ContinuousLoop(loop, decaying_rule(0.5, 1.0, n=1)), horizon_s=1e6, delivered=[],
             known_start=True, max_events=50,
         )  # fmt: skip
 
@@ -391,8 +392,9 @@ def test_a_threshold_that_vanishes_is_an_error() -> None:
     one = np.ones((1, 1))
     loop = loop_with(-one, one, 0 * one, -one, np.ones(1))
     with pytest.raises(CallerError, match="floor"):
-        Case(loop, DecayingTrigger(0.5, 1.0), [False], True, 1e4).run()
-    assert Case(loop, DecayingTrigger(0.5, 1.0, 1e-9), [False], True, 1e4).run().event_s.size == 0
+        Case(loop, decaying_rule(0.5, 1.0, n=1), [False], True, 1e4).run()
+    floored = Case(loop, decaying_rule(0.5, 1.0, 1e-9, n=1), [False], True, 1e4)
+    assert floored.run().event_s.size == 0
 
 
 def test_a_reset_keeps_the_undelivered_jumps() -> None:

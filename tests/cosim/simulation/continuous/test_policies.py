@@ -1,12 +1,14 @@
-"""Every policy in continuous time, against an integrator with separately written rules."""
+"""Policies in continuous time: known events, and published bounds.
+
+Each event of every policy is checked by an integrator in ../batch/test_policies.py.
+"""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 from scipy.linalg import expm
 
 from cosim.simulation.continuous import (
@@ -16,16 +18,17 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from noack.config.resolution import LoopMatrices
-from noack.trigger.deadline import DeadlineTrigger
-from noack.trigger.dwell import DwellTrigger
-from noack.trigger.dynamic import DynamicTrigger
-from noack.trigger.lyapunov import LyapunovTrigger
-from noack.trigger.mixed import MixedTrigger
-from noack.trigger.periodic_trigger import PeriodicTrigger
-from noack.trigger.quadratic import QuadraticTrigger
-from noack.trigger.relative import relative_trigger
-from noack.trigger.self_triggered import SelfTrigger
-from noack.trigger.trigger_rule import Forecast, Policy
+from noack.trigger.trigger_rule import Forecast, TriggerRule
+from tests.trigger_rules import (
+    dynamic_rule,
+    lyapunov_rule,
+    mixed_rule,
+    periodic_rule,
+    quadratic_rule,
+    self_triggered_rule,
+    with_deadline,
+    with_dwell_time,
+)
 
 Vector = NDArray[np.float64]
 A_MODEL = np.array([[0.0, 1.0], [-2.0, 3.0]])
@@ -46,42 +49,11 @@ def loop_of(*, zoh: bool, mismatch: float = 0.1) -> LoopMatrices:
     )  # fmt: skip
 
 
-POLICIES: dict[str, Policy] = {
-    "relative": relative_trigger(0.05),
-    "mixed": MixedTrigger(0.05, 0.02, np.array([[1.0, 0.2], [0.0, 2.0]])),
-    "dynamic": DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K, 1.0),
-    "dynamic, at once": DynamicTrigger(0.1, 0.5, 0.0, P, Q, B @ K),
-    "deadline": DeadlineTrigger(MixedTrigger(0.05, 0.1), 500 * MS),
-}
-"""Policies with events at the zero of a continuous function or at a given time; the paper's is in
-``test_continuous.py``."""
-Excess = Callable[[float, Vector, float], float]
-"""Positive at an event: a function of the time, z = (x, e_s), and η."""
-
-
-def excess_of(name: str) -> Excess:
-    def dynamic(t: float, z: Vector, eta: float) -> float:
-        return -(eta + 0.5 * gain(z))
-
-    W = np.array([[1.0, 0.2], [0.0, 2.0]])
-    rules: dict[str, Excess] = {
-        "relative": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2,
-        "mixed": lambda t, z, eta: norm(W @ z[2:]) ** 2 - (0.05 * norm(W @ z[:2])) ** 2 - 0.02**2,
-        "deadline": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2 - 0.1**2,
-    }
-    return rules.get(name, dynamic)
-
-
-def gain(z: Vector) -> float:
-    """W of the dynamic rule."""
-    return float(0.1 * z[:2] @ Q @ z[:2] - 2 * z[:2] @ P @ B @ K @ z[2:])
-
-
 def norm(v: Vector) -> float:
     return float(np.linalg.norm(v))
 
 
-def run_of(policy: Policy, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> ContinuousRun:
+def run_of(policy: TriggerRule, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> ContinuousRun:
     loop = loop_of(zoh=zoh)
     return simulate_continuous(
         ContinuousLoop(loop, policy), horizon_s=horizon_s, known_start=True,
@@ -89,52 +61,13 @@ def run_of(policy: Policy, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> C
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("zoh", "lost"), [(False, 2), (True, 0)])
-@pytest.mark.parametrize("name", POLICIES)
-def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> None:
-    """From each event of the run, an integrator with event detection finds the next one."""
-    policy, excess = POLICIES[name], excess_of(name)
-    run = run_of(policy, zoh=zoh, lost=lost)
-    loop, decay = run.system.loop, getattr(policy, "decay_per_s", 0.0)
-    assert len(run.before) >= 3
-    eta = policy.initial_dynamic_variable
-    for start in (run.start, *run.after):
-        z0 = np.concatenate([start.x, start.x + start.e_s, start.x + start.e_c, [eta]])
-
-        def flow(t: float, y: Vector) -> Vector:
-            x, x_s, x_c = y[:2], y[2:4], y[4:6]
-            z = np.concatenate([x, x_s - x])
-            return np.concatenate(
-                [loop.A @ x + loop.B @ (loop.K @ x_c), loop.H @ x_s, loop.H @ x_c,
-                 [-decay * y[6] + gain(z)]]
-            )  # fmt: skip
-
-        def crossing(t: float, y: Vector) -> float:
-            return excess(t, np.concatenate([y[:2], y[2:4] - y[:2]]), y[6])
-
-        crossing.terminal, crossing.direction = True, 1  # type: ignore[attr-defined]
-        end_s = run.horizon_s
-        if name == "deadline":
-            end_s = min(end_s, start.t_s + 0.5)
-        if end_s - start.t_s < 1e-6:
-            continue
-        found = solve_ivp(
-            flow, (start.t_s, end_s), z0, "DOP853", events=crossing, rtol=1e-11, atol=1e-13,
-            max_step=0.02,
-        )  # fmt: skip
-        expected_s = found.t_events[0][0] if len(found.t_events[0]) else end_s
-        following = next((one.t_s for one in run.before if one.t_s > start.t_s), run.horizon_s)
-        assert following == pytest.approx(expected_s, abs=1e-7)
-        eta = float(found.y[6, -1])
-
-
 @pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
 def test_states_evolve_while_the_rule_is_not_tested(decay_per_s: float) -> None:
     """η may be used up meanwhile; an event that is due within the dwell time follows at its end."""
-    dynamic = DynamicTrigger(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
+    dynamic = dynamic_rule(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
     for policy, times_s in (
-        (DwellTrigger(dynamic, 500 * MS), None),
-        (DeadlineTrigger(DwellTrigger(dynamic, 500 * MS), 200 * MS), 0.2 * np.arange(1, 30)),
+        (with_dwell_time(dynamic, 500 * MS), None),
+        (with_deadline(with_dwell_time(dynamic, 500 * MS), 200 * MS), 0.2 * np.arange(1, 30)),
     ):
         run = run_of(policy, zoh=True, lost=1, horizon_s=5.9)
         assert len(run.before) >= 5
@@ -147,7 +80,7 @@ def test_states_evolve_while_the_rule_is_not_tested(decay_per_s: float) -> None:
 
 def test_an_envelope_is_not_exceeded_between_dwell_time_and_event() -> None:
     """V(x) = xᵀPx ≤ V(x_k) e^{−ρ(t−t_k)}, sampled densely, under losses."""
-    policy = DwellTrigger(LyapunovTrigger(np.linalg.cholesky(P).T, 0.2), 20 * MS)
+    policy = with_dwell_time(lyapunov_rule(np.linalg.cholesky(P).T, 0.2), 20 * MS)
     run = run_of(policy, zoh=True, lost=1, horizon_s=4.0)
     compared = 0
     for state, end_s in zip([run.start, *run.after], [*run.event_s, run.horizon_s], strict=True):
@@ -170,7 +103,7 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
     """
     a, b = float(np.linalg.norm(CLOSED, 2)), float(np.linalg.norm(B @ K, 2))
     tau_s, _ = quad(lambda phi: 1 / (a + (a + b) * phi + b * phi**2), 0.0, sigma)
-    system = ContinuousLoop(loop_of(zoh=True, mismatch=0.0), relative_trigger(sigma))
+    system = ContinuousLoop(loop_of(zoh=True, mismatch=0.0), mixed_rule(sigma))
     shortest_s = math.inf
     for angle in np.linspace(0, math.pi, 40, endpoint=False):
         run = simulate_continuous(
@@ -183,13 +116,13 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
 
 
 def test_periodic_transmits_at_a_fixed_period() -> None:
-    run = run_of(PeriodicTrigger(300 * MS), zoh=True, lost=0, horizon_s=6.1)
+    run = run_of(periodic_rule(300 * MS), zoh=True, lost=0, horizon_s=6.1)
     np.testing.assert_allclose(run.event_s, np.arange(1, 21) * 0.3, rtol=1e-12)
 
 
 def test_periodic_event_triggering_agrees_with_the_sampled_rule() -> None:
     """By powers of matrices, sample by sample."""
-    run = run_of(QuadraticTrigger(FORM, 50 * MS, heartbeat=7), zoh=True, lost=1)
+    run = run_of(quadratic_rule(FORM, 50 * MS, heartbeat=7), zoh=True, lost=1)
     transition = expm(run.system.generator * 0.05)
     z, since, expected, number = np.concatenate(run.start[1:]), 0, [], 0
     for k in range(1, 121):
@@ -208,7 +141,7 @@ def test_a_self_trigger_stays_below_the_threshold_under_its_assumption() -> None
     """ZOH, no losses: |ė| = |ẋ| ≤ |A| |e| + |A+BK| |x_k|, as x = x_k − e."""
     loop = loop_of(zoh=True, mismatch=0.0)
     L, a = np.linalg.norm(loop.A, 2), np.linalg.norm(CLOSED, 2)
-    policy = SelfTrigger(Forecast(0.5, 0.2, 0.0, float(L), float(a), 0.0), 1000, 10**9)
+    policy = self_triggered_rule(Forecast(0.5, 0.2, 0.0, float(L), float(a), 0.0), 1000, 10**9)
     system = ContinuousLoop(loop, policy)
     run = simulate_continuous(system, horizon_s=6.0, delivered=[], known_start=True)
     assert len(run.before) > 20
@@ -217,6 +150,6 @@ def test_a_self_trigger_stays_below_the_threshold_under_its_assumption() -> None
 
 
 def test_events_accumulate_under_a_pure_envelope_when_updates_are_lost() -> None:
-    rule = LyapunovTrigger(np.linalg.cholesky(P).T, 0.2)
+    rule = lyapunov_rule(np.linalg.cholesky(P).T, 0.2)
     with pytest.raises(TooManyEventsError):
         run_of(rule, zoh=True, lost=2)

@@ -21,12 +21,8 @@ from cosim.simulation.continuous import (
 )
 from noack.config.resolution import LoopMatrices, resolve
 from noack.config.scenario_file import load
-from noack.trigger.absolute import AbsoluteTrigger
-from noack.trigger.dynamic import DynamicTrigger
-from noack.trigger.lyapunov import LyapunovTrigger
-from noack.trigger.quadratic import QuadraticTrigger
-from noack.trigger.relative import relative_trigger
-from noack.trigger.trigger_rule import Policy
+from noack.trigger.trigger_rule import TriggerRule
+from tests.trigger_rules import absolute_rule, lyapunov_rule, mixed_rule, quadratic_rule
 
 Matrix = NDArray[np.float64]
 MS = 1_000_000
@@ -50,7 +46,7 @@ P = np.array([[1.0, 0.25], [0.25, 1.0]])
 """Of V = xᵀPx in Tabuada, IEEE TAC 52(9), 2007, Section V."""
 
 
-def held(system: System, policy: Policy) -> ContinuousLoop:
+def held(system: System, policy: TriggerRule) -> ContinuousLoop:
     """The loop of the literature: held input, and a model equal to the plant."""
     A, B, K = system
     n, m = B.shape
@@ -148,14 +144,15 @@ def test_a_dynamic_rule_waits_at_least_as_long_as_the_static_one(theta_s: float)
     an integrator.
     """
     loop = dynamic(theta_s)
-    rule = loop.trigger
-    assert isinstance(rule, DynamicTrigger)
-    np.testing.assert_allclose(rule.P, P, rtol=1e-12)
+    assert loop.trigger.dynamic_variable is not None
+    form = loop.trigger.dynamic_variable.gain
+    psi = form.up.T @ form.up - form.down.T @ form.down
     A, B, K = TABUADA
+    np.testing.assert_allclose(psi[:2, 2:], -P @ B @ K, atol=1e-12)
     for x0 in directions(12):
 
         def w(t_s: float, x: Matrix, x0: Matrix = x0) -> float:
-            return float(rule.sigma * x @ rule.Q @ x - 2 * x @ P @ B @ K @ (x0 - x))
+            return float(x @ psi[:2, :2] @ x - 2 * x @ P @ B @ K @ (x0 - x))
 
         w.terminal, w.direction = True, -1  # type: ignore[attr-defined]
         u = B @ K @ x0
@@ -199,7 +196,7 @@ def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:
     i = next(i for i in range(len(t_s)) if above(t_s[i]) > 0)
     assert i > 0
     shortest_s = brentq(above, t_s[i - 1], t_s[i], xtol=1e-14)
-    loop = held(REACTOR, LyapunovTrigger(L, rate_per_s))
+    loop = held(REACTOR, lyapunov_rule(L, rate_per_s))
     worst = np.linalg.svd(L @ step(REACTOR, shortest_s) @ np.linalg.inv(L))[2][0]
     met = run_from(np.linalg.solve(L, worst), loop, 1.5 * shortest_s)
     # the square root of the rounding error
@@ -216,7 +213,7 @@ def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float
     """
     tau_s = 0.8
     system = np.array([[-1 / tau_s]]), np.array([[1.0]]), np.array([[0.0]])
-    run = run_from(np.array([1.0]), held(system, AbsoluteTrigger(delta)), 40.0)
+    run = run_from(np.array([1.0]), held(system, absolute_rule(delta, n=1)), 40.0)
     k = np.arange(1, math.floor(1 / delta) + 1)
     np.testing.assert_allclose(run.event_s, -tau_s * np.log1p(-k * delta), rtol=1e-9)
 
@@ -230,7 +227,7 @@ def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes() -> None:
     """
     system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
     amplitude, delta, periods = 3.7, 0.05, 4
-    rule = AbsoluteTrigger(delta, np.diag([1.0, 1e-9]))
+    rule = absolute_rule(delta, np.diag([1.0, 1e-9]))
     x0 = amplitude * np.array([math.cos(0.4), math.sin(0.4)])
     events = len(run_from(x0, held(system, rule), 2 * math.pi * periods).event_s)
     by_clock = amplitude / delta * 2 * math.pi * periods  # max|ẋ| = amplitude
@@ -255,9 +252,9 @@ def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound(
     gain, _ = quad(
         lambda s: float(np.linalg.norm(expm((other + B @ K) * s) @ B @ K, 2)), 0, 60, limit=200
     )
-    quiet = ContinuousLoop(same, AbsoluteTrigger(level))
+    quiet = ContinuousLoop(same, absolute_rule(level))
     assert len(run_from(np.array([10.0, 0.0]), quiet, 10.0).event_s) == 0
-    loop, x0 = ContinuousLoop(disturbed, AbsoluteTrigger(level)), np.array([10.0, -5.0])
+    loop, x0 = ContinuousLoop(disturbed, absolute_rule(level)), np.array([10.0, -5.0])
     run = run_from(x0, loop, 10.0)
     assert len(run.event_s) > 5
     t_s = np.linspace(0.0, 10.0, 500)
@@ -269,14 +266,14 @@ def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound(
 @pytest.mark.parametrize(
     "rule",
     [
-        relative_trigger(0.3),
-        LyapunovTrigger(np.linalg.cholesky(P).T, 0.2),
+        mixed_rule(0.3),
+        lyapunov_rule(np.linalg.cholesky(P).T, 0.2),
         dynamic(1.0).trigger,
-        QuadraticTrigger(np.kron(np.diag([-0.1, 1.0]), np.eye(2)), 10 * MS),
+        quadratic_rule(np.kron(np.diag([-0.1, 1.0]), np.eye(2)), 10 * MS),
     ],
     ids=["relative", "lyapunov", "dynamic", "quadratic"],
 )
-def test_inter_event_times_depend_only_on_the_direction_of_the_state(rule: Policy) -> None:
+def test_inter_event_times_depend_only_on_the_direction_of_the_state(rule: TriggerRule) -> None:
     """Theorem: τ(λx) = τ(x) for homogeneous rules and linear plants.
 
     Anta, Tabuada, IEEE TAC 55(9), 2010, of the degree 0.
@@ -296,7 +293,7 @@ def test_inter_event_times_become_constant_where_the_direction_is_invariant() ->
     """
     A, B, _ = TABUADA
     system = A, B, np.array([[0.0, -6.0]])  # A + BK has the eigenvalues −1 and −2
-    run = run_from(np.array([1.0, 0.3]), held(system, relative_trigger(0.3)), 20.0)
+    run = run_from(np.array([1.0, 0.3]), held(system, mixed_rule(0.3)), 20.0)
     tau_s = float(between(run)[-1])
     np.testing.assert_allclose(between(run)[-5:], tau_s, rtol=1e-6)
     x, after = run.after[-2].x, run.after[-1].x

@@ -19,7 +19,8 @@ from noack.config.resolution import LoopMatrices, policy_of, resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import PLANT_STEP
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.trigger_rule import TriggerRule
+from tests.trigger_rules import decaying_rule
 
 PERIOD_NS = 10_000_000
 STEPS = 200
@@ -29,7 +30,7 @@ class Case(NamedTuple):
     """A random loop and schedule."""
 
     loop: LoopMatrices
-    trigger: DecayingTrigger
+    trigger: TriggerRule
     measured: list[bool]
     lost: list[bool]
     delays_ns: list[int]
@@ -110,7 +111,7 @@ def cases(draw: st.DrawFn) -> Case:
     delays = st.one_of(overtaking_within_a_step, anything)
     return Case(
         loop,
-        DecayingTrigger(draw(st.sampled_from([0.003, 0.03, 0.3])), 0.5, 1e-4),
+        decaying_rule(draw(st.sampled_from([0.003, 0.03, 0.3])), 0.5, 1e-4, n=n),
         measured,
         draw(st.lists(st.booleans(), min_size=1, max_size=6)),
         draw(delays),
@@ -145,7 +146,7 @@ def test_fast_sampling_converges_to_the_continuous_loop() -> None:
         "network": {"mansd": 0, "loss": {"model": "lossless"}},
     }
     record = simulate(resolve(validate(content, "test")))
-    system = ContinuousLoop(record.loop, DecayingTrigger(0.02, 0.3))
+    system = ContinuousLoop(record.loop, decaying_rule(0.02, 0.3))
     ideal = simulate_continuous(system, horizon_s=4.0, delivered=[], known_start=False)
     differences = []
     for period_ns in (4_000_000, 2_000_000, 1_000_000, 500_000):
