@@ -35,6 +35,7 @@ FIGURES = (
     Figure("simulation", ".* of the machines in virtual time", "the demo's 20 s in virtual time"),
     Figure("long_run", "the same, by CPU time .*", "end of a run of 10 minutes, by CPU time"),
     Figure("long_run", "of it, the replay"),
+    Figure("simulation", "replay of .*", "replay of 10 minutes at 500 Hz, from memory"),
     Figure("long_run", "peak memory, .*"),
     Figure("fleet", ".*: end of the run"),
     Figure("fleet", ".*lateness p99, worst loop"),

@@ -237,12 +237,6 @@ class CapacityPlan:
         """Start of the part of a run that counts for the guarantee and the deadline."""
         return self.scenario.horizon_s / 5
 
-    @property
-    def pulse_s(self) -> tuple[float, float]:
-        """Begin and end of the common disturbance."""
-        begin_s = self.scenario.horizon_s / 2
-        return begin_s, begin_s + _PULSE_S
-
     def campaign(self) -> Campaign:
         """Return the campaign of all runs."""
         axes = [
@@ -250,8 +244,8 @@ class CapacityPlan:
             self._numbers(),
         ]
         if self.amplitude:
-            begin_s, end_s = self.pulse_s
-            pulse = {"kind": "step", "from_s": begin_s, "until_s": end_s}
+            begin_s = self.scenario.horizon_s / 2
+            pulse = {"kind": "step", "from_s": begin_s, "until_s": begin_s + _PULSE_S}
             variants = {
                 name: {
                     f"loops.{place}.plant.disturbances": kind.disturbed(pulse, amplitude)
@@ -284,10 +278,9 @@ class CapacityPlan:
         title = "number of loops"
         if self.is_one_kind:
             return Axis(name=LOOPS, title=title, key="loops", values=self.counts)
-        variants: dict[str, Any] = {str(count): {"loops": count} for count in self.counts}
-        for count in self.counts:
-            variants[unshared(count)] = {"loops": count, **self._faster(count)}
-        return Axis(name=LOOPS, title=title, variants=variants)
+        shared: dict[str, Any] = {str(count): {"loops": count} for count in self.counts}
+        own = {unshared(count): {"loops": count, **self._faster(count)} for count in self.counts}
+        return Axis(name=LOOPS, title=title, variants={**shared, **own})
 
     def _faster(self, factor: int) -> dict[str, Any]:
         """Return the settings of bottlenecks that are so many times as fast, with longer queues."""
