@@ -31,7 +31,7 @@ NO_COMPILER = 3
 # No contraction of a·b + c: results have the same bits on every processor.
 FLAGS = (
     "-std=c11", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off",
-    "-fno-math-errno", "-Wall", "-Wextra", "-Wconversion",
+    "-fno-math-errno", "-g0", "-Wall", "-Wextra", "-Wconversion",
 )  # fmt: skip
 SANITIZERS = (
     "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-g",

@@ -7,8 +7,24 @@
 enum { CACHE_LINE = 8 }; /* doubles */
 
 #if defined(__x86_64__)
+#include <cpuid.h>
+
+static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
+
+/* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
+   With ziglang, __builtin_cpu_supports() answers no to everything. */
+__attribute__((constructor)) static void ask_processor(void) {
+    unsigned a, b, c, d, kept, high;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE))
+        return;
+    __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
+    is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
+}
+
+int64_t noack_exact_is_fused(void) { return is_fused; }
+
 static const exact_code *code_for(int64_t entries) {
-    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma"))
+    if (!is_fused)
         return entries == 3 ? &exact_plain_3 : &exact_plain_64;
     if (entries <= 2)
         return &exact_fused_2;
@@ -17,6 +33,8 @@ static const exact_code *code_for(int64_t entries) {
     return entries <= 8 ? &exact_fused_8 : entries <= 16 ? &exact_fused_16 : &exact_fused_64;
 }
 #else
+int64_t noack_exact_is_fused(void) { return 0; }
+
 static const exact_code *code_for(int64_t entries) {
     if (entries <= 2)
         return &exact_plain_2;

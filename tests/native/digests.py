@@ -59,6 +59,7 @@ def _functions() -> None:
 
 
 if __name__ == "__main__":
+    print("uses AVX2 and FMA:", core.noack_exact_is_fused())
     _records()
     _batches()
     _functions()
