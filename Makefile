@@ -19,6 +19,9 @@ MINUTES ?= 10
 N ?= 1000000
 ARGS ?=
 LIVE ?=
+SETTABLE := PYTHON VENV CC SCENARIO CAMPAIGN SETTLING SESSION RUNS MINUTES N ARGS LIVE
+UNKNOWN := $(foreach v,$(filter-out $(SETTABLE) SHELL MAKE% -%,$(.VARIABLES)),$(if $(filter command,$(origin $v)),$v))
+$(if $(strip $(UNKNOWN)),$(error no such variable: $(strip $(UNKNOWN)); there are $(SETTABLE)))
 C_FILES := $(wildcard native/*.[ch] native/*/*.[ch])
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
@@ -72,7 +75,7 @@ certify: setup ## Compute the guaranteed bounds of SCENARIO and their conditions
 adversary: setup ## Search for the worst losses that SCENARIO's network may cause
 	@$(BIN)/noack adversary "$(SCENARIO)" $(ARGS)
 
-paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/ (3 minutes)
+paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/
 	@$(BIN)/noack paper --out docs $(ARGS)
 
 campaign: setup ## Run CAMPAIGN: many random draws over a grid of settings
@@ -177,7 +180,11 @@ $(VENV)/bin/python:
 
 $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 	@echo "installing pinned dependencies ..."
-	@$(PIP) -r requirements.lock
+	@# On another core meanwhile the library in C; the target core reports what fails of it.
+	@$(BIN)/python native/build.py --library > /dev/null 2>&1 & \
+		$(PIP) --no-compile -r requirements.lock; status=$$?; wait; exit $$status
+	@# pip would do it on one core.
+	@$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true
 	@touch $@
 
 # It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
@@ -189,7 +196,7 @@ core: $(VENV)/.dependencies
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
 	@$(EDITABLE)
 	@# Else each process compiles its modules anew where PYTHONDONTWRITEBYTECODE is set.
-	@$(BIN)/python -m compileall -q noack netem cosim plant_server sensor_node controller_node
+	@$(BIN)/python -m compileall -q -j 0 noack netem cosim plant_server sensor_node controller_node
 	@touch $@
 
 $(VENV)/.installed-lab: requirements-lab.lock $(VENV)/.installed

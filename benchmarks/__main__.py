@@ -9,6 +9,7 @@ import argparse
 import json
 import pkgutil
 import sys
+import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,7 @@ from rich.console import Console
 
 from benchmarks import goals
 from benchmarks._programs import provide
-from benchmarks._report import Benchmark, MeasurementError, measured, table_of
+from benchmarks._report import Benchmark, Load, MeasurementError, Row, table_of
 
 GOALS = "goals"
 _TABLE_WIDTH = 130
@@ -29,8 +30,7 @@ def all_benchmarks() -> list[Benchmark]:
     names = (found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)])
              if not (found.ispkg or found.name.startswith("_")))  # fmt: skip
     modules = (import_module(f"benchmarks.{name}") for name in names)
-    declared = (getattr(module, "BENCHMARK", None) for module in modules)
-    return [benchmark for benchmark in declared if benchmark is not None]
+    return [module.BENCHMARK for module in modules if hasattr(module, "BENCHMARK")]
 
 
 def run(every: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
@@ -55,8 +55,11 @@ def run(every: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> i
     console = Console()
     if not console.is_terminal:
         console.width = _TABLE_WIDTH
-    selected = [benchmark for name, benchmark in benchmarks.items() if name in chosen]
-    rows, failures = measured(selected, options, console)
+    rows, failures = list[tuple[str, Row]](), 0
+    for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
+        found, failed = _measured(benchmark, options, console)
+        rows += [(benchmark.name, row) for row in found]
+        failures += failed
     if options.json is not None:
         content = [row.as_json() | {"benchmark": name} for name, row in rows]
         options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
@@ -70,6 +73,25 @@ def run(every: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> i
             print(error, file=sys.stderr)
             return 1
     return 1 if failures else 0
+
+
+def _measured(
+    benchmark: Benchmark, options: argparse.Namespace, console: Console
+) -> tuple[list[Row], bool]:
+    """Run a benchmark and print its table; return its rows, and whether it failed."""
+    print(f"{benchmark.name}:", file=sys.stderr)
+    load, begun_s, failed = Load(), time.monotonic(), False
+    try:
+        rows = benchmark.measure(options)
+    except MeasurementError as error:
+        failed = True
+        rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
+    rows += load.rows()
+    console.print(table_of(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows))
+    for row in rows:
+        if (note := row.as_json().get("note")) is not None:
+            console.print(f"{row.name}: {note}", highlight=False, markup=False)
+    return rows, failed
 
 
 if __name__ == "__main__":

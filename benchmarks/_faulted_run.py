@@ -14,13 +14,15 @@ from benchmarks.soak.watch import is_of
 from cosim.analysis.loop_statistics import lateness_us
 from cosim.analysis.run_summary import summarise
 from cosim.cli import find_scenario
-from cosim.live.launcher import Watcher, launch
+from cosim.live.launcher import launch
+from cosim.live.run_watcher import Watcher
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import ROLES
+from noack.runtime.control_messages import RunProgress
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""
@@ -62,8 +64,8 @@ def faulted_run(
     threads: list[threading.Thread] = []
     outcomes, backs_s = list[Outcome](), list[float]()
 
-    def progress(account: Mapping[str, Any]) -> None:
-        if account["t_s"] >= at_s and not threads:
+    def progress(report: RunProgress) -> None:
+        if report.t_s >= at_s and not threads:
             children = psutil.Process().children()
             processes = {role: child for role in ROLES for child in children if is_of(role, child)}
             threads.append(threading.Thread(target=lambda: outcomes.append(fault(processes))))

@@ -49,11 +49,11 @@ class Kind:
     lossy: bool = False
 
 
-def c_relay(built: Built, mode: Literal["", "segment", "paths"] = "") -> Kind:
+def c_relay(built: Built, *words: Literal["segment", "names", "paths"]) -> Kind:
     """Return ``relay.c`` in one of its modes."""
-    names = {"": "C relay", "segment": "C relay, segments", "paths": "C relay, a socket per client"}
-    words = [mode] if mode else []
-    return Kind(names[mode], lambda to, _: [str(built.relay), str(to), *words])
+    text = {"segment": "segments", "names": "senders' addresses", "paths": "a socket per client"}
+    name = ", ".join(["C relay", *(text[word] for word in words)])
+    return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
 
 
 def socat() -> Kind | str:

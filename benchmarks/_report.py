@@ -1,17 +1,17 @@
 """Rounds, rows, tables and JSON of the benchmarks, and the machine's other load."""
 
 import argparse
+import operator
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
-from rich.console import Console
 from rich.table import Table
 
 BUSY_SHARE = 0.1
@@ -19,15 +19,7 @@ BUSY_SHARE = 0.1
 STEAL_SHARE = 0.01
 """Figures are reported as doubtful if the hypervisor took at least this share of all cores."""
 
-_TABLE_WIDTH = 130
-"""Columns of a table, if the output is not a terminal."""
-
-_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
-    "<=": lambda found, limit: found <= limit,
-    "<": lambda found, limit: found < limit,
-    ">=": lambda found, limit: found >= limit,
-    "==": lambda found, limit: found == limit,
-}
+_COMPARISONS = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operator.eq}
 
 
 class MeasurementError(Exception):
@@ -49,7 +41,7 @@ class Goal(NamedTuple):
 
     def holds(self, found: float) -> bool:
         """Whether ``found`` reaches the goal."""
-        return _COMPARISONS[self.comparison](found, self.limit)
+        return bool(_COMPARISONS[self.comparison](found, self.limit))
 
     def __str__(self) -> str:
         return f"{self.comparison} {self.limit:g}"
@@ -99,15 +91,11 @@ class Row:
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as ``--json`` writes it."""
-        row: dict[str, Any] = {
-            "name": self.name,
-            "value": self.value,
-            "unit": self.unit,
-            "peer": None if self.peer is None else self.peer._asdict(),
-            "ratio": self.ratio,
-            "goal": None if self.goal is None else str(self.goal),
-            "holds": self.holds,
-        }
+        row = {
+            "name": self.name, "value": self.value, "unit": self.unit,
+            "peer": self.peer and self.peer._asdict(), "ratio": self.ratio,
+            "goal": self.goal and str(self.goal), "holds": self.holds,
+        }  # fmt: skip
         notes = [text for text in (self.unjudged, self.note) if text]
         return row | ({"note": "; ".join(notes)} if notes else {})
 
@@ -161,11 +149,7 @@ class Benchmark:
     add_arguments: Callable[[argparse.ArgumentParser], None] = lambda parser: None
 
 
-def median(values: Iterable[float]) -> float:
-    """Return the median over rounds."""
-    return statistics.median(values)
-
-
+median = statistics.median
 Figures = Mapping[str, float]
 """The figures of one side in one round, by quantity."""
 
@@ -219,6 +203,52 @@ class Rounds:
         )  # fmt: skip
 
 
+Side = Callable[[], float]
+"""Measures one figure of a side."""
+
+
+def compared(
+    name: str, unit: str, ours: Side, peer: tuple[str, Side] | Peer | None = None,
+    goal: Goal | None = None, *, note: str | None = None, unjudged: str | None = None,
+    rounds: int = 5,
+) -> Row:  # fmt: skip
+    """Measure our side and the alternative in turn; the ratio is the median of the rounds' ratios.
+
+    Args:
+        name: what is measured.
+        unit: its unit.
+        ours: our side.
+        peer: name and side of the alternative; or its figure, if it is known.
+        goal: see :class:`Row`.
+        note: for the reader.
+        unjudged: see :class:`Row`.
+        rounds: number of rounds.
+    """
+    say(name)
+    if not isinstance(peer, tuple) or isinstance(peer, Peer):
+        return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unjudged)
+    found = [(ours(), peer[1]()) for _ in range(rounds)]
+    value, other = (median(side) for side in zip(*found, strict=True))
+    ratio = median(a / b for a, b in found)
+    return Row(name, value, unit, Peer(peer[0], other), goal, note, unjudged, ratio)
+
+
+def cpu_ms(call: Callable[[], object]) -> Side:
+    """Return a side: milliseconds of CPU time of a call, which other load changes little."""
+    return lambda: 1e3 * _cpu_s(call)
+
+
+def per_cpu_s(count: float, call: Callable[[], object]) -> Side:
+    """Return a side: so many per second of CPU time."""
+    return lambda: count / _cpu_s(call)
+
+
+def _cpu_s(call: Callable[[], object]) -> float:
+    begun_s = time.process_time()
+    call()
+    return max(time.process_time() - begun_s, 1e-9)
+
+
 def say(text: str) -> None:
     """Print what is being measured."""
     print(f"  {text} ...", file=sys.stderr, flush=True)
@@ -248,25 +278,3 @@ def number_text(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
-
-
-def measured(
-    benchmarks: Iterable[Benchmark], options: argparse.Namespace, console: Console
-) -> tuple[list[tuple[str, Row]], int]:
-    """Run benchmarks and print their tables; return (benchmark, row) and the number of failures."""
-    everything, failures = list[tuple[str, Row]](), 0
-    for benchmark in benchmarks:
-        print(f"{benchmark.name}:", file=sys.stderr)
-        load, begun_s = Load(), time.monotonic()
-        try:
-            rows = benchmark.measure(options)
-        except MeasurementError as error:
-            failures += 1
-            rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
-        rows += load.rows()
-        console.print(table_of(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows))
-        for row in rows:
-            if (note := row.as_json().get("note")) is not None:
-                console.print(f"{row.name}: {note}", highlight=False, markup=False)
-        everything += [(benchmark.name, row) for row in rows]
-    return everything, failures

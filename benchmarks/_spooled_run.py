@@ -14,7 +14,7 @@ import numpy as np
 from cosim.live.simulated_run import simulate_run
 from cosim.record.record_source import joined
 from cosim.record.run_directory import RECORD, write_environment
-from cosim.record.table_files import read_batches
+from cosim.record.table_files import TableFile
 from noack.config.resolution import run_tables
 from noack.config.scenario_file import load
 from noack.protocol.topology import RECORDER
@@ -29,7 +29,8 @@ def spool(run_dir: Path, types: dict[str, np.dtype[np.void]]) -> None:
     """Turn the record of a run into a spool."""
     writer = SpoolWriter(run_dir / SPOOL, RECORDER)
     for table, dtype in types.items():
-        rows = joined([*read_batches(run_dir / RECORD / f"{table}.parquet", dtype)], dtype)
+        file = TableFile(run_dir / RECORD / f"{table}.parquet", dtype)
+        rows = joined([*file.batches()], dtype)
         rows = rows.take(np.argsort(rows["now_ns"], kind="stable"))
         ends_ns = np.arange(_BATCH_NS, rows["now_ns"].max(initial=0) + _BATCH_NS, _BATCH_NS)
         first = 0

@@ -16,13 +16,13 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 
 from benchmarks._driven_clocks import DrivenClocks
 from noack.core.clock import ClockOffset, Restart
-from noack.runtime.address import Address, family_of
+from noack.runtime.address import Address
 from noack.runtime.real_time_loop import realtime
 from noack.runtime.time_exchange import TimeClient, TimeReference, answering
 
@@ -34,50 +34,48 @@ _START_NS = 500_000_000
 _PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
 
 
-class BareReference:
-    """Answers like a plain NTP server."""
+class Bare:
+    """An end of a plain NTP exchange; the client takes the newest midpoint for the offset."""
 
-    def __init__(self, listen: Address) -> None:
-        self._endpoint = socket.socket(family_of(listen), socket.SOCK_DGRAM)
-        self._endpoint.bind(listen)
-        self.address: Address = self._endpoint.getsockname()[:2]
+    def __init__(self, clocks: DrivenClocks | None = None) -> None:
+        self._clocks = clocks or DrivenClocks()
+        self._endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.midpoint_ns: int | None = None
+
+    @classmethod
+    def reference(cls, listen: Address) -> Self:
+        """Return an end that answers at an address."""
+        made = cls()
+        made._endpoint.bind(listen)
+        return made
+
+    @classmethod
+    def client(cls, reference: Address, clocks: DrivenClocks) -> Self:
+        """Return an end that asks a reference."""
+        made = cls(clocks)
+        made._endpoint.connect(reference)
+        made._endpoint.setblocking(False)
+        return made
+
+    @property
+    def address(self) -> Address:
+        """Its own address."""
+        name: Address = self._endpoint.getsockname()
+        return name
 
     def fileno(self) -> int:
+        """Return the descriptor to wait for."""
         return self._endpoint.fileno()
 
-    def answer_all(self) -> int:
+    def answer_all(self) -> None:
+        """Answer the waiting request."""
         data, source = self._endpoint.recvfrom(100)
         received_ns = time.monotonic_ns()
         sent_ns = _PACKET.unpack(data)[0]
         self._endpoint.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
-        return 1
-
-    def close(self) -> None:
-        self._endpoint.close()
-
-
-class Client(Protocol):
-    """What the measurement needs of a client."""
-
-    def fileno(self) -> int: ...
-    def poll(self) -> list[Restart]: ...
-    def close(self) -> None: ...
-
-
-class BareClient:
-    """Takes the midpoint of the newest exchange for the offset."""
-
-    def __init__(self, reference: Address, clocks: DrivenClocks) -> None:
-        self._endpoint = socket.socket(family_of(reference), socket.SOCK_DGRAM)
-        self._endpoint.connect(reference)
-        self._endpoint.setblocking(False)
-        self._clocks = clocks
-        self.midpoint_ns: int | None = None
-
-    def fileno(self) -> int:
-        return self._endpoint.fileno()
 
     def poll(self) -> list[Restart]:
+        """Take the answer, or send a request if there is none."""
         try:
             data = self._endpoint.recv(100)
         except BlockingIOError:
@@ -89,21 +87,23 @@ class BareClient:
         return []
 
     def close(self) -> None:
+        """Close the socket."""
         self._endpoint.close()
 
 
 def run_reference(options: argparse.Namespace) -> None:
     """Answer until the standard input closes."""
     listen = (options.host, 0)
-    with closing(BareReference(listen) if options.bare else TimeReference(listen, KEY)) as one:
-        print(one.address[1], flush=True)
-        if isinstance(one, TimeReference) and not options.answer_every_s:
-            with answering(one):
+    end = Bare.reference(listen) if options.bare else TimeReference(listen, KEY)
+    with closing(end):
+        print(end.address[1], flush=True)
+        if isinstance(end, TimeReference) and not options.answer_every_s:
+            with answering(end):
                 sys.stdin.read()
             return
         while not select.select([sys.stdin], (), (), options.answer_every_s)[0]:
-            while select.select([one], (), (), 0 if options.answer_every_s else 0.1)[0]:
-                one.answer_all()
+            while select.select([end], (), (), 0 if options.answer_every_s else 0.1)[0]:
+                end.answer_all()
 
 
 def run_client(options: argparse.Namespace) -> None:
@@ -112,8 +112,8 @@ def run_client(options: argparse.Namespace) -> None:
     address = (options.host, options.port)
     offset = ClockOffset(options.rate_ppb)
     period_ns = round(options.period_s * 1e9)
-    bare = BareClient(address, clocks) if options.bare else None
-    client: Client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
+    bare = Bare.client(address, clocks) if options.bare else None
+    client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
     errors_ns, estimates_ns = list[int](), list[int]()
     checks = outside = restarts = 0
     steady_ns = time.monotonic_ns() + _START_NS

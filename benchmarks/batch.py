@@ -6,12 +6,9 @@ settling time, supremum of the error); the integrator only finds the events.
 """
 
 import argparse
-import json
 import os
-import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any
 
 # Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -20,66 +17,36 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from benchmarks._report import Benchmark, Goal, Peer, Rounds, Row, median, say
+from benchmarks._report import Benchmark, Goal, Row, compared, median, per_cpu_s
 from cosim.cli import find_scenario
-from cosim.simulation.batch import (
-    Population,
-    Setting,
-    run_batch,
-    run_events,
-    setting_of,
-)
-from cosim.simulation.continuous import network_fates
-from noack.config.resolution import loop_of, resolve
-from noack.config.run_sections import SeedsSection
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
+from cosim.simulation.batch import Population, Setting, run_batch, run_with_events, setting_of
+from cosim.studies.campaign.random_draws import box_of
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load, validate
 from noack.config.sections import POLICIES
 from noack.core.linear_systems import Vector
 
-Mode = Literal["model", "zoh"]
-Method = Literal["RK45", "DOP853"]
-METHODS: tuple[Method, ...] = ("RK45", "DOP853")
-"""Methods of the integrator: its default, and the fastest at this accuracy."""
-
-ROUNDS = 5
 DRAWS = 200
 """Number of different plants and losses; a batch repeats them."""
-_REPEATED = {"model": 40, "zoh": 8}
+_ENGINE = {"model": 40, "zoh": 8}
+"""Repetitions of the draws in a batch."""
 _INTEGRATED = {"model": 20, "zoh": 3}
 """Runs of the integrator in a round."""
-_FATES = 1000
+_FASTEST = {"model": 20_000.0, "zoh": 3_000.0}
 _AGREEMENT_S = 1e-4
 """Accumulated effect of the integrator's errors of 1e-8 over hundreds of events."""
-_GOALS = {"model": 20_000.0, "zoh": 3_000.0}
 
 
-def drawn(
-    mode: Mode, trigger: Mapping[str, Any] | None = None
-) -> tuple[Setting, Population, NDArray[np.bool_]]:
-    """Return the draws, by default with the paper's trigger, and the fates of the first updates."""
-    scenario = load(find_scenario("lane_following"), ()).model_copy(update={"mode": mode})
-    if trigger is not None:
-        content = scenario.model_dump(mode="json") | {"trigger": trigger}
-        scenario = Scenario.model_validate_json(json.dumps(content))
-
-    def draw(i: int) -> Scenario:
-        return resolve(scenario.model_copy(update={"seeds": SeedsSection(plant=i, loss=i)}))
-
-    resolved = [draw(i) for i in range(DRAWS)]
-    loops = [loop_of(one) for one in resolved]
-    population = Population(
-        np.array([loop.A for loop in loops]),
-        np.array([loop.B for loop in loops]),
-        np.array([loop.x0 for loop in loops]),
-        np.arange(DRAWS, dtype=np.uint64),
-    )
-    fates = [[fate(k) for k in range(_FATES)] for fate in map(network_fates, resolved)]
-    return setting_of(resolved[0]), population, np.array(fates)
+def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
+    """Return draws of the lane example, by default with the paper's trigger."""
+    content = load(find_scenario("lane_following"), ()).model_dump(mode="json", exclude_none=True)
+    changes = {"mode": mode} | ({} if trigger is None else {"trigger": trigger})
+    scenario = validate(content | changes, "lane_following")
+    return setting_of(resolve(scenario)), box_of(scenario).population(0, range(DRAWS))
 
 
 def integrated(
-    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: Method,
+    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: str,
     rtol: float = 1e-8,
 ) -> list[float]:  # fmt: skip
     """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
@@ -109,56 +76,40 @@ def integrated(
         found.append(t_s)
 
 
-def per_s(runs: int, call: Callable[[], object]) -> float:
-    """Return runs per second of this thread's CPU time, on which other load has little effect."""
-    begun_ns = time.thread_time_ns()
-    call()
-    return runs / ((time.thread_time_ns() - begun_ns) * 1e-9)
+def apart_s(found: Vector, expected: list[float]) -> float:
+    """Return the largest difference of event times; infinite if their numbers differ."""
+    same = len(found) == len(expected)
+    return float(np.abs(np.subtract(found, expected)).max()) if same else np.inf
 
 
-def rows_of(mode: Mode) -> list[Row]:
-    """Return the rows of a mode, all sides measured in turn."""
-    setting, population, fates = drawn(mode)
+def rows_of(mode: str) -> list[Row]:
+    """Return the rows of a mode: the engine beside the integrator's default, and its fastest."""
+    setting, population = drawn(mode)
+    rows, events = run_with_events(setting, population)
     draws = [Population(*(part[i : i + 1] for part in population)) for i in range(DRAWS)]
-    batch = Population(*(np.concatenate([part] * _REPEATED[mode]) for part in population))
+    batch = Population(*(np.concatenate([part] * _ENGINE[mode]) for part in population))
     few = range(_INTEGRATED[mode])
-    run_batch(setting, population)
-    apart_s = dict.fromkeys(METHODS, 0.0)
-    for method in METHODS:
-        for i in few:
-            found = run_events(setting, draws[i]).event_s
-            expected = integrated(setting, draws[i], fates[i], method)
-            same = len(found) == len(expected)
-            difference_s = float(np.abs(found - expected).max()) if same else np.inf
-            apart_s[method] = max(apart_s[method], difference_s)
-    ours: list[float] = []
-    scipys: dict[Method, list[float]] = {method: [] for method in METHODS}
+    engine = per_cpu_s(len(batch.A), lambda: run_batch(setting, batch))
+    name, found = f"lane_following, {setting.horizon_s:g} s, {mode}", list[Row]()
+    for method, goal in (("RK45", Goal(">=", 1000)), ("DOP853", None)):
 
-    def integrate(method: Method) -> list[list[float]]:
-        return [integrated(setting, draws[i], fates[i], method) for i in few]
+        def integrate(method: str = method) -> list[list[float]]:
+            # The last event has no fate that matters.
+            fates = [np.append(events[i].delivered, False) for i in few]
+            return [integrated(setting, draws[i], fates[i], method) for i in few]
 
-    for _ in range(ROUNDS):
-        ours.append(per_s(len(batch.A), lambda: run_batch(setting, batch)))
-        for method, figures in scipys.items():
-            figures.append(per_s(len(few), partial(integrate, method)))
-    events = float(run_batch(setting, population)["transmissions"].mean())
-    name = f"lane_following, {setting.horizon_s:g} s, {mode}"
-
-    def ratio(peer: Sequence[float]) -> float:
-        return median(a / b for a, b in zip(ours, peer, strict=True))
-
-    value, note = median(ours), f"{events:.0f} events a run"
-    return [
-        Row(name, value, "runs/s", goal=Goal(">=", _GOALS[mode]), note=note),
-        *(
-            Row(name, value, "runs/s", Peer(f"solve_ivp, {method}, rtol 1e-8", median(figures)),
-                Goal(">=", 1000) if method == METHODS[0] else None,
-                f"event times differ from those of {method} by {apart_s[method]:.1g} s",
-                None if apart_s[method] <= _AGREEMENT_S else "the two do not agree",
-                ratio(figures))
-            for method, figures in scipys.items()
-        ),
-    ]  # fmt: skip
+        error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
+        found.append(
+            compared(
+                name, "runs/s", engine,
+                (f"solve_ivp, {method}, rtol 1e-8", per_cpu_s(len(few), integrate)), goal,
+                note=f"event times differ from those of {method} by {error_s:.1g} s",
+                unjudged=None if error_s <= _AGREEMENT_S else "the two do not agree",
+            )
+        )  # fmt: skip
+    value = median(row.value for row in found if row.value is not None)
+    note = f"{rows['transmissions'].mean():.0f} events a run"
+    return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *found]
 
 
 def rows_of_policies() -> list[Row]:
@@ -166,34 +117,22 @@ def rows_of_policies() -> list[Row]:
 
     If losses can make the events of a policy accumulate, it is only measured with a dwell time.
     """
-    names, triggers = ["decaying"], [None]
+    paper, rows = drawn("model"), []
     for name, settings in POLICIES.items():
         example = settings.example(4)
-        if name != "decaying" and example is not None and not example.events_may_accumulate:
-            triggers.append(example.model_dump(mode="json", exclude_none=True))
-            rule = triggers[-1].get("rule")
-            names.append(name if rule is None else f"{name} of {rule['policy']}")
-    rounds = Rounds()
-    batches = [drawn("model", trigger)[:2] for trigger in triggers]
-    for number in range(-1, ROUNDS):
-        for name, (setting, population) in zip(names, batches, strict=True):
-            speed = per_s(DRAWS, partial(run_batch, setting, population))
-            if number >= 0:
-                rounds.add(name, {"per_s": speed})
-    return [
-        rounds.row(f"model, {name}", "runs/s", "per_s", name, names[0], paired=True)
-        for name in names[1:]
-    ]
+        if name == "decaying" or example is None or example.events_may_accumulate:
+            continue
+        trigger = example.model_dump(mode="json", exclude_none=True)
+        whole = f"{name} of {trigger['rule']['policy']}" if "rule" in trigger else name
+        other = drawn("model", trigger)
+        side, peer = (per_cpu_s(DRAWS, lambda run=run: run_batch(*run)) for run in (other, paper))
+        rows.append(compared(f"model, {whole}", "runs/s", side, ("decaying", peer)))
+    return rows
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure both modes of the paper's policy, and the other policies."""
-    rows: list[Row] = []
-    for mode in ("model", "zoh"):
-        say(mode)
-        rows += rows_of(mode)  # type: ignore[arg-type]
-    say("other policies")
-    return rows + rows_of_policies()
+    return [*rows_of("model"), *rows_of("zoh"), *rows_of_policies()]
 
 
 BENCHMARK = Benchmark("batch", "Exact runs of a batch, one core", measure)

@@ -44,25 +44,16 @@ CLOCKS = [(ahead_s, drift_ppb) for ahead_s in (1, -1) for drift_ppb in (100_000,
 
 
 def measured(
-    hosts: TwoHosts,
-    ahead_s: int,
-    drift_ppb: int,
-    case: Case,
-    *,
-    bare: bool = False,
-    seconds: float = SECONDS,
-    realtime: bool = True,
-    ip: int = 4,
-) -> Figures:
+    hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare: bool = False,
+    seconds: float = SECONDS, realtime: bool = True, ip: int = 4,
+) -> Figures:  # fmt: skip
     """Run a reference and a client on two hosts; return the client's figures.
 
     Raises:
         MeasurementError: one of them failed.
     """
-    program, kind = (
-        (sys.executable, "-m", "benchmarks._time_peers"),
-        ["--bare"] * bare + ["--realtime"] * realtime,
-    )
+    program = (sys.executable, "-m", "benchmarks._time_peers")
+    kind = ["--bare"] * bare + ["--realtime"] * realtime
     host = hosts.addresses[0][ip == 6]
     with subprocess.Popen(
         hosts.inside(0, *program, "reference", host, *kind, *case.reference),
@@ -108,18 +99,17 @@ def measure(options: argparse.Namespace) -> list[Row]:
     ]
     for case, found in ((MAIN, rounds), *others.items()):
         note = f"largest: {max(found.of(OURS, 'error_max_us')):.0f} µs"
-        rows += [
-            found.row(f"error bound, {quantile}, {case.name}", "µs",
-                      f"error_{quantile}_us", OURS, goal=case.goal, note=remark)
-            for quantile, remark in (("p50", None), ("p99", note))
-        ]  # fmt: skip
-    for quantity, unit, name in (
-        ("estimate_p50_us", "µs", "error of the estimate, p50"),
-        ("estimate_p99_us", "µs", "error of the estimate, p99"),
-        ("cpu_us", "µs", "client's CPU per 20 ms"),
-    ):
-        rows.append(rounds.row(name, unit, quantity, OURS, BARE))
-    return rows
+        for q in ("p50", "p99"):
+            name = f"error bound, {q}, {case.name}"
+            rows.append(found.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note))
+    return rows + [
+        rounds.row(name, "µs", quantity, OURS, BARE)
+        for quantity, name in (
+            ("estimate_p50_us", "error of the estimate, p50"),
+            ("estimate_p99_us", "error of the estimate, p99"),
+            ("cpu_us", "client's CPU per 20 ms"),
+        )
+    ]
 
 
 BENCHMARK = Benchmark("clock_offset_bound", "Bound of the offset between two clocks", measure)

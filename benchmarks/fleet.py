@@ -24,8 +24,6 @@ import psutil
 from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from benchmarks.soak.watch import Processes
 from cosim.record.run_directory import LATEST
-from cosim.simulation.virtual_time import simulate_loops
-from noack.config.scenario_file import load
 from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
 
 CAP = 2
@@ -65,11 +63,7 @@ _KIBI = 1024
 _POLL_S = 2.0
 _SINGLE_S = 60.0
 _FLAT_MIB = 32.0
-_BATCH = 50, 10.0
-"""Loops, and seconds, of a run in virtual time."""
-_STEP_US, _MEMORY_MIB, _BATCH_PER_S, _END_SHARE = (
-    Goal("<=", 5), Goal("<=", 80), Goal(">=", 3000), Goal("<=", 0.1),
-)  # fmt: skip
+_STEP_US, _MEMORY_MIB, _END_SHARE = Goal("<=", 5), Goal("<=", 80), Goal("<=", 0.1)
 _LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
 """By the rate of the loops, Hz."""
 _LIBRARIES = "import numpy, zenoh; print(); input()"
@@ -230,28 +224,6 @@ def libraries_mib(count: int) -> float:
     return float(sum(used)) / _KIBI**2
 
 
-def batch(live_step_us: float) -> list[Row]:
-    """Return how many runs of a loop in virtual time are computed a second of CPU time.
-
-    ``live_step_us`` is the CPU time of a step of one of many loops that run live at the same rate.
-    """
-    loops, horizon_s = _BATCH
-    load_ = Load(loops, 50.0, horizon_s)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "fleet.toml"
-        path.write_text(scenario_of(load_))
-        scenario = load(path)
-    begun_s = time.process_time()
-    simulate_loops(scenario)
-    per_s = loops / (time.process_time() - begun_s)
-    live = Peer("live, by CPU time", 1e6 / (live_step_us * horizon_s * load_.rate_hz))
-    name = f"{load_}, in virtual time: loops × runs"
-    return [
-        Row(name, per_s, "/s of CPU", goal=_BATCH_PER_S),
-        Row("the same", per_s, "/s of CPU", live),
-    ]
-
-
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("--fleet-s", type=float, default=60.0, help="length of the runs, seconds")
@@ -274,9 +246,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
                 measured.append(run(one, Path(folder)))
         alone, together = measured
         rows += figures(load_, together, single.step_us(alone))
-        if load_.rate_hz == 50.0:
-            rows += batch(load_.step_us(together))
-        else:
+        if load_.rate_hz != 50.0:
             rows += memory(single, alone)
     return rows
 

@@ -12,13 +12,13 @@ three. A datagram counts as lost if it is dropped, or if a later one arrives bef
 
 import argparse
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._report import Benchmark, Goal, Rounds, Row, say
+from benchmarks._report import Benchmark, Goal, Row, compared, say
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.impairments.loss_prediction import expected_loss
@@ -46,7 +46,7 @@ COMBINATIONS: Mapping[str, Limits] = {
 }
 EXPECTED = ("loss 50% mansd 4", "loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
             "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
-_ROUNDS = 30
+_COSTED, _ROUNDS = 200_000, 30
 CAP = 3
 _LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
 _SPACING_NS = 2_000_000
@@ -57,38 +57,48 @@ class Decider:
 
     def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
         self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
-        self._sizes, self._rows = np.full(_BATCH, 72), np.zeros(_BATCH, np.int64)
-        self._arrivals_ns = np.arange(_BATCH) * spacing_ns
+        columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
+        self._columns = columns
 
     def decide(self, count: int = _BATCH) -> NDArray[Any]:
         """Return the decisions for the first datagrams of the next flow."""
         self._link.start_flow(0, self._flow)
         self._link.core.in_flight = 0
         self._flow += 1
-        columns = (self._rows, self._sizes, self._arrivals_ns)
-        return self._link.decide_many(*(column[:count] for column in columns))
+        return self._link.decide_many(*(column[:count] for column in self._columns))
+
+    def outcomes(self, count: int) -> list[Outcomes]:
+        """Return which datagrams are lost, of several flows."""
+        return [outcomes_of(self.decide()) for _ in range(count // _BATCH)]
+
+    def cost(self) -> Callable[[], float]:
+        """Return what measures nanoseconds per decision."""
+
+        def measured() -> float:
+            begun_ns = time.perf_counter_ns()
+            self.decide(_COSTED)
+            return (time.perf_counter_ns() - begun_ns) / _COSTED
+
+        measured()
+        return measured
 
 
-def check_rows(words: str, limits: Limits, count: int) -> list[Row]:
+def check_row(words: str, limits: Limits, count: int) -> Row:
     """Return the violations in a number of decisions."""
     say(f"{count:,} decisions, {words}")
-    decider, found, lost = Decider(f"{words} limit 1000000"), 0, 0
-    for _ in range(count // _BATCH):
-        outcomes = outcomes_of(decider.decide())
-        found, lost = found + violations(outcomes, limits), lost + int(outcomes.sum())
-    note = f"{count:,} decisions, {lost / count:.2%} lost"
-    return [Row(f"{words}: violations", found, "", goal=Goal("==", 0), note=note)]
+    flows = Decider(f"{words} limit 1000000").outcomes(count)
+    note = f"{count:,} decisions, {np.mean(flows):.2%} lost"
+    found = sum(violations(lost, limits) for lost in flows)
+    return Row(f"{words}: violations", found, "", goal=Goal("==", 0), note=note)
 
 
 def expected_row(words: str, count: int) -> Row:
     """Return the realised loss rate beside the expected one, which may be asked for (keep)."""
     say(f"{count:,} decisions, {words}")
-    decider, lost = Decider(words), 0
-    for _ in range(count // _BATCH):
-        lost += int(outcomes_of(decider.decide()).sum())
+    share = float(np.mean(Decider(words).outcomes(count)))
     expected = expected_loss(settings_of(words)).rate or 0.0
-    error = 100 * abs(lost / count - expected)
-    note = f"{count:,} decisions: {lost / count:.4%} lost, {expected:.4%} expected"
+    note = f"{count:,} decisions: {share:.4%} lost, {expected:.4%} expected"
+    error = 100 * abs(share - expected)
     return Row(f"{words}: error", error, "% of all", goal=Goal("<=", 0.1), note=note)
 
 
@@ -119,76 +129,64 @@ def violations(lost: Outcomes, limits: Limits) -> int:
     return found + int(np.count_nonzero((gaps > 0) & (gaps < limits.recovery)))
 
 
-def plain_cap(words: str) -> str:
-    """Return the words of the plain cap that allows as many consecutive losses."""
-    return f"mansd {settings_of(words).longest_burst}"
-
-
-def cost_rows() -> list[Row]:
-    """Return the time per decision beside that of the plain cap."""
-    rounds = Rounds()
-    for before in ("loss 50%", f"loss 50% {_REORDERING}"):
-        every = dict.fromkeys([*COMBINATIONS, *map(plain_cap, COMBINATIONS)])
-        deciders = {words: Decider(f"{before} {words} limit 1000000") for words in every}
-        for number in range(-1, _ROUNDS):
-            for words, decider in deciders.items():
-                begun_s = time.perf_counter()
-                decider.decide(200_000)
-                spent_ns = 1e9 * (time.perf_counter() - begun_s) / 200_000
-                if number >= 0:
-                    rounds.add(f"{before} {words}", {"decision_ns": spent_ns})
-    return [
-        rounds.row(
-            f"{before} {words}: decision", "ns", "decision_ns", f"{before} {words}",
-            f"{before} {plain_cap(words)}", Goal("<=", 1.3), paired=True,
-        )
-        for before in ("loss 50%", f"loss 50% {_REORDERING}")
-        for words in COMBINATIONS if words != plain_cap(words)
-    ]  # fmt: skip
-
-
-def networks() -> dict[str, NDArray[Any]]:
-    """Return the decisions of the three networks."""
-    free = Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy()
-    drops = Decider(f"{_LOSS} mansd {CAP}", _SPACING_NS).decide()["release_ns"] < 0
-    unlost = Decider(_DELAY, _SPACING_NS).decide().copy()
-    unlost["release_ns"][drops] = -1
-    kept = Decider(f"{_LOSS} {_DELAY} mansd {CAP}", _SPACING_NS).decide().copy()
-    return {
-        "no cap": free,
-        f"cap {CAP} on drops only": unlost,
-        f"mansd {CAP}": kept,
-    }
+def cost_row(before: str, words: str, cap: str) -> Row:
+    """Return the time per decision beside that of the plain cap with as many consecutive losses."""
+    ours, plain = (Decider(f"{before} {one} limit 1000000").cost() for one in (words, cap))
+    return compared(
+        f"{before} {words}: decision", "ns", ours, (f"{before} {cap}", plain), Goal("<=", 1.3),
+        rounds=_ROUNDS,
+    )  # fmt: skip
 
 
 def network_rows() -> list[Row]:
-    """Return the losses at the receiver of each network."""
+    """Return the losses at the receiver of three networks."""
+    held = f"mansd {CAP}"
+    drops = Decider(f"{_LOSS} {held}", _SPACING_NS).decide()["release_ns"] < 0
+    capped = Decider(_DELAY, _SPACING_NS).decide().copy()
+    capped["release_ns"][drops] = -1
+    networks = {
+        "no cap": Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy(),
+        f"cap {CAP} on drops only": capped,
+        held: Decider(f"{_LOSS} {_DELAY} {held}", _SPACING_NS).decide(),
+    }
     rows = []
-    for name, decisions in networks().items():
+    for name, decisions in networks.items():
         lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
         ends = np.flatnonzero(np.concatenate([[True], ~lost, [True]]))
-        goal = Goal("<=", CAP) if name.startswith("mansd") else None
+        goal = Goal("<=", CAP) if name == held else None
         rows += [
             Row(f"{name}: dropped", 100 * float(dropped.mean()), "%"),
             Row(f"{name}: dropped or out of order", 100 * float(lost.mean()), "%"),
             Row(f"{name}: longest loss burst", int(np.diff(ends).max()) - 1, "", goal=goal),
         ]
-        if name.startswith("mansd"):
-            delay_ns = decisions["hold_back_ns"][decisions["hold_back_ns"] > 0]
-            rows.append(Row(f"{name}: held back", 100 * len(delay_ns) / len(lost), "%"))
-            rows.append(
-                Row(f"{name}: held back by, median", float(np.median(delay_ns)) / 1e6, "ms")
-            )
-    return rows
+    back_ns = networks[held]["hold_back_ns"]
+    back_ns = back_ns[back_ns > 0]
+    return [
+        *rows,
+        Row(f"{held}: held back", 100 * len(back_ns) / _BATCH, "%"),
+        Row(f"{held}: held back by, median", float(np.median(back_ns)) / 1e6, "ms"),
+    ]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure costs and networks, then violations, then loss rates."""
-    rows = [*cost_rows(), *network_rows()]
-    for words, limits in COMBINATIONS.items():
-        rows += check_rows(f"loss 50% {words}", limits, DECISIONS)
-        rows += check_rows(f"loss 30% {_REORDERING} {words}", limits, DECISIONS)
-    return rows + [expected_row(words, DECISIONS // 5) for words in EXPECTED]
+    caps = {words: f"mansd {settings_of(words).longest_burst}" for words in COMBINATIONS}
+    befores = ("loss 50%", f"loss 50% {_REORDERING}")
+    return [
+        *(
+            cost_row(before, *pair)
+            for before in befores
+            for pair in caps.items()
+            if len({*pair}) > 1
+        ),
+        *network_rows(),
+        *(
+            check_row(f"{before} {words}", limits, DECISIONS)
+            for words, limits in COMBINATIONS.items()
+            for before in ("loss 50%", f"loss 30% {_REORDERING}")
+        ),
+        *(expected_row(words, DECISIONS // 5) for words in EXPECTED),
+    ]
 
 
 BENCHMARK = Benchmark("guarantee", "Emulator: the guarantee over many decisions", measure)

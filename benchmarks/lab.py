@@ -6,6 +6,7 @@ graphics card the browser draws by the processor, which is the worst case.
 """
 
 import argparse
+import itertools
 import json
 import shutil
 import signal
@@ -27,24 +28,11 @@ ROUNDS = 3
 HORIZON_S = 10.0
 ALONE, OPEN = "run without the page", "page open"
 DRAGGED, VIEWED = "a slider moves", "viewer open"
-_LARGEST = Goal("<=", 1.2)
 _SETTINGS = ("--set", f"horizon_s={HORIZON_S}")
 _PATIENCE_S = 120.0
 _MOVE_S = 0.05
+_KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
 _SLIDER = "document.querySelector('.q-slider[aria-label=\"loss probability\"] [tabindex]')"
-
-
-def alone() -> Figures:
-    """Run without the page."""
-    return _lateness(noack("run", "lane_following", *_SETTINGS).summary)
-
-
-def _lateness(summary: dict[str, Any]) -> Figures:
-    if summary["exit"]["status"] != 0:
-        raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
-    return {
-        role: summary["loops"][0]["lateness_us"][role]["p99"] for role in ("plant", "controller")
-    }
 
 
 class _Page:
@@ -72,7 +60,7 @@ class _Page:
     def move(self, until: threading.Event) -> None:
         """Move a slider to and fro."""
         self.js(f"{_SLIDER}.focus()")
-        for key, code in _to_and_fro():
+        for key, code in itertools.cycle(_KEYS):
             if until.wait(_MOVE_S):
                 return
             for kind in ("rawKeyDown", "keyUp"):
@@ -88,12 +76,6 @@ class _Page:
             )
             time.sleep(0.5)
         self.wait(f"document.body.innerText.includes('ended: {HORIZON_S} of')")
-
-
-def _to_and_fro() -> Iterator[tuple[str, int]]:
-    while True:
-        yield from 20 * [("ArrowLeft", 37)]
-        yield from 20 * [("ArrowRight", 39)]
 
 
 @contextmanager
@@ -115,50 +97,48 @@ def _opened(folder: Path) -> Iterator[_Page]:
         server.wait()
 
 
-def resting() -> Figures:
-    """Run while the page is open."""
-    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder, _opened(Path(folder)):
-        return alone()
-
-
-def dragged() -> Figures:
-    """Run while a slider of the page moves."""
-    with (
-        tempfile.TemporaryDirectory(prefix="noack-bench-") as folder,
-        _opened(Path(folder)) as page,
-    ):
-        ended = threading.Event()
-        mover = threading.Thread(target=page.move, args=(ended,))
-        mover.start()
-        try:
-            return alone()
-        finally:
-            ended.set()
-            mover.join()
-
-
-def viewed() -> Figures:
-    """Run by the page, which shows the viewer."""
-    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
-        with _opened(Path(folder)) as page:
+def summary_of(side: str, folder: Path) -> dict[str, Any]:
+    """Run a side; return the summary."""
+    arguments = ("run", "lane_following", *_SETTINGS)
+    if side == ALONE:
+        return noack(*arguments).summary
+    with _opened(folder) as page:
+        if side == VIEWED:
             page.run_live()
-        summary = Path(folder) / "runs/latest/summary.json"
-        return _lateness(json.loads(summary.read_text(encoding="utf-8")))
+        else:
+            ended = threading.Event()
+            mover = threading.Thread(target=page.move, args=(ended,))
+            if side == DRAGGED:
+                mover.start()
+            try:
+                return noack(*arguments).summary
+            finally:
+                ended.set()
+                if side == DRAGGED:
+                    mover.join()
+    found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
+    return found
 
 
-_SIDES = ((ALONE, alone), (OPEN, resting), (DRAGGED, dragged), (VIEWED, viewed))
+def lateness(side: str) -> Figures:
+    """Return the lateness of plant and controller, p99, µs."""
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+        summary = summary_of(side, Path(folder))
+    if summary["exit"]["status"] != 0:
+        raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
+    late = summary["loops"][0]["lateness_us"]
+    return {role: late[role]["p99"] for role in ("plant", "controller")}
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure all sides in turn."""
-    rounds = Rounds()
-    for i in range(ROUNDS):
-        for side, ran in _SIDES:
-            say(f"round {i + 1} of {ROUNDS}: {side}")
-            rounds.add(side, ran())
+    rounds, sides, goal = Rounds(), (ALONE, OPEN, DRAGGED, VIEWED), Goal("<=", 1.2)
+    for i, side in itertools.product(range(ROUNDS), sides):
+        say(f"round {i + 1} of {ROUNDS}: {side}")
+        rounds.add(side, lateness(side))
     return [
-        rounds.row(f"{role} lateness, p99, {side}", "µs", role, side, ALONE, _LARGEST, paired=True)
-        for side, _ in _SIDES[1:]
+        rounds.row(f"{role} lateness, p99, {side}", "µs", role, side, ALONE, goal, paired=True)
+        for side in sides[1:]
         for role in ("plant", "controller")
     ]
 

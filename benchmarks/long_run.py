@@ -24,8 +24,6 @@ from benchmarks._runs import execute
 
 LENGTHS_S = (120.0, 600.0)
 """Both are replayed in a process of its own; a shorter run is not."""
-MOST_MIB = Goal("<=", 300)
-LEAST_SPEED, LEAST_REPLAY_SPEED = Goal(">=", 200), Goal(">=", 2000)
 
 
 class End(NamedTuple):
@@ -43,6 +41,7 @@ def end_of(horizon_s: float, folder: Path) -> End:
     Raises:
         MeasurementError: a step failed.
     """
+    say(f"a run of {horizon_s:g} s")
     arguments = ["-m", "benchmarks._spooled_run", f"{horizon_s:g}", str(folder)]
     run_dir = Path(execute([sys.executable, *arguments]).stdout.strip())
     begun_s = time.monotonic()
@@ -64,20 +63,22 @@ def end_of(horizon_s: float, folder: Path) -> End:
 def rows_of(ends: Mapping[float, End]) -> list[Row]:
     """Return the rows from the ends of runs, by length in s."""
     shortest_s, longest_s = min(ends), max(ends)
-    short, long = ends[shortest_s], ends[longest_s]
-    # Start and end of the program cost the same for every length.
-    more_s, length_s = max(long.wall_s - short.wall_s, 1e-9), longest_s - shortest_s
-    more_cpu_s = max(long.cpu_s - short.cpu_s, 1e-9)
-    replay_s = max(long.phases_s[REPLAY] - short.phases_s[REPLAY], 1e-9)
+    short, long, length_s = ends[shortest_s], ends[longest_s], longest_s - shortest_s
+
+    def speed(name: str, more_s: float, goal: Goal | None = None, note: str = "") -> Row:
+        # Start and end of the program cost the same for every length.
+        return Row(name, length_s / max(more_s, 1e-9), "×", goal=goal, note=note or None)
+
     return [
-        Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=MOST_MIB),
+        Row(f"peak memory, end of {longest_s:g} s", long.peak_mib, "MiB", goal=Goal("<=", 300)),
         Row("the same, against a short run", long.peak_mib, "MiB",
             Peer(f"end of {shortest_s:g} s", short.peak_mib)),
         Row(f"end of {longest_s:g} s", long.wall_s, "s"),
-        Row("speed of the end, as a multiple of real time", length_s / more_s,
-            "×", note="of the additional length, replay beside the rest"),
-        Row("the same, by CPU time of all processes", length_s / more_cpu_s, "×", goal=LEAST_SPEED),
-        Row("of it, the replay", length_s / replay_s, "×", goal=LEAST_REPLAY_SPEED),
+        speed("speed of the end, as a multiple of real time", long.wall_s - short.wall_s,
+              note="of the additional length, replay beside the rest"),
+        speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200)),
+        speed("of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY],
+              Goal(">=", 2000)),
         *(
             Row(f"phase: {phase}, per hour of the run",
                 3600 * (took_s - short.phases_s.get(phase, 0.0)) / length_s, "s")
@@ -88,12 +89,9 @@ def rows_of(ends: Mapping[float, End]) -> list[Row]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Complete runs of several lengths."""
-    ends = {}
     with tempfile.TemporaryDirectory(prefix="noack-long-run-") as folder:
-        for horizon_s in options.long_run or LENGTHS_S:
-            say(f"a run of {horizon_s:g} s")
-            ends[horizon_s] = end_of(horizon_s, Path(folder))
-    return rows_of(ends)
+        lengths_s = options.long_run or LENGTHS_S
+        return rows_of({length_s: end_of(length_s, Path(folder)) for length_s in lengths_s})
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,43 +22,34 @@ from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 
 ROUNDS = 3
-HORIZON_S = 9.0
-FAULT_S = 2.5
-STOPPED_S = 0.7
+FAULT_S, STOPPED_S = 2.5, 0.7
+SETTINGS = ("horizon_s=9", "recovery.rejoin_within_s=30")
 IMPORT = "Python that imports as much"
 
 
-def suffer(role: str, fault: Callable[[psutil.Process], float]) -> tuple[FaultedRun[float], float]:
+def faulted(
+    role: str, fault: Callable[[psutil.Process], object]
+) -> tuple[FaultedRun[float], float]:
     """Run with a fault of a process; return the run, and the fault's end in time of the run.
-
-    Args:
-        role: the process.
-        fault: returns the time of its end on the monotonic clock.
 
     Raises:
         MeasurementError: the run failed.
     """
+    say(f"{role}: {fault.__name__}")
 
-    def of_role(processes: Processes) -> float:
-        return fault(processes[role])
+    def act(processes: Processes) -> float:
+        fault(processes[role])
+        return time.monotonic()
 
-    settings = [f"horizon_s={HORIZON_S}", "recovery.rejoin_within_s=30"]
-    run = faulted_run(role, settings, FAULT_S, of_role)
+    run = faulted_run(role, SETTINGS, FAULT_S, act)
     return run, run.outcome - run.epoch_s
 
 
-def kill(process: psutil.Process) -> float:
-    """Kill a process."""
-    process.kill()
-    return time.monotonic()
-
-
-def stop(process: psutil.Process) -> float:
+def stop(process: psutil.Process) -> None:
     """Stop a process, and continue it after 0.7 s."""
     process.send_signal(signal.SIGSTOP)
     time.sleep(STOPPED_S)
     process.send_signal(signal.SIGCONT)
-    return time.monotonic()
 
 
 def killed(role: str) -> Figures:
@@ -69,7 +60,7 @@ def killed(role: str) -> Figures:
         controller had an update again; ``unwritten_ms``: age of the last recorded row of the
         killed process at its death.
     """
-    run, at_s = suffer(role, kill)
+    run, at_s = faulted(role, psutil.Process.kill)
     before, after = run.record.lives(role)
     if before.last_ns is None or after.first_ns is None:
         raise MeasurementError(f"{role}: has no rows before or after")
@@ -88,25 +79,17 @@ def killed(role: str) -> Figures:
     }
 
 
-def stopped_ms(role: str) -> float:
-    """Stop a process for 0.7 s; return the wall time from then to the last late step of all."""
-    run, at_s = suffer(role, stop)
-    return 1e3 * run_recovery_s(run.record, at_s)
-
-
 def imported_s(role: str) -> float:
     """Return wall seconds from the start of a Python to the end of a process's imports."""
-    module = MODULES[role]
-    command = [sys.executable, "-c", f"import {module}, sys; print('ready', file=sys.stderr)"]
-    finished = execute(command)
+    code = f"import {MODULES[role]}, sys; print('ready', file=sys.stderr)"
+    finished = execute([sys.executable, "-c", code])
     return finished.lines[-1].at_s - finished.begun_s
 
 
 def killed_rows(role: str) -> list[Row]:
     """Kill a process several times; return the rows."""
     rounds = Rounds()
-    for number in range(ROUNDS):
-        say(f"{role} killed, round {number + 1} of {ROUNDS}")
+    for _ in range(ROUNDS):
         rounds.add(role, killed(role))
         rounds.add(IMPORT, dict.fromkeys(("acted_s", "updated_s"), imported_s(role)))
     row = partial(rounds.row, ours=role)
@@ -125,8 +108,7 @@ def recorder_row() -> Row:
     Raises:
         MeasurementError: it was not restarted, or rows are missing.
     """
-    say("recorder killed")
-    run, at_s = suffer("recorder", kill)
+    run, at_s = faulted("recorder", psutil.Process.kill)
     steps = run.record[PLANT_STEP]["sequence"]
     if run.back_s is None or len(steps) != steps[-1] + 1:
         raise MeasurementError("recorder: it was not restarted, or rows are missing")
@@ -136,15 +118,20 @@ def recorder_row() -> Row:
     )  # fmt: skip
 
 
+def stopped_row(role: str) -> Row:
+    """Stop a process several times; return the time from its end to the last late step of all."""
+    runs = [faulted(role, stop) for _ in range(ROUNDS)]
+    late_ms = median(1e3 * run_recovery_s(run.record, at_s) for run, at_s in runs)
+    return Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms")
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     """Kill and stop each process, several times."""
-    rows = [row for role in ("sensor", "controller", "netem") for row in killed_rows(role)]
-    rows.append(recorder_row())
-    for role in ("plant", "sensor", "netem", "controller", "recorder"):
-        say(f"{role} stopped")
-        late_ms = median([stopped_ms(role) for _ in range(ROUNDS)])
-        rows.append(Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms"))
-    return rows
+    return [
+        *(row for role in ("sensor", "controller", "netem") for row in killed_rows(role)),
+        recorder_row(),
+        *map(stopped_row, ("plant", "sensor", "netem", "controller", "recorder")),
+    ]
 
 
 BENCHMARK = Benchmark("recovery", "A run whose processes die or stop", measure)

@@ -2,9 +2,10 @@
  *
  * Receives up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
  * socket, to one destination on loopback. With "segment", successive datagrams of equal size are
- * sent as one message, which the kernel segments (UDP_SEGMENT). With "paths", each source has a
- * connected socket of its own, which the last 16 bits of its address select, and whose answers go
- * back to the source: as in our relay, epoll waits for them. Prints its listening port.
+ * sent as one message, which the kernel segments (UDP_SEGMENT). With "names", it also receives the
+ * sources' addresses, and ignores them. With "paths", each source has a connected socket of its
+ * own, which the last 16 bits of its address select, and whose answers go back to the source: as in
+ * our relay, epoll waits for them. Prints its listening port.
  */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -145,12 +146,16 @@ int main(int argc, char **argv)
     socklen_t length = sizeof here;
     int in = socket(AF_INET, SOCK_DGRAM, 0), out = socket(AF_INET, SOCK_DGRAM, 0);
     int bytes = BUFFER_BYTES;
-    bool segment = argc == 3 && strcmp(argv[2], "segment") == 0;
-    bool by_path = argc == 3 && strcmp(argv[2], "paths") == 0;
+    bool segment = false, by_path = false, with_names = false;
     struct rlimit files;
 
-    if (argc != 2 && !segment && !by_path) {
-        fprintf(stderr, "usage: %s PORT [segment | paths]\n", argv[0]);
+    for (int k = 2; k < argc; k++) {
+        segment |= strcmp(argv[k], "segment") == 0;
+        by_path |= strcmp(argv[k], "paths") == 0;
+        with_names |= strcmp(argv[k], "names") == 0;
+    }
+    if (argc < 2) {
+        fprintf(stderr, "usage: %s PORT [segment] [names] | PORT paths\n", argv[0]);
         return 2;
     }
     if (getrlimit(RLIMIT_NOFILE, &files) == 0) {
@@ -177,7 +182,9 @@ int main(int argc, char **argv)
     if (by_path)
         relay_paths(in, &there);
     for (;;) {
-        int taken = receive(in, MSG_WAITFORONE, false);
+        int taken = receive(in, MSG_WAITFORONE, with_names);
+        for (int k = 0; k < taken; k++)
+            batch[k].msg_hdr.msg_name = NULL; /* sent to where the socket is connected */
         if (segment)
             forward_segments(out, taken);
         else

@@ -11,6 +11,7 @@ median over rounds of the ratio within a round.
 
 import argparse
 from contextlib import ExitStack
+from typing import Literal
 
 from benchmarks import _relay_process as relay_process
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, on_core, scheduled
@@ -25,6 +26,9 @@ OURS = {
     PLAIN: Ours(WORDS),
     SEGMENTS: Ours(WORDS, segment=True),
 }
+C_MODES: tuple[tuple[Literal["segment", "names"], ...], ...] = (
+    (), ("segment",), ("names",), ("segment", "names"),
+)  # fmt: skip
 DIRECT = "direct, no relay"
 RATES = (
     (PLAIN, "socat", Goal(">=", 2)),
@@ -32,6 +36,8 @@ RATES = (
     (SEGMENTS, "socat", Goal(">=", 5)),
     (PLAIN, DIRECT, None),
     (SEGMENTS, "C relay, segments", Goal(">=", 0.97)),
+    (PLAIN, "C relay, senders' addresses", None),
+    (SEGMENTS, "C relay, segments, senders' addresses", None),
 )
 COSTS = (
     (PLAIN, "socat"),
@@ -61,8 +67,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {
             "socat": relay_process.socat(),
-            "C relay": relay_process.c_relay(tools),
-            "C relay, segments": relay_process.c_relay(tools, "segment"),
+            **{kind.name: kind for kind in (relay_process.c_relay(tools, *one) for one in C_MODES)},
             **{name: relay_process.our_relay(name, ours) for name, ours in OURS.items()},
         }
         relays = relay_process.start_all(kinds, tools, stack, rounds)

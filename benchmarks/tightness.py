@@ -6,6 +6,7 @@ in the norm that ``noack certify --weight chosen`` finds for the paper's trigger
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,21 +48,17 @@ def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, An
         {"policy": "quadratic", "Q": Q.tolist(), "epsilon": delta**2, "period_s": _PERIOD_S} | W,
         {"policy": "send_on_area", "delta_s": delta * _PERIOD_S} | W,
         {"policy": "periodic", "period_s": _PERIOD_S} | W,
-        {
-            "policy": "self_triggered", "growth_per_s": 1.0, "mismatch_per_s": 1.0,
-            "shortest_s": _PERIOD_S, "longest_s": _DEADLINE_S,
-        } | paper | W,
+        {"policy": "self_triggered", "growth_per_s": 1.0, "mismatch_per_s": 1.0,
+         "shortest_s": _PERIOD_S, "longest_s": _DEADLINE_S} | paper | W,
         deadline | {"rule": absolute},
         {"policy": "dwell", "interval_s": _PERIOD_S, "rule": absolute},
         deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
         deadline | {"rule": dynamic | W},
     ]  # fmt: skip
-    return {_name(one): one for one in found}
-
-
-def _name(trigger: Mapping[str, Any]) -> str:
-    rule = trigger.get("rule")
-    return trigger["policy"] if rule is None else f"{trigger['policy']}({rule['policy']})"
+    return {
+        one["policy"] + (f"({one['rule']['policy']})" if "rule" in one else ""): one
+        for one in found
+    }
 
 
 def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
@@ -79,17 +76,14 @@ def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
 def rows_of(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> list[Row]:
     """Search one loop under one policy."""
     name = f"{loop.name}, {policy}"
+    say(name)
     content = loop.model_dump(mode="json", exclude_none=True) | {"trigger": trigger}
     resolved = resolve(validate(content, name))
     certificate = certify(resolved, conditions_of(resolved, continuous=False))
     if certificate.void is not None:
         return [Row(name, None, "", note=f"no certificate: {certificate.void}")]
-    return [
-        row_of(
-            name, find_worst(resolved, one, most_nodes=NODES, beam=BEAM, certificate=certificate)
-        )
-        for one in QUANTITIES
-    ]
+    search = partial(find_worst, resolved, most_nodes=NODES, beam=BEAM, certificate=certificate)
+    return [row_of(name, search(objective)) for objective in QUANTITIES]
 
 
 def row_of(name: str, worst: Worst) -> Row:
@@ -111,7 +105,6 @@ def measure(options: argparse.Namespace) -> list[Row]:
         paper = loop.decaying.model_dump(include={"beta", "alpha_per_s", "floor"})
         for policy, trigger in triggers(paper, np.array(loop.decaying.weight)).items():
             if policy in (options.policy or (policy,)):
-                say(f"{name}, {policy}")
                 rows += rows_of(loop, policy, trigger)
     return rows
 

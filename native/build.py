@@ -10,12 +10,14 @@ import hashlib
 import importlib.util
 import io
 import os
+import platform
 import shlex
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -24,8 +26,9 @@ HERE = Path(__file__).resolve().parent
 INTO = HERE.parent / "noack" / "core"
 LIBRARY, HEADER = "libnoack.so", "_core_header.py"
 _SCRATCH = ".building-"
-_SIZES = "sizes"
-"""Folder of the files that take the longest; they are begun first."""
+_STATES = "states.c"
+"""The exact simulator's code for a fixed number of states; it is compiled for each of these:"""
+_SIZES = (64, 16, 8, 4, 3, 2)
 NO_COMPILER = 3
 """Exit status if there is no C compiler."""
 # No contraction of a·b + c: results have the same bits on every processor.
@@ -73,17 +76,18 @@ def declarations() -> str:
     return (HERE / "noack.h").read_text() + "const char *noack_sources(void);\n"
 
 
-def is_current(into: Path = INTO) -> bool:
-    """Return whether a folder has library and declarations of the present sources."""
-    library, header, digest = into / LIBRARY, into / HEADER, _digest().encode()
-    return all(file.exists() and digest in file.read_bytes() for file in (library, header))
+def is_current(into: Path = INTO, files: Sequence[str] = (LIBRARY, HEADER)) -> bool:
+    """Return whether a folder has files of the present sources."""
+    digest = _digest().encode()
+    paths = [into / name for name in files]
+    return all(path.exists() and digest in path.read_bytes() for path in paths)
 
 
-def build(into: Path = INTO, *more_flags: str) -> bool:
+def build(into: Path = INTO, *more_flags: str, library_alone: bool = False) -> bool:
     """Build library and declarations into a folder; return whether anything had changed.
 
     Each file is replaced as a whole, and one build waits for another. Both files contain the digest
-    of the sources: the loader compares them.
+    of the sources: the loader compares them. The declarations need cffi, the library does not.
 
     Raises:
         NoCompilerError: there is no C compiler.
@@ -93,17 +97,20 @@ def build(into: Path = INTO, *more_flags: str) -> bool:
     folder = os.open(into, os.O_RDONLY)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
-        if is_current(into):
+        files = [LIBRARY] if library_alone else [LIBRARY, HEADER]
+        if not (missing := [name for name in files if not is_current(into, [name])]):
             return False
         for left in into.glob(f"{_SCRATCH}*"):  # by a build that was killed
             shutil.rmtree(left)
         with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=into) as name:
             scratch = Path(name)
-            print("building the core in C ...", flush=True)
-            _compile(scratch, more_flags)
-            _write_declarations(scratch)
-            (scratch / LIBRARY).replace(into / LIBRARY)
-            (scratch / HEADER).replace(into / HEADER)
+            if LIBRARY in missing:
+                print("building the core in C ...", flush=True)
+                _compile(scratch, more_flags)
+            if HEADER in missing:
+                _write_declarations(scratch)
+            for file in missing:
+                (scratch / file).replace(into / file)
         for old in into.glob(f"__pycache__/{Path(HEADER).stem}.*"):  # maybe of the same second
             old.unlink(missing_ok=True)
         return True
@@ -119,19 +126,32 @@ def _compile(into: Path, more_flags: tuple[str, ...]) -> None:
         f'const char *noack_sources(void) {{ return "{_digest()}"; }}\n'
     )
 
-    def compile_one(file: Path) -> str:
-        result = into / "-".join(file.with_suffix(".o").parts[-3:])
-        # Code for a fixed number of states takes half the time to compile, and as long to run.
-        flags = [*FLAGS, *(("-O2",) if file.parent.name == _SIZES else ()), *more_flags]
-        subprocess.run([*command, *flags, "-c", str(file), "-o", str(result)], check=True)
-        return str(result)
+    def compile_one(unit: tuple[int, tuple[Path, tuple[str, ...]]]) -> str:
+        number, (file, own) = unit
+        result = str(into / f"{file.stem}-{number}.o")
+        subprocess.run(
+            [*command, *FLAGS, *own, *more_flags, "-c", str(file), "-o", result], check=True
+        )
+        return result
 
-    files = sorted((*sources(), digest), key=lambda file: file.parent.name != _SIZES)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        objects = [*pool.map(compile_one, files)]
+        objects = [*pool.map(compile_one, enumerate([*_units(), (digest, ())]))]
     library = str(into / LIBRARY)
     command += [*FLAGS, *more_flags, "-shared", *objects, "-lm", "-o", library]
     subprocess.run(command, check=True)
+
+
+def _units() -> list[tuple[Path, tuple[str, ...]]]:
+    """Return the files to compile, each with its own flags; those that take longest are first."""
+    states = HERE / "exact" / _STATES
+    sizes: list[tuple[str, ...]] = [(f"-DN={size}",) for size in _SIZES]
+    if platform.machine() in ("x86_64", "AMD64"):  # two sizes for processors without AVX2 and FMA
+        fused = [(*size, "-DFUSED", "-mavx2", "-mfma") for size in sizes]
+        sizes = [*fused, ("-DN=64",), ("-DN=3",)]
+    return [
+        *((states, flags) for flags in sizes),
+        *((file, ()) for file in sources() if file != states),
+    ]
 
 
 def _write_declarations(into: Path) -> None:
@@ -162,6 +182,9 @@ def main() -> int:
     parser.add_argument(
         "--sanitized", action="store_true", help="with ASan and UBSan; needs --into"
     )
+    parser.add_argument(
+        "--library", action="store_true", help="only the library: before cffi is installed"
+    )
     given = parser.parse_args()
     if given.sanitized and given.into == INTO:
         parser.error("--sanitized: noack cannot load this library; give another folder by --into")
@@ -170,7 +193,8 @@ def main() -> int:
             with tempfile.TemporaryDirectory() as scratch:
                 _compile(Path(scratch), ("-Werror",))
         else:
-            build(given.into, *(SANITIZERS if given.sanitized else ()))
+            flags = SANITIZERS if given.sanitized else ()
+            build(given.into, *flags, library_alone=given.library)
     except NoCompilerError as error:
         print(error, file=sys.stderr)
         return NO_COMPILER

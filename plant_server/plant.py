@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
+from noack.config.sections import PlantSection
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, reals_at
@@ -161,6 +162,7 @@ class Plant:
         measuring: the measurement model; None if y = x.
         reports_inputs: whether a measurement also carries the inputs of the steps since the last
             measurement. These are the latched inputs, without the disturbance.
+        section: the scenario's table of it, by which loops with the same plant are known.
     """
 
     system: PlantSystem
@@ -174,6 +176,7 @@ class Plant:
     disturbance: Disturbance | None = None
     measuring: MeasurementModel | None = None
     reports_inputs: bool = False
+    section: PlantSection | None = None
 
     role = PLANT
     schedule = None
@@ -300,10 +303,14 @@ def _part(resolved: Scenario) -> Plant:
         disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
+        section=resolved.plant,
     )
 
 
 def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
+    is_repeated = isinstance(plant.system, LinearSystem) and resolved.plant is plant.section
+    if is_repeated and plant.disturbance is None and plant.measuring is None:
+        return plant
     return replace(
         plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),

@@ -9,8 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks._report import MeasurementError
-from benchmarks.soak.result import print_result
-from benchmarks.soak.run import PICTURE_FILE, soak
+from benchmarks.soak.run import print_result, soak
 from noack.config.scenario_file import load
 from noack.core.errors import NoackError
 
@@ -21,7 +20,19 @@ _LEAST_MINUTES = 0.2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the soak; return 0 if all memory was flat and no claim was violated."""
-    options = _options(arguments)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.soak",
+        description="Run the loop for an hour at speed 1, then for a day of simulated time in half "
+        "an hour, and watch it: memory, descriptors and threads must stay flat, every claim must "
+        "hold.",
+    )
+    add = parser.add_argument
+    add("kinds", nargs="*", metavar="KIND", choices=[[], *KINDS], help=f"of {', '.join(KINDS)}")
+    add("--minutes", type=_minutes, metavar="M", help="a shorter one; of the first kind only")
+    add("--json", type=Path, metavar="FILE", help="write all figures to FILE")
+    add("--runs", type=Path, default=Path("runs"), help="where runs are kept")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a value")
+    options = parser.parse_args(arguments)
     console = Console()
     if not console.is_terminal:
         console.width = _TABLE_WIDTH
@@ -38,7 +49,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"soak: {error}", file=sys.stderr)
             return 2
         print_result(console, result)
-        print(f"picture: {result.run_dir}/{PICTURE_FILE}")
         results.append(result.as_json())
         status |= bool(result.faults)
     if options.json is not None:
@@ -46,32 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.soak",
-        description="Run the loop for an hour at speed 1, then for a day of simulated time in half "
-        "an hour, and watch it: memory, descriptors and threads must stay flat, every claim must "
-        "hold.",
-    )
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}")
-    parser.add_argument(
-        "--minutes", type=_minutes, metavar="M", help="a shorter one; of the first kind only"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures to FILE")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where runs are kept")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE",
-                        help="replace a value of the scenario")  # fmt: skip
-    options = parser.parse_args(arguments)
-    if unknown := [kind for kind in options.kinds if kind not in KINDS]:
-        parser.error(f"no soak is called {unknown[0]!r}; there are {', '.join(KINDS)}")
-    return options
-
-
 def _minutes(text: str) -> float:
-    try:
-        minutes = float(text)
-    except ValueError:
-        minutes = 0.0
+    minutes = float(text)
     if not _LEAST_MINUTES <= minutes <= 1e4:
         raise argparse.ArgumentTypeError(f"must be a number of at least {_LEAST_MINUTES}")
     return minutes

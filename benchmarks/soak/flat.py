@@ -22,6 +22,9 @@ from collections.abc import Sequence
 from itertools import combinations, pairwise
 from typing import Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 WARM_UP_SHARE, LONGEST_WARM_UP_S = 0.2, 300.0
 WINDOWS, LEAST_WINDOWS = 12, 8
 ALLOWED_KIB = 1024.0
@@ -29,6 +32,7 @@ ALLOWED_KIB = 1024.0
 SHORT_S, SHORT_ALLOWED_KIB, LEAST_S = 1800.0, 9728.0, 120.0
 STEADY_KIB, STEADY_SHARE, STEADY_FROM_S = 256.0, 0.9, 1800.0
 
+Values = NDArray[np.float64]
 Word = Literal["flat", "grows", "creeps", "unknown", "too short"]
 
 
@@ -62,39 +66,30 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
         kib: the samples.
         length_s: length of the run.
     """
-    at_10, at_50, at_100 = (_near(at_s, kib, share * length_s) for share in (0.1, 0.5, 1.0))
+    shares = (_near(at_s, kib, share * length_s) for share in (0.1, 0.5, 1.0))
     begin_s = warm_up_s(length_s)
     judged_s = length_s - begin_s
-    allowed_kib = ALLOWED_KIB * max(judged_s / 3600, 1.0)
-    if length_s < SHORT_S:
-        allowed_kib = SHORT_ALLOWED_KIB
+    hours = max(judged_s / 3600, 1.0)
+    allowed_kib = SHORT_ALLOWED_KIB if length_s < SHORT_S else ALLOWED_KIB * hours
     windows: list[list[tuple[float, float]]] = [[] for _ in range(WINDOWS)]
     for at, value in zip(at_s, kib, strict=True):
         if begin_s <= at <= length_s:
             place = int((at - begin_s) / judged_s * WINDOWS)
             windows[min(place, WINDOWS - 1)].append((at, value))
-    if judged_s < LEAST_S:
-        return Trend(at_10, at_50, at_100, math.nan, math.nan, allowed_kib, math.nan, "too short")
-    seen = [window for window in windows if window]
-    if len(seen) < LEAST_WINDOWS:
-        return Trend(at_10, at_50, at_100, math.nan, math.nan, allowed_kib, math.nan, "unknown")
-    middles = [
-        (_low_median([at for at, _ in window]), _low_median([value for _, value in window]))
-        for window in seen
-    ]
-    pairs = list(combinations(middles, 2))
-    slope = _low_median([(b - a) / (t - s) for (s, a), (t, b) in pairs])
-    rising = sum(b > a for (_, a), (_, b) in pairs) / len(pairs)
-    growth_kib = slope * judged_s
+    medians = [_low_median(np.array(window)) for window in windows if window]
+    if judged_s < LEAST_S or len(medians) < LEAST_WINDOWS:
+        verdict: Word = "too short" if judged_s < LEAST_S else "unknown"
+        return Trend(*shares, math.nan, math.nan, allowed_kib, math.nan, verdict)
+    apart = np.array([after - before for before, after in combinations(medians, 2)])
+    slope = float(_low_median(apart[:, 1] / apart[:, 0]))
+    rising, growth_kib = float((apart[:, 1] > 0).mean()), slope * judged_s
     steady = (
         rising >= STEADY_SHARE
-        and growth_kib > STEADY_KIB * max(judged_s / 3600, 1.0)
+        and growth_kib > STEADY_KIB * hours
         and judged_s >= STEADY_FROM_S * (1 - WARM_UP_SHARE)
     )
-    verdict: Word = "grows" if growth_kib > allowed_kib else "creeps" if steady else "flat"
-    return Trend(
-        at_10, at_50, at_100, 3600 * slope, growth_kib, allowed_kib, rising, verdict
-    )  # fmt: skip
+    verdict = "grows" if growth_kib > allowed_kib else "creeps" if steady else "flat"
+    return Trend(*shares, 3600 * slope, growth_kib, allowed_kib, rising, verdict)
 
 
 def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
@@ -109,11 +104,8 @@ def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> t
 
 
 def _near(at_s: Sequence[float], kib: Sequence[float], when_s: float) -> float:
-    found = min(
-        zip(at_s, kib, strict=True), key=lambda sample: abs(sample[0] - when_s), default=None
-    )
-    return math.nan if found is None else found[1]
+    return kib[int(np.abs(np.subtract(at_s, when_s)).argmin())] if len(kib) else math.nan
 
 
-def _low_median(values: Sequence[float]) -> float:
-    return sorted(values)[(len(values) - 1) // 2]
+def _low_median(values: Values) -> Values:
+    return np.quantile(values, 0.5, axis=0, method="lower")

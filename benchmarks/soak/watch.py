@@ -35,18 +35,17 @@ class Processes:
     def __init__(self, launcher: int) -> None:
         self._known = {LAUNCHER: psutil.Process(launcher)}
 
-    @property
-    def roles(self) -> set[str]:
-        """Roles of all processes seen so far."""
-        return set(self._known)
-
     def sample(self) -> dict[str, Sample]:
         """Sample every process that is alive."""
-        self._find()
+        if len(self._known) <= len(ROLES):
+            with contextlib.suppress(psutil.Error):
+                children = self._known[LAUNCHER].children()
+                named = {role: child for child in children for role in ROLES if is_of(role, child)}
+                self._known = named | self._known
         found = {}
         for role, process in self._known.items():
             with contextlib.suppress(psutil.Error):
-                found[role] = _sample(process)
+                found[role] = take_sample(process)
         return found
 
     def left_behind(self, patience_s: float) -> list[str]:
@@ -59,15 +58,6 @@ class Processes:
         for process in reversed(self._known.values()):
             with contextlib.suppress(psutil.Error):
                 process.kill()
-
-    def _find(self) -> None:
-        if len(self._known) > len(ROLES):
-            return
-        with contextlib.suppress(psutil.Error):
-            for child in self._known[LAUNCHER].children():
-                for role in ROLES:
-                    if role not in self._known and is_of(role, child):
-                        self._known[role] = child
 
 
 def is_of(role: str, process: psutil.Process) -> bool:
@@ -84,7 +74,8 @@ def udp_port(process: psutil.Process) -> int:
     return int(port)
 
 
-def _sample(process: psutil.Process) -> Sample:
+def take_sample(process: psutil.Process) -> Sample:
+    """Sample a process."""
     with process.oneshot():
         memory = process.memory_full_info()
         cpu = process.cpu_times()

@@ -124,9 +124,11 @@ def latency(record: RunRecord) -> LatencyPart:
     return LatencyPart(**_quantiles(sketch), updates=len(passed_us))
 
 
+_SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+
+
 def _quantiles(sketch: QuantileSketch) -> dict[str, float | None]:
-    shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
-    return {key: sketch.quantile(share) for key, share in shares.items()}
+    return dict(zip(_SHARES, sketch.quantiles(*_SHARES.values()), strict=True))
 
 
 _ARRIVES_AFTER_END_S = 0.1
@@ -215,7 +217,8 @@ class _Unmatched:
     def take(self, sent: NDArray[np.int64], arrived: NDArray[np.int64]) -> "_Unmatched":
         """Add the next numbers; one is received in the same part as it is sent, or later."""
         self._newest = max(self._newest, int(arrived.max(initial=-1)))
-        self._sent = np.setdiff1d(np.concatenate([self._sent, sent]), arrived)
+        sent = np.concatenate([self._sent, sent])
+        self._sent = sent[:0] if np.array_equal(sent, arrived) else np.setdiff1d(sent, arrived)
         return self
 
     def count(self, *, complete: bool) -> int:
@@ -230,12 +233,12 @@ def missing_rows(record: RunRecord) -> Counter[str]:
     """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        for life in record.lives(role):
-            if life.report is None:
-                missing[role] += life.missing_inputs
+        for place, counts in enumerate(record.row_counts(role)):
+            if counts.report is None:
+                missing[role] += record.lives(role)[place].missing_inputs
                 continue
-            for table, count in life.rows.items():
-                missing[table] += life.report["rows"][table] - count
+            for table, count in counts.rows.items():
+                missing[table] += counts.report["rows"][table] - count
     return missing
 
 

@@ -154,18 +154,7 @@ class MarginResult:
             period = self.period._asdict() | {"text": self.period.text}
             period["found"] = None if self.period.found is None else _document(self.period.found)
         found = self.without_guarantee
-        own = (
-            "scenario",
-            "mode",
-            "mansd",
-            "guarantee",
-            "shortest_s",
-            "period_s",
-            "delay_s",
-            "every_m",
-        )
-        return {key: getattr(self, key) for key in own} | {
-            "shortest_s": self.shortest_s,
+        return vars(self) | {
             "verdict": self.verdict,
             "stable_m": self.stable_m,
             "caps": [{"m": cap.m, **_document(cap.found)} for cap in self.caps],

@@ -196,6 +196,13 @@ _SHARED_INTERVALS = 8
 Reals = NDArray[np.float64]
 
 
+class LoopOverTime(NamedTuple):
+    """Two quantities of one loop, (intervals,) each; see :class:`LoopsOverTime`."""
+
+    errors: Reals
+    states: Reals
+
+
 class LoopsOverTime(NamedTuple):
     """Quantities of L loops in ``INTERVALS`` intervals of the run, each of shape (L, intervals)."""
 
@@ -221,20 +228,40 @@ class LoopsOverTime(NamedTuple):
         return ends_s, sums / np.where(sums.sum(axis=0) > 0, sums.sum(axis=0), np.nan)
 
 
-def loops_over_time(run: RecordedRun) -> LoopsOverTime:
-    """Return how the loops of a run went; their records are read one after the other."""
-    horizon_ns, phases = run.scenario.timing.horizon_ns, phases_ns(run.scenario)
+def loops_over_time(run: RecordedRun, known: Sequence[LoopOverTime] | None = None) -> LoopsOverTime:
+    """Return how the loops of a run went, from what is ``known`` of each, or from their records."""
+    if known is None:
+        known = [
+            loop_over_time(record, phase_ns)
+            for record, phase_ns in zip(run.loops, phases_ns(run.scenario), strict=True)
+        ]
     found = empty_over_time(run.scenario)
-    for number, (record, phase_ns) in enumerate(zip(run.loops, phases, strict=True)):
-        with np.errstate(all="ignore"):  # a loop may diverge
-            for part in aligned_parts(record):
-                aligned = part.aligned
-                place = places(aligned.t_ns + phase_ns, horizon_ns)
-                np.fmax.at(found.states[number], place, row_norms(aligned.x))
-                common = aligned.since_delivery(record.scenario)
-                np.fmax.at(found.errors[number], place[common], aligned.e_c_norm[common])
-    add_link_bytes(found.link_bytes, run.network[NETEM_PACKET], horizon_ns)
+    for number, (errors, states) in enumerate(known):
+        found.errors[number], found.states[number] = errors, states
+    add_link_bytes(found.link_bytes, run.network[NETEM_PACKET], run.scenario.timing.horizon_ns)
     return found
+
+
+@np.errstate(all="ignore")  # a loop may diverge
+def loop_over_time(record: RunRecord, phase_ns: int) -> LoopOverTime:
+    """Return how a loop went that began at ``phase_ns`` in the time of its run."""
+    horizon_ns = record.scenario.timing.horizon_ns
+    errors, states = np.full((2, INTERVALS), np.nan)
+    for part in aligned_parts(record):
+        aligned = part.aligned
+        place = places(aligned.t_ns + phase_ns, horizon_ns)
+        common = aligned.since_delivery(record.scenario)
+        _raise(states, place, row_norms(aligned.x))
+        _raise(errors, place[common], aligned.e_c_norm[common])
+    return LoopOverTime(errors, states)
+
+
+def _raise(largest: Reals, place: NDArray[np.int64], values: Reals) -> None:
+    """Take the largest values at places, which ascend, into account."""
+    if len(place):
+        first = np.flatnonzero(np.diff(place, prepend=-1))
+        at = place[first]
+        largest[at] = np.fmax(largest[at], np.fmax.reduceat(values, first))
 
 
 def empty_over_time(scenario: Scenario) -> LoopsOverTime:

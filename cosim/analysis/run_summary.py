@@ -103,7 +103,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
     signals = signal_statistics(record)
     return LoopSummary(
         name=scenario.name,
-        number=record.number or 0,
+        number=record.number,
         phase_s=phase_ns / NS_PER_S,
         mode=scenario.mode,
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
@@ -234,6 +234,8 @@ def _restarts(record: RunRecord) -> list[RestartPart]:
                             first_s=notice["t_ns"] * 1e-9, what=notice["text"])
                 for number, notice in enumerate(notices, 1)
             ]  # fmt: skip
+            continue
+        if not notices and len(record.begun_lives(role)) == 1:
             continue
         active_s = {
             life.generation: (_seconds(life.first_ns), _seconds(life.last_ns))

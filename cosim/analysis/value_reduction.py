@@ -56,13 +56,14 @@ class QuantileSketch:
         for place, count in zip(places.tolist(), counts.tolist(), strict=True):
             self._counts[place] = self._counts.get(place, 0) + count
 
-    def quantile(self, share: float) -> float | None:
-        """Return the value below which a share of all values is; None without values."""
+    def quantiles(self, *shares: float) -> list[float | None]:
+        """Return the values below which some shares of all values are; None without values."""
         if not self.count:
-            return None
+            return [None] * len(shares)
         if self._values is not None:
-            return float(np.quantile(np.concatenate(self._values), share))
-        return float(self.largest(np.array([self.count - share * (self.count - 1)]))[0])
+            return list(np.quantile(np.concatenate(self._values), shares).tolist())
+        ranks = self.count - np.array(shares) * (self.count - 1)
+        return list(self.largest(ranks).tolist())
 
     def largest(self, ranks: NDArray[Any]) -> NDArray[np.float64]:
         """Return the values of some ranks, (k,); that of rank 1 is the largest one."""

@@ -107,7 +107,7 @@ class ExplorerWidget:
             self._say(str(error))
             return
         self._say(self._results.warning if CERTIFICATE in self._results.known else "")
-        self._facts.value = as_html(_facts(self._results))
+        self._facts.value = as_html([row for rows in self._results.facts.values() for row in rows])
 
     def _say(self, text: str) -> None:
         lines = "<br>".join(map(html.escape, text.splitlines()))
@@ -183,18 +183,3 @@ def _png(results: DraftResults, state: int) -> bytes:
         figure = draw(exploration_figure(results.shown(state)))
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs=_QUICK)
     return buffer.getvalue()
-
-
-def _facts(results: DraftResults) -> list[tuple[str, str]]:
-    rows, known = list(results.run.numbers), results.known
-    if ENSEMBLE in known and results.ensemble is not None:
-        rows += results.ensemble.numbers
-    if CERTIFICATE in known:
-        found = results.certificate
-        rows += [("certificate", f"{found.verdict}: {found.reason}"), *found.rows]
-        rows += [(what, f"{verdict} ({why})") for verdict, what, why in found.assumptions]
-    if MARGIN in known:
-        rows += [("margin", results.margin.verdict)]
-        rows += [(f"M = {m}", f"growth {growth}, {verdict}")
-                 for m, growth, verdict in results.margin.rows]  # fmt: skip
-    return rows

@@ -133,7 +133,7 @@ class Run:
             NoackError: there is no such table, or its file is damaged.
         """
         from cosim.record.data_frames import with_seconds
-        from cosim.record.table_files import arrow_table, read_table
+        from cosim.record.table_files import TableFile, arrow_table
 
         if name not in self.tables:
             known = ", ".join(self.tables)
@@ -141,7 +141,7 @@ class Run:
         if self._loop is not None:
             return with_seconds(arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        return with_seconds(read_table(path, run_tables(self._run.scenario)[name]))
+        return with_seconds(TableFile(path, run_tables(self._run.scenario)[name]).whole())
 
     def samples(self) -> "pa.Table":
         """Return plant, sensor and controller side by side, one row per measurement.
@@ -367,7 +367,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
     """
     from cosim.live.finalize import finalize
     from cosim.live.launcher import launch
-    from cosim.live.progress import PatientConsole, progress_line
+    from cosim.live.progress import PipeSafeConsole, progress_line
 
     loaded = load(scenario)
     if threading.current_thread() is not threading.main_thread():
@@ -375,7 +375,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
             "noack.run: a live run is started by the main thread, which signals go to"
         )
     with _folder(runs) as (folder, temporary):
-        console = PatientConsole(stderr=True, quiet=not progress)
+        console = PipeSafeConsole(stderr=True, quiet=not progress)
         with progress_line(console, loaded) as watcher:
             ending = launch(loaded, folder, watcher=watcher)
         outcome = finalize(ending, report=False, view=temporary is None)

@@ -313,9 +313,9 @@ def campaign(
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
     bar = None
     if progress:
-        from cosim.live.progress import PatientConsole, runs_bar
+        from cosim.live.progress import PipeSafeConsole, runs_bar
 
-        bar = runs_bar(PatientConsole(file=sys.stderr))
+        bar = runs_bar(PipeSafeConsole(file=sys.stderr))
     start = partial(local, workers or cores())
     try:
         finished = finish_campaign(

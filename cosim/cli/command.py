@@ -2,20 +2,24 @@
 
 import math
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
+from copy import copy
 from enum import StrEnum
 from functools import wraps
 from importlib import import_module
+from inspect import cleandoc
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
 
 import typer
+from typer import Argument, Option
 
 from cosim.cli import commands, completion
-from cosim.cli.program import NAME, Program, be_patient
+from cosim.cli.program import NAME, Program, ignore_broken_pipes
 from cosim.output.figure_format import FigureFormat
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
 from cosim.shipped_files import find_shipped
@@ -27,6 +31,7 @@ from noack.runtime.command_line import StopRequestError, failed, log_format, sto
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.status import Status
 
     from cosim.live.fork_server import ForkServer
     from cosim.output.result_tables import ResultTable
@@ -45,6 +50,8 @@ _TOUR = (
 )
 """A first session: commands and their descriptions."""
 _MOST_COLUMNS = 78
+_ARGUMENT = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
+"""An option and its help, in a docstring."""
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
 MEASURING = "Real networks"
@@ -53,6 +60,7 @@ PROCESSES = "One terminal per process"
 PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 """The panels of the help, in order."""
 
+P = ParamSpec("P")
 _order: dict[Any, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
 
@@ -90,30 +98,30 @@ app = typer.Typer(
 
 ScenarioArgument = Annotated[
     str,
-    typer.Argument(
+    Argument(
         help="Scenario file (TOML), or the name of a shipped scenario.",
         autocompletion=completion.scenarios,
     ),
 ]
 RunArgument = Annotated[
     Path | None,
-    typer.Argument(
+    Argument(
         help="Run directory; the last run by default.", autocompletion=completion.run_directories
     ),
 ]
 LoopOption = Annotated[
-    str | None,
-    typer.Option("--loop", metavar="NAME", help="Only the loop of this name."),
+    str | None, Option("--loop", metavar="NAME", help="Only the loop of this name.")
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         metavar="KEY=VALUE",
         help="Replace a value of the scenario, e.g. trigger.beta=0.3, or for short beta=0.3.",
         autocompletion=completion.settings,
     ),
 ]
+OutOption = Annotated[Path | None, Option("--out")]
 
 
 class TriggerMode(StrEnum):
@@ -125,15 +133,15 @@ class TriggerMode(StrEnum):
 
 TriggerOption = Annotated[
     TriggerMode,
-    typer.Option(
+    Option(
         help="sampled: test the trigger at each measurement, as in a live run; "
         "continuous: at all times."
     ),
 ]
-RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the run directories.")]
+RunsOption = Annotated[Path, Option("--runs", help="Folder of the run directories.")]
 LiveOption = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--live",
         help="Show the run in the rerun viewer: in a window, or without a display in a browser, at "
         "the address that is printed.",
@@ -151,7 +159,7 @@ def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
 
 LogFormatOption = Annotated[
     LogFormat,
-    typer.Option(
+    Option(
         "--log-format",
         callback=_log_format,
         is_eager=True,
@@ -160,7 +168,7 @@ LogFormatOption = Annotated[
 ]
 MetricsOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--metrics",
         metavar="[HOST]:PORT",
         help="Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback "
@@ -169,21 +177,18 @@ MetricsOption = Annotated[
 ]
 ReportOption = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--report/--no-report",
         help="Write report.html, which takes some seconds; `noack report` writes it later.",
     ),
 ]
 FormatOption = Annotated[
     FigureFormat | None,
-    typer.Option(
-        "--format",
-        help="Write each figure as a file, too; a PDF has the fonts of LaTeX.",
-    ),
+    Option("--format", help="Write each figure as a file, too; a PDF has the fonts of LaTeX."),
 ]
 WidthOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--width",
         metavar="column|page|INCHES",
         help="Width of figures in files: column (3.5 in), page (7.16 in), or inches; by default "
@@ -192,19 +197,20 @@ WidthOption = Annotated[
 ]
 TablesOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--tables",
         metavar="FOLDER",
         help="Write the tables into this folder, as LaTeX (booktabs) and as CSV.",
     ),
 ]
 VerboseOption = Annotated[
-    bool, typer.Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
+    bool, Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")
+    bool, Option("--json", help="Print one JSON document on stdout, and nothing else.")
 ]
-SESSION = typer.Option("--session", help="Session name that the processes of a run share.")
+SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
+SESSION = Option("--session", help="Session name that the processes of a run share.")
 SessionOption = Annotated[str, SESSION]
 
 
@@ -219,7 +225,7 @@ def _version(requested: bool) -> None:
 @app.callback()
 def options(
     _: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+        bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Take the options before the command."""
@@ -229,6 +235,8 @@ def command(
     panel: str, place: int, examples: Sequence[tuple[str, str]] = (), **settings: Any
 ) -> Callable[[Callable[..., int]], Callable[..., None]]:
     """Register a command. Its result is the exit status; an error or Ctrl-C is printed as one line.
+
+    The help of an option is under ``Options:`` in its docstring, unless this module declares it.
 
     Args:
         panel: panel of the help, one of :data:`PANELS`.
@@ -260,12 +268,25 @@ def command(
 
         epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
         _order[reported] = PANELS.index(panel), place
+        text = _describe_options(function)
         registered: Callable[..., None] = app.command(
-            rich_help_panel=panel, epilog=epilog, **settings
+            rich_help_panel=panel, epilog=epilog, help=text, **settings
         )(reported)
         return registered
 
     return register
+
+
+def _describe_options(function: Callable[..., int]) -> str:
+    """Give the options of a command the help of its docstring; return the docstring before it."""
+    text, _, arguments = cleandoc(function.__doc__ or "").partition("\n\nOptions:\n")
+    for name, words in _ARGUMENT.findall(arguments):
+        of = function.__annotations__[name]
+        metadata = getattr(of, "__metadata__", ())
+        described = copy(metadata[0]) if metadata else Option()
+        described.help = " ".join(words.split())
+        function.__annotations__[name] = Annotated[of.__origin__ if metadata else of, described]
+    return text
 
 
 def _why_not_written(error: Exception) -> str | None:
@@ -284,12 +305,14 @@ def register_commands(wanted: str = "") -> None:
 
     It is found by its source, since importing all of them takes 0.05 s.
     """
-    modules = [one.name for one in pkgutil.iter_modules(commands.__path__)]
-    folder, declaration = Path(commands.__path__[0]), f"\ndef {wanted}("
-    own = [one for one in modules if declaration in (folder / f"{one}.py").read_text("utf-8")]
+    folder = Path(commands.__path__[0])
+    modules = [module.name for module in pkgutil.iter_modules([str(folder)])]
+    texts = {module: (folder / f"{module}.py").read_text("utf-8") for module in modules}
+    declarations = f"\ndef {wanted}(", f'\n_join("{wanted}",'
+    own = [module for module in modules if any(line in texts[module] for line in declarations)]
     for module in own or modules:
         import_module(f"{commands.__name__}.{module}")
-    app.registered_commands.sort(key=lambda one: _order[one.callback])
+    app.registered_commands.sort(key=lambda command: _order[command.callback])
 
 
 def find_scenario(name: str) -> Path:
@@ -311,14 +334,39 @@ def console() -> "Console":
     return Console()
 
 
+def status(what: str) -> "AbstractContextManager[Status]":
+    """Show within the context what a command is doing, on a terminal only."""
+    from cosim.live.progress import error_console
+
+    return error_console().status(what)
+
+
 def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
     """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
     if folder is not None:
         from cosim.output.result_tables import save_tables
 
-        written = save_tables(tables, folder)
-        if not json:
-            print(*written, sep="\n")
+        print_paths(save_tables(tables, folder), json=json)
+
+
+def print_paths(paths: Iterable[Path], *, json: bool) -> None:
+    """Print the paths of written files, unless the document of ``--json`` has them."""
+    if not json:
+        print(*paths, sep="\n")
+
+
+def show(
+    json: bool,
+    document: Callable[[], object],
+    show_text: "Callable[Concatenate[Console, P], object]",
+    *found: P.args,
+    **how: P.kwargs,
+) -> None:
+    """Print a result: the document of ``--json``, or ``show_text(console, *found, **how)``."""
+    if json:
+        print_json(document())
+    else:
+        show_text(console(), *found, **how)
 
 
 def print_json(document: object) -> None:
@@ -337,5 +385,5 @@ def _finite(value: Any) -> Any:
 def run_program(server: "ForkServer | None" = None) -> None:
     """Run the command of the command line; a live run uses the server."""
     if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
-        be_patient()
+        ignore_broken_pipes()
     app(prog_name=NAME, obj=server)

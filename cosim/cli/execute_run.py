@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli import command as cli
-from cosim.cli.command import console, print_json
 from noack.core.errors import CallerError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from cosim.live.fork_server import ForkServer
-    from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
+    from cosim.live.run_watcher import Watcher
     from cosim.output.figure_format import FigureFiles
     from cosim.record.run_directory import RunEnding
     from cosim.studies.campaign.campaign_file import Campaign
@@ -75,7 +74,8 @@ def run_processes(
     from cosim.live.fork_server import fork_server
 
     with fork_server(server) as server:
-        from cosim.live.launcher import RunLog, Watcher, joint_watcher, later_watcher, launch
+        from cosim.live.launcher import launch
+        from cosim.live.run_watcher import RunLog, Watcher, joint_watcher, later_watcher
         from noack.config.link_load import require_capacity
         from noack.protocol.topology import ROLES
 
@@ -102,9 +102,9 @@ def run_processes(
 
 def _progress(scenario: "Scenario", session: str | None) -> "AbstractContextManager[Watcher]":
     """Give what shows the progress of a run; importing rich takes 0.05 s."""
-    from cosim.live.progress import PatientConsole, progress_line
+    from cosim.live.progress import error_console, progress_line
 
-    return progress_line(PatientConsole(stderr=True), scenario, session)
+    return progress_line(error_console(), scenario, session)
 
 
 @contextmanager
@@ -138,9 +138,12 @@ def warn_of_violations(scenario: "Scenario") -> None:
         print(f"noack: warning: {line}", file=sys.stderr)
     for section in loop_sections(scenario):
         whose = f"{section.name}: " if shares else ""
-        for one in assumptions(resolve(loop_scenario(scenario, section))):
-            if one.verdict == AssumptionStatus.VIOLATED and one.source == "Theorem 2":
-                print(f"noack: warning: {whose}violated: {one.what}: {one.why}", file=sys.stderr)
+        for assumption in assumptions(resolve(loop_scenario(scenario, section))):
+            if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
+                print(
+                    f"noack: warning: {whose}violated: {assumption.what}: {assumption.why}",
+                    file=sys.stderr,
+                )
 
 
 def warn_of_other_runs() -> None:
@@ -162,27 +165,20 @@ def warn_of_other_runs() -> None:
 
 def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
+    from cosim.live.finalize import finalize
+    from cosim.live.run_watcher import log_end
+    from cosim.output.run_verdict import print_outcome
+
     try:
-        return _finalize_run(ending, output)
+        # This takes minutes for a run of an hour.
+        with cli.status("replaying the run and checking its claims"):
+            outcome = finalize(ending, report=output.report)
     except KeyboardInterrupt as error:
         error.add_note(f"`noack summary {ending.run_dir}` completes its record")
         raise
-
-
-def _finalize_run(ending: "RunEnding", output: RunOutput) -> int:
-    from cosim.live.finalize import finalize
-    from cosim.live.launcher import log_end
-    from cosim.live.progress import PatientConsole
-    from cosim.output.run_verdict import print_outcome
-
-    # This takes minutes for a run of an hour.
-    with PatientConsole(stderr=True).status("replaying the run and checking its claims"):
-        outcome = finalize(ending, report=output.report)
     log_end(outcome.status, outcome.reason, outcome.run_dir)
-    if output.json:
-        print_json(outcome.summary.to_json())
-    else:
-        print_outcome(console(), outcome, verbose=output.verbose)
+    document = outcome.summary.to_json
+    cli.show(output.json, document, print_outcome, outcome, verbose=output.verbose)
     return outcome.status
 
 

@@ -30,16 +30,18 @@ class Program(TyperGroup):
         if self._words and not self._words[0].startswith("-"):
             return []
         found: list[Any] = super().get_params(ctx)
-        for one in found:
-            one.hidden = one.hidden or one.name in _COMPLETION
+        for parameter in found:
+            parameter.hidden = parameter.hidden or parameter.name in _COMPLETION
         return found
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, a section for each panel."""
         commands: Mapping[str, Any] = self.commands
-        for panel, some in groupby(commands.values(), lambda one: one.rich_help_panel):
+        for panel, some in groupby(commands.values(), lambda command: command.rich_help_panel):
             with formatter.section(panel):
-                formatter.write_dl([(one.name, one.get_short_help_str(200)) for one in some])
+                formatter.write_dl(
+                    [(command.name, command.get_short_help_str(200)) for command in some]
+                )
 
     def main(
         self,
@@ -62,12 +64,8 @@ class Program(TyperGroup):
             if message := self._line(error, words):
                 failed(message, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help is written to a full disk
-            status = failed(
-                f"cannot write: {why(error)}",
-                ExitStatus.FAILED,
-                who=NAME,
-                as_json="--json" in words,
-            )
+            text, as_json = f"cannot write: {why(error)}", "--json" in words
+            status = failed(text, ExitStatus.FAILED, who=NAME, as_json=as_json)
         if standalone_mode:
             sys.exit(int(status or 0))
         return status
@@ -97,20 +95,20 @@ def examples_of(command: Any) -> list[str]:
     return [line for line in commands if line.startswith(f"{NAME} ")]
 
 
-def be_patient() -> None:
+def ignore_broken_pipes() -> None:
     """Discard output to a standard stream after its reader has closed it.
 
     Hence `noack run ... | head -1` runs to its end, with the run's exit status.
     """
-    sys.stdout, sys.stderr = patient_stream(sys.stdout), patient_stream(sys.stderr)
+    sys.stdout, sys.stderr = pipe_safe_stream(sys.stdout), pipe_safe_stream(sys.stderr)
 
 
-def patient_stream(stream: Any) -> Any:
+def pipe_safe_stream(stream: Any) -> Any:
     """Return a standard stream that discards output after its reader has closed it."""
     if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream
     return io.TextIOWrapper(
-        io.BufferedWriter(_Patient(stream.fileno(), "w", closefd=False)),
+        io.BufferedWriter(_PipeSafeFile(stream.fileno(), "w", closefd=False)),
         encoding=stream.encoding,
         errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
         # PYTHONUNBUFFERED requests more than lines; readers wait for lines.
@@ -118,7 +116,7 @@ def patient_stream(stream: Any) -> Any:
     )
 
 
-class _Patient(io.FileIO):
+class _PipeSafeFile(io.FileIO):
     """Raises one error if the disk is full; the rest, written at the end, is discarded."""
 
     _full = False

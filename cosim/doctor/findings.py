@@ -100,7 +100,7 @@ def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding
 def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
     """Return the verdict on the whole machine."""
     order = list(FindingStatus)
-    return max((one.verdict for one in findings), key=order.index)
+    return max((finding.verdict for finding in findings), key=order.index)
 
 
 def _cores(machine: MachineFacts) -> MachineFinding:
@@ -292,7 +292,7 @@ def document(
     return {
         "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
         "verdict": worst(findings),
-        "findings": [one._asdict() for one in findings],
+        "findings": [finding._asdict() for finding in findings],
         "measured": {
             name: value._asdict() if hasattr(value, "_asdict") else value
             for name, value in asdict(machine).items()
@@ -308,13 +308,15 @@ def print_findings(
     table.add_column(no_wrap=True)
     table.add_column(max_width=26)
     table.add_column(ratio=1)
-    for one in findings:
-        text = Text(one.found)
-        if one.means:
-            text.append(f"\n{one.means}", "" if one.verdict is not GOOD else "dim")
-        if one.remedy:
-            text.append(f"\n→ {one.remedy}", "cyan")
-        table.add_row(Text(one.verdict, _VERDICTS[one.verdict][0]), Text(one.what), text)
+    for finding in findings:
+        text = Text(finding.found)
+        if finding.means:
+            text.append(f"\n{finding.means}", "" if finding.verdict is not GOOD else "dim")
+        if finding.remedy:
+            text.append(f"\n→ {finding.remedy}", "cyan")
+        table.add_row(
+            Text(finding.verdict, _VERDICTS[finding.verdict][0]), Text(finding.what), text
+        )
     console.print(table)
     colour, verdict = _VERDICTS[worst(findings)]
     console.print(Text.assemble("this machine, for ", wanted.name, ": ", (verdict, colour)))

@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
@@ -22,7 +21,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import zenoh
-from zenoh.handlers import FifoChannel
 
 from cosim.live.launcher import needed_bytes
 from cosim.output.viewer.live_viewer import has_display
@@ -305,39 +303,21 @@ def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
 def _control() -> float:
     """Return the time of a query in seconds, over zenoh sessions as in the control plane."""
     name, key = f"doctor-{os.getpid()}", "noack/doctor"
-    centre = open_session(RUNS, name, listen=True)
-    try:
-        with centre.declare_queryable(key, FifoChannel(4)) as answering:
-            other = open_session(RUNS, name, listen=False)
-            try:
-                ended = threading.Event()
-                thread = threading.Thread(target=_answer, args=(answering, key, ended))
-                thread.start()
-                begun_s = time.perf_counter()
-                answer = answer_to(other, key, "", _ANSWER_S)
-                taken_s = time.perf_counter() - begun_s
-                ended.set()
-                thread.join()
-            finally:
-                other.close()  # type: ignore[no-untyped-call]
-    finally:
-        centre.close()  # type: ignore[no-untyped-call]
+    with (
+        open_session(RUNS, name, listen=True) as centre,
+        centre.declare_queryable(key, lambda query: query.reply(key, "here")),
+        open_session(RUNS, name, listen=False) as other,
+    ):
+        begun_s = time.perf_counter()
+        answer = answer_to(other, key, "", _ANSWER_S)
+        taken_s = time.perf_counter() - begun_s
     if answer is None:
         raise MachineError(f"no answer within {_ANSWER_S:g} s")
     return taken_s
 
 
-def _answer(queryable: Any, key: str, ended: threading.Event) -> None:
-    while not ended.is_set():
-        if (query := queryable.try_recv()) is not None:
-            query.reply(key, "here")
-            query.drop()
-        else:
-            ended.wait(0.001)
-
-
 def _disk(runs: Path, needed: int) -> Disk:
-    folder = next(one for one in (runs, *runs.absolute().parents) if one.is_dir())
+    folder = next(path for path in (runs, *runs.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             block = bytes(1024 * 1024)

@@ -5,7 +5,7 @@ All items always exist, perhaps without points, so that the lab page can replace
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -234,30 +234,50 @@ class DraftResults:
     @property
     def run(self) -> Exploration:
         """The run."""
-        return self._once(RUN, run_of, Exploration)
+        return self._once(RUN, run_of)
 
     @property
     def certificate(self) -> Guarantee:
         """What is guaranteed."""
-        return self._once(CERTIFICATE, certify, Guarantee)
+        return self._once(CERTIFICATE, certify)
 
     @property
     def ensemble(self) -> Ensemble | None:
         """Bands over many draws; None without exact simulation."""
         if why_not_exact(self.draft.scenario) is not None:
             return None
-        return self._once(ENSEMBLE, explore_ensemble, Ensemble)
+        return self._once(ENSEMBLE, explore_ensemble)
 
     @property
     def margin(self) -> Margin:
         """For which M the loop is stable; this may take seconds."""
-        return self._once(MARGIN, margin_of, Margin)
+        return self._once(MARGIN, margin_of)
 
     @property
     def warning(self) -> str:
         """In words, by what is computed: whether the loop is unstable, and why."""
         certificate = self.certificate if CERTIFICATE in self.known else None
         return warning(self.run, certificate, self.margin if MARGIN in self.known else None)
+
+    @property
+    def facts(self) -> dict[str, list[tuple[str, str]]]:
+        """What is computed, in groups of labels and values."""
+        bands = self.ensemble if ENSEMBLE in self.known else None
+        run = [*self.run.numbers, *(() if bands is None else bands.numbers)]
+        groups = {f"this run ({self.run.kind})": run}
+        if CERTIFICATE in self.known:
+            found = self.certificate
+            groups["certificate"] = [
+                ("certificate", f"{found.verdict}: {found.reason}"), *found.rows,
+                *((what, f"{verdict} ({why})") for verdict, what, why in found.assumptions),
+            ]  # fmt: skip
+        if MARGIN in self.known:
+            groups["margin"] = [
+                ("margin", self.margin.verdict),
+                *((f"M = {m}: growth of the worst pattern (D delivered, L lost) per event",
+                   f"{growth}, {verdict}") for m, growth, verdict in self.margin.rows),
+            ]  # fmt: skip
+        return groups
 
     def shown(self, state: int) -> Shown:
         """Return what a figure shows of the results that are computed."""
@@ -266,9 +286,11 @@ class DraftResults:
             self.certificate if CERTIFICATE in self.known else None,
         )  # fmt: skip
 
-    def _once(self, name: str, compute: Callable[[Scenario], T], kind: type[T]) -> T:
+    def put(self, name: str, result: object) -> None:
+        """Take a result that was computed elsewhere: RUN, CERTIFICATE, ENSEMBLE or MARGIN."""
+        self._found[name] = result
+
+    def _once(self, name: str, compute: Callable[[Scenario], T]) -> T:
         if name not in self._found:
             self._found[name] = compute(self.draft.scenario)
-        found = self._found[name]
-        assert isinstance(found, kind)
-        return found
+        return cast(T, self._found[name])

@@ -1,12 +1,12 @@
 """The figure of the run, its key numbers, and what is guaranteed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from nicegui import ui
 
 from cosim.interactive.exploration_figure import Shown, exploration_figure
-from cosim.interactive.scenario_guarantee import CERTIFIED, Guarantee, Margin
+from cosim.interactive.scenario_guarantee import CERTIFIED
 from cosim.lab.chart import HEIGHT, data_options, figure_options
 from cosim.lab.lab_services import Session
 from noack.core.number_format import number
@@ -22,8 +22,8 @@ class ExplorePanel:
     def __init__(self) -> None:
         self._shape: tuple[object, ...] = ()
         self._names: dict[int, str] = {}
-        self._guaranteed: tuple[int, int] | None = None
-        """Which guarantee and margin are shown; arrays are not compared."""
+        self._facts: dict[str, Rows] = {}
+        """The groups of facts, by their headings."""
         self._chart: ui.echart | None = None
         with ui.row().classes("w-full items-center gap-x-4 gap-y-0"):
             self._summary = ui.label()
@@ -34,17 +34,14 @@ class ExplorePanel:
         self._note.set_visibility(False)
         self._area = ui.element("div").classes("w-full")
         self._stale = False
-        with ui.element("div").classes("w-full lab-facts"):
-            with ui.column().classes("gap-0"):
-                self._kind = _heading("this run")
-                self._numbers = _Rows()
-            self._guarantee = ui.column().classes("gap-0")
+        self._groups = ui.element("div").classes("w-full lab-facts")
 
     async def draw(self, session: Session, *, dark: bool) -> None:
         """Show what was computed; a redraw of the same figure replaces its data only."""
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
-        note = first + more or session.warning or session.note
+        warning = session.results.warning if session.results else ""
+        note = first + more or warning or session.note
         shown = session.shown()
         self._mark_stale(shown is None)
         if shown is None and self._chart is not None:
@@ -52,12 +49,13 @@ class ExplorePanel:
         self._note.set_text(note)
         self._note.set_visibility(bool(note))
         self._pending.set_text(session.pending)
-        if shown is None:
+        if shown is None or session.results is None:
             return
-        self._choose_state(session)
+        self._choose_state(session, shown.run.state_names)
         await self._show_figure(shown, dark=dark)
         if not self._area.is_deleted:
-            self._show_facts(session)
+            self._show_summary(shown)
+            self._show_facts(session.results.facts)
 
     def _mark_stale(self, stale: bool) -> None:
         """Draw the figure faintly while it is not that of the settings."""
@@ -85,9 +83,8 @@ class ExplorePanel:
         except TimeoutError:
             self._shape = ()
 
-    def _choose_state(self, session: Session) -> None:
-        assert session.run is not None
-        names = dict(enumerate(session.run.state_names))
+    def _choose_state(self, session: Session, state_names: Sequence[str]) -> None:
+        names = dict(enumerate(state_names))
         if names == self._names:
             return
         self._names = names
@@ -104,64 +101,40 @@ class ExplorePanel:
                 "w-32"
             ).props("dense options-dense")
 
-    def _show_facts(self, session: Session) -> None:
-        run, found = session.run, session.ensemble
-        assert run is not None
-        self._kind.set_text(f"this run ({run.kind})")
-        self._show_summary(session, dict(run.numbers))
-        self._numbers.show([*run.numbers, *(() if found is None else found.numbers)])
-        if self._guaranteed == (shown := (id(session.guarantee), id(session.margin))):
-            return
-        self._guaranteed = shown
-        self._guarantee.clear()
-        with self._guarantee:
-            _show_guarantee(session.guarantee)
-            _show_margin(session.margin)
+    def _show_facts(self, groups: Mapping[str, Sequence[tuple[str, str]]]) -> None:
+        if [*groups] != [*self._facts]:
+            self._groups.clear()
+            with self._groups:
+                self._facts = {heading: _group(heading) for heading in groups}
+        for heading, rows in groups.items():
+            self._facts[heading].show(rows)
 
-    def _show_summary(self, session: Session, numbers: dict[str, str]) -> None:
+    def _show_summary(self, shown: Shown) -> None:
         """Show above the figure what changes most."""
-        first, last = session.run.x_norm[[0, -1]] if session.run else (0.0, 0.0)
+        numbers, (first, last) = dict(shown.run.numbers), shown.run.x_norm[[0, -1]]
         self._summary.set_text(
             f"{numbers.get('transmissions', 0)} transmissions, {numbers.get('lost', 0)} lost; "
             f"‖x‖ from {number(first, 3)} to {number(last, 3)}"
         )
-        verdict = session.guarantee.verdict if session.guarantee else ""
+        verdict = shown.guarantee.verdict if shown.guarantee else ""
         self._verdict.set_text(verdict)
         self._verdict.classes(replace=_TONES.get(verdict, "text-warning"))
 
 
-def _show_guarantee(found: Guarantee | None) -> None:
-    _heading("certificate")
-    if found is None:
-        ui.label("follows when no setting changes")
-        return
-    ui.label(f"{found.verdict}: {found.reason}").classes(_TONES.get(found.verdict, "text-warning"))
-    _Rows().show(found.rows)
-    for verdict, what, why in found.assumptions:
-        ui.label(f"{verdict}: {what} ({why})")
+def _group(heading: str) -> "Rows":
+    with ui.column().classes("gap-0"):
+        ui.label(heading).classes("text-subtitle2 mt-2").props("role=heading aria-level=3")
+        return Rows("lab-rows")
 
 
-def _show_margin(found: Margin | None) -> None:
-    if found is None or not found.defined:
-        return
-    _heading("margin")
-    ui.label(found.verdict)
-    ui.label("Pattern: D delivered, L lost. Growth of the worst pattern per event; 1 is the limit.")
-    for m, growth, verdict in found.rows:
-        ui.label(f"M = {m}: growth {growth}, {verdict}")
+class Rows:
+    """A list of names with values; while the names stay, only texts change, which is quick."""
 
-
-def _heading(text: str) -> ui.label:
-    return ui.label(text).classes("text-subtitle2 mt-2").props("role=heading aria-level=3")
-
-
-class _Rows:
-    """Names with values; while the names stay, only texts change, which is quick."""
-
-    def __init__(self) -> None:
+    def __init__(self, style: str, rows: Sequence[tuple[str, str]] = ()) -> None:
         self._names: list[str] = []
         self._values: list[ui.label] = []
-        self._list = ui.element("dl").classes("lab-rows")
+        self._list = ui.element("dl").classes(style)
+        self.show(rows)
 
     def show(self, rows: Sequence[tuple[str, str]]) -> None:
         """Show other rows."""
@@ -174,7 +147,7 @@ class _Rows:
                     with ui.element("dt"):
                         ui.label(name)
                     with ui.element("dd"):
-                        self._values.append(ui.label().classes("font-mono"))
+                        self._values.append(ui.label())
         for label, (_, value) in zip(self._values, rows, strict=True):
             if label.text != value:
                 label.set_text(value)

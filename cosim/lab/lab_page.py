@@ -7,9 +7,11 @@ import csv
 import io
 import json
 import re
+import tomllib
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,92 +20,25 @@ from nicegui import ui
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import Shown
-from cosim.lab.explore_panel import ExplorePanel
+from cosim.lab.explore_panel import ExplorePanel, Rows
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.live_panel import LivePanel
 from cosim.lab.runs_panel import RunsPanel
 from cosim.lab.settings_panel import SettingsPanel
-from cosim.output.figure_format import FigureFormat
+from cosim.output.figure_format import FigureFormat, figure_width_in
 from cosim.output.glossary import TERMS
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 
-_STYLE = """
-.lab-body { display: grid; grid-template-columns: minmax(260px, 340px) minmax(0, 1fr); gap: 1rem; }
-.lab-body { font-size: 14px; }
-.lab-body .cm-editor { font-size: 13px; }
-.lab-head { flex-wrap: nowrap; }
-.lab-sheet-button { display: none; }
-.lab-about { margin: 0; padding-left: 1.2rem; list-style: disc; max-width: 46rem; }
-.lab-guided { display: grid; gap: 1rem; }
-.lab-body .q-tab-panels { background: transparent; }
-.lab-settings { position: sticky; top: 56px; align-self: start; padding: 0 10px 1rem; }
-.lab-settings { max-height: calc(100vh - 64px); overflow-y: auto; }
-.lab-facts { display: grid; gap: 1rem; }
-.lab-facts { grid-template-columns: repeat(auto-fit, minmax(260px, 1fr)); }
-.lab-rows { display: grid; grid-template-columns: auto auto; gap: 0 1rem; margin: 0; }
-.lab-rows dd { margin: 0; }
-.lab-words { margin: 0; }
-.lab-words dt { font-weight: bold; margin-top: .5rem; }
-.lab-words dd { margin: 0; }
-.lab-viewer { height: 70vh; border: 0; }
-.nicegui-error-popup { max-width: 30rem; border: 3px solid var(--q-negative); }
-.lab-figure { --ink: #1b1f24; --grid: #d9dde3; --paper: #ffffff; }
-.body--dark .lab-figure { --ink: #e6eaef; --grid: #3a424d; --paper: #14181d; }
-.lab-figure :is(svg, img) { width: 100%; height: auto; max-width: 900px; }
-.lab-log * { white-space: pre-wrap; overflow-wrap: anywhere; }
-:focus-visible, .q-slider:focus-within, .q-field:focus-within {
-  outline: none; box-shadow: 0 0 0 2px white, 0 0 0 5px #c77700 !important;
-}
-.q-header { background: #1f5f99; }
-.q-header .q-field__label { color: white; opacity: 1; }
-.body--dark .q-btn.bg-primary, .body--dark .q-btn.bg-primary * { color: #08131e !important; }
-.body--dark { --q-primary: #64a8e8 !important; --q-negative: #ff8a80 !important; }
-.body--dark { --q-warning: #ffb74d !important; --q-positive: #7fd39b !important; }
-.body--dark .cm-activeLine { background: transparent !important; }
-.body--dark .cm-gutterElement { color: #b0b0b0 !important; }
-@media (min-width: 1200px) {
-  .lab-guided { grid-template-columns: minmax(260px, 1fr) minmax(0, 2fr); align-items: start; }
-}
-@media (max-width: 800px) {
-  html { scroll-padding-bottom: 56px; }
-  .lab-body { grid-template-columns: minmax(0, 1fr); padding-bottom: 48px; }
-  .lab-head { gap: 4px; padding: 0 8px; }
-  .lab-head .lab-scenario { flex: 1 1 0; min-width: 0; }
-  .lab-head .q-space { max-width: 0; }
-  .lab-keep .block { position: absolute; width: 1px; height: 1px; overflow: hidden; }
-  .lab-settings { position: fixed; left: 0; right: 0; top: auto; bottom: 0; z-index: 1000; }
-  .lab-settings { max-height: 46px; padding: 0; overflow: hidden; background: white; }
-  .lab-settings { border-top: 2px solid var(--q-primary); }
-  .body--dark .lab-settings { background: #121212; }
-  .lab-sheet { padding: 0 16px 16px; }
-  .lab-sheet-button { display: flex; width: 100%; min-height: 44px; }
-  .lab-settings:not(.lab-open) .lab-sheet { visibility: hidden; }
-  .lab-settings.lab-open { max-height: 45vh; overflow-y: auto; }
-  .lab-open .lab-sheet-button { position: sticky; top: 0; z-index: 1; background: inherit; }
-}
-"""
-
+_FOLDER = Path(__file__).parent
 _EXPLORE, _LIVE, _RUNS, _TUTORIAL = "explore", "run live", "recorded runs", "tutorial"
-_SHEET = """event => {
-  const button = event.currentTarget;
-  button.ariaExpanded = button.parentElement.classList.toggle('lab-open');
-}"""
-"""Opens or closes the settings on a small screen."""
 _KEEP = "keep for comparison"
-_LOST = """
-const lost = document.getElementById('popup');
-lost.role = 'alert';
-lost.children[0].textContent = 'The page has lost its server.';
-lost.children[1].textContent = 'Has noack lab ended? Start it again and open the address that it '
-    + 'shows. The settings are in the address of this page, after the "?".';
-"""
-"""Words for the framework's notice, which is shown after 2 s without a connection."""
 
 
 async def show_page(services: LabServices) -> None:
     """Build the page for one visitor."""
-    ui.add_css(_STYLE)
+    ui.add_css(_FOLDER / "lab.css")
+    ui.add_head_html(f"<script>{_FOLDER.joinpath('lab.js').read_text()}</script>")
     ui.colors(primary="#1f5f99", negative="#b3261e", warning="#8a5300", positive="#1b6e3c")
     query = ui.context.client.request.url.query if ui.context.client.request else ""
     problem = ""
@@ -154,7 +89,7 @@ class _Page:
             with ui.column().classes("gap-2 lab-settings").props("role=region aria-label=settings"):
                 ui.button("settings", icon="tune").classes("lab-sheet-button").props(
                     "flat no-caps aria-expanded=false"
-                ).on("click", js_handler=_SHEET)
+                ).on("click", js_handler="labToggleSettings")
                 with ui.column().classes("w-full gap-2 lab-sheet"):
                     self._settings = SettingsPanel(self._session.draft, self._changed)
             with ui.column().classes("gap-2 w-full"):
@@ -181,7 +116,7 @@ class _Page:
     async def begin(self) -> None:
         """Draw for the first time."""
         await ui.context.client.connected()
-        ui.run_javascript(_LOST)
+        ui.run_javascript("labNameLostServer()")
         self._settings.begin()
         self._is_dark = await ui.run_javascript(
             "window.matchMedia('(prefers-color-scheme: dark)').matches", timeout=ANSWER_S
@@ -231,11 +166,7 @@ class _Page:
             query = json.dumps(f"?{draft.query()}")
         except DraftError:
             return
-        # The browser limits how often this may be called.
-        ui.run_javascript(
-            f"clearTimeout(window.labQuery); window.labQuery = setTimeout("
-            f"() => history.replaceState(null, '', {query}), 300)"
-        )
+        ui.run_javascript(f"labShowQuery({query})")
 
     async def _choose(self, event: Any) -> None:
         if event.value == self._session.draft.base:
@@ -290,12 +221,8 @@ class FileMenu:
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
                 ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
             ui.menu_item("glossary", self._open_words)
-        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
-            for term, meaning in TERMS:
-                with ui.element("dt"):
-                    ui.label(term)
-                with ui.element("dd"):
-                    ui.label(meaning)
+        with ui.dialog() as self._words, ui.card():
+            Rows("lab-words", TERMS)
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
             self._name = ui.input("file name", value="my_loop.toml", validation={
@@ -333,8 +260,9 @@ class FileMenu:
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
     def _data(self) -> None:
-        if self._session.run is not None:
-            ui.download(csv_of(self._session.run).encode(), "exploration.csv", "text/csv")
+        if self._session.results is not None:
+            content = csv_of(self._session.results.run).encode()
+            ui.download(content, "exploration.csv", "text/csv")
 
     async def _figure(self, kind: FigureFormat) -> None:
         shown = self._session.shown()
@@ -363,10 +291,9 @@ def csv_of(run: Exploration) -> str:
 def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
     from cosim.interactive.exploration_figure import exploration_figure
-    from cosim.output.figure_drawing import draw
     from cosim.output.figure_files import file_content
 
-    return file_content(draw(exploration_figure(shown)), kind)
+    return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
 
 
 class Step(NamedTuple):
@@ -379,54 +306,10 @@ class Step(NamedTuple):
     drag: str
 
 
-STEPS = (
-    Step(
-        "What is an event?",
-        "The sensor runs a model x_s of the plant and knows the plant's state x. It transmits only "
-        "when its error ‖x_s − x‖ exceeds the threshold βe^(−αt). Each point in the lowest panel "
-        "of the figure is a transmission.",
-        "lane_following", {"network.loss": {"model": "lossless"}},
-        "Drag β: a larger threshold gives fewer events and larger errors.",
-    ),
-    Step(
-        "What does a loss do?",
-        "The controller runs the same model x_c, but it learns only from packets that arrive. "
-        "Nobody acknowledges anything, so the sensor does not know what was lost. A cross is a "
-        "lost packet; after it ‖e_c‖ stays large until the next packet arrives.",
-        "lane_following", {"network.loss": {"model": "bernoulli", "probability": 0.5}},
-        "Drag the loss probability from 0 to 1.",
-    ),
-    Step(
-        "What is guaranteed?",
-        "The network loses at most M − 1 consecutive packets. Then the certificate bounds every "
-        "run: ‖e_c‖ ≤ Δβe^(−αt), and no two events are closer than δ. The green curves are these "
-        "bounds; they hold for every loss pattern, not only for this one.",
-        "lane_weighted", {},
-        "Drag M − 1: the bound grows, the run changes little.",
-    ),
-    Step(
-        "What can go wrong?",
-        "An event trigger answers losses with more transmissions, so it is hard to break. A clock "
-        "does not: here the sensor transmits every 0.1 s, whatever happens, and the controller "
-        "holds what it received. The margin below the figure is the largest M for which no loss "
-        "pattern makes the loop unstable.",
-        "unstable_pendulum",
-        {
-            "mode": "zoh", "trigger": {"policy": "periodic", "period_s": 0.1},
-            "network.loss": {"model": "worst_case"}, "network.mansd": 0,
-        },
-        "Drag M − 1 upwards until the loop diverges; then change the mode to model-based.",
-    ),
-    Step(
-        "Your own plant under 80 % loss",
-        "Replace the matrices under “all settings (TOML)” with those of your plant: [model] has A, "
-        "B and the gain. Then run it live: five processes exchange real UDP packets, and the "
-        "claims are judged while they run.",
-        "double_integrator",
-        {"network.loss": {"model": "bernoulli", "probability": 0.8}},
-        "Drag M − 1, then press “run live”.",
-    ),
-)  # fmt: skip
+def _steps() -> list[Step]:
+    content = tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text(encoding="utf-8"))
+    return [Step(**step) for step in content["steps"]]
+
 
 Begin = Callable[[Step], Awaitable[None]]
 
@@ -435,7 +318,7 @@ class TutorialPanel:
     """The text of one step at a time; the figure is beside it."""
 
     def __init__(self, begin: Begin) -> None:
-        self._begin, self._place = begin, 0
+        self._begin, self._place, self._steps = begin, 0, _steps()
         with ui.card().classes("w-full"):
             self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
             self._text = ui.label()
@@ -448,12 +331,12 @@ class TutorialPanel:
         self._show()
 
     def _show(self) -> None:
-        step = STEPS[self._place]
-        self._title.set_text(f"{self._place + 1} of {len(STEPS)}: {step.title}")
+        step = self._steps[self._place]
+        self._title.set_text(f"{self._place + 1} of {len(self._steps)}: {step.title}")
         self._text.set_text(step.text)
         self._drag.set_text(step.drag)
         self._back.set_visibility(self._place > 0)
-        self._next.set_visibility(self._place < len(STEPS) - 1)
+        self._next.set_visibility(self._place < len(self._steps) - 1)
 
     async def _go(self, by: int) -> None:
         self._place += by
@@ -461,4 +344,4 @@ class TutorialPanel:
         await self._start()
 
     async def _start(self) -> None:
-        await self._begin(STEPS[self._place])
+        await self._begin(self._steps[self._place])

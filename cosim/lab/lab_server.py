@@ -10,28 +10,28 @@ another secret, which leads to the page for processes of this user only.
 
 import asyncio
 import os
-import re
 import secrets
 import socket
 import sys
 import webbrowser
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
 from nicegui import ui
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 
 from cosim.lab.lab_page import show_page
 from cosim.lab.lab_services import LabServices
 from cosim.lab.runs_panel import serve_reports
-from cosim.output.viewer.rerun_program import socket_user
+from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
 from noack.core.errors import MachineError
-
-HOST = "127.0.0.1"
 
 
 @dataclass(frozen=True)
@@ -120,33 +120,26 @@ def _listener(port: int) -> socket.socket:
     return listener
 
 
-Scope = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
-Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-Application = Callable[[Scope, Receive, Send], Awaitable[None]]
-
-_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 _SECRET_BYTES = 32
-_HEADERS = (
-    (b"referrer-policy", b"no-referrer"),
-    (b"x-frame-options", b"DENY"),
-    (b"x-content-type-options", b"nosniff"),
-    (b"cross-origin-opener-policy", b"same-origin"),
-    (b"cross-origin-resource-policy", b"same-origin"),
+_HEADERS = {
+    "referrer-policy": "no-referrer",
+    "x-frame-options": "DENY",
+    "x-content-type-options": "nosniff",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
     # The rerun viewer, which is in a frame, draws in another process of the browser: while it
     # draws without a graphics card, it would keep this page from handling clicks for seconds.
-    (b"origin-agent-cluster", b"?1"),
+    "origin-agent-cluster": "?1",
     # The framework compiles its templates in the browser, which needs unsafe-eval.
-    (b"content-security-policy",
-     b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
-     b"style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
-     b"connect-src 'self'; worker-src 'self' blob:; frame-src http://127.0.0.1:* "
-     b"http://localhost:*; frame-ancestors 'none'; base-uri 'self'; form-action 'self'"),
-)  # fmt: skip
-
+    "content-security-policy":
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self'; worker-src 'self' blob:; frame-src http://127.0.0.1:* "
+    "http://localhost:*; frame-ancestors 'none'; base-uri 'self'; form-action 'self'",
+}  # fmt: skip
 _UNKNOWN = (
-    b"noack lab: this is not the address of the page. Each start of noack lab has another address:"
-    b" open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"
+    "noack lab: this is not the address of the page. Each start of noack lab has another address:"
+    " open the one that its terminal shows. What follows the '?' are the settings; add it there.\n"
 )
 
 
@@ -164,66 +157,53 @@ class AddressGuard:
         opening: the secret for a command line.
     """
 
-    def __init__(self, application: Application, secret: str, opening: str) -> None:
+    def __init__(self, application: ASGIApp, secret: str, opening: str) -> None:
         self._application = application
         self._root, self._opening = f"/{secret}", f"/{opening}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an admitted request on; refuse another one."""
-        if scope["type"] == "lifespan":
-            await self._application(scope, receive, send)
+        answer = None if scope["type"] == "lifespan" else self._answer(scope)
+        if answer is not None:
+            await answer(scope, receive, send)
             return
-        status = self._refusal(scope)
-        if status == 404 and self._may_open(scope):
-            to = f"{self._root}/?".encode() + scope["query_string"]
-            headers = [(b"location", to), *_HEADERS]
-            await send({"type": "http.response.start", "status": 303, "headers": headers})
-            await send({"type": "http.response.body"})
-            return
-        if status is not None:
-            await _refuse(scope, receive, send, status)
-            return
-        await self._application({**scope, "root_path": self._root}, receive, _protected(send))
 
-    def _refusal(self, scope: Scope) -> int | None:
-        """Return the status of the refusal, or None."""
-        headers = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
-        hosts = [value for name, value in headers if name == b"host"]
-        origins = [value for name, value in headers if name == b"origin"]
-        if len(hosts) != 1 or not _OWN_HOST.fullmatch(hosts[0]):
-            return 403
-        if any(origin != f"http://{hosts[0]}" for origin in origins):
-            return 403
-        if scope["type"] == "websocket" and not origins:
-            return 403  # a browser names it; nothing else needs this socket
-        return None if _begins(scope, self._root) else 404
+        async def protected(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.append(name, value)
+            await send(message)
 
-    def _may_open(self, scope: Scope) -> bool:
-        """Whether this is the first request of a browser that this user has started."""
-        if scope["type"] != "http" or not _begins(scope, self._opening):
-            return False
+        await self._application({**scope, "root_path": self._root}, receive, protected)
+
+    def _answer(self, scope: Scope) -> ASGIApp | None:
+        """Return the answer to a request that is not passed on; None for others."""
+        is_socket, headers = scope["type"] == "websocket", Headers(scope=scope)
+        hosts, origins = headers.getlist("host"), headers.getlist("origin")
+        is_own = len(hosts) == 1 and OWN_HOST.fullmatch(hosts[0]) is not None
+        is_own = is_own and all(origin == f"http://{hosts[0]}" for origin in origins)
+        # A browser names the origin of a socket; nothing else needs this socket.
+        if not is_own or (is_socket and not origins):
+            return _POLICY_VIOLATION if is_socket else Response(None, 403, _HEADERS)
+        if _begins(scope, self._root):
+            return None
+        if is_socket:
+            return _POLICY_VIOLATION
+        if _begins(scope, self._opening) and self._is_of_this_user(scope):
+            query = scope["query_string"].decode("latin-1")
+            return RedirectResponse(f"{self._root}/?{query}", 303, _HEADERS)
+        return PlainTextResponse(_UNKNOWN, 404, _HEADERS)
+
+    @staticmethod
+    def _is_of_this_user(scope: Scope) -> bool:
+        """Whether a request is from a process of this user, as a browser that was started here."""
         return socket_user(scope["client"], scope["server"]) == os.getuid()
+
+
+_POLICY_VIOLATION = WebSocketClose(code=1008)
 
 
 def _begins(scope: Scope, root: str) -> bool:
     first = "/" + scope["path"].removeprefix("/").partition("/")[0]
     return secrets.compare_digest(first.encode(), root.encode())
-
-
-async def _refuse(scope: Scope, receive: Receive, send: Send, status: int) -> None:
-    if scope["type"] == "websocket":
-        await receive()
-        await send({"type": "websocket.close", "code": 1008})
-        return
-    headers = [(b"content-type", b"text/plain"), *_HEADERS]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": _UNKNOWN if status == 404 else b""})
-
-
-def _protected(send: Send) -> Send:
-    async def protected(message: MutableMapping[str, Any]) -> None:
-        if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", ()), *_HEADERS]
-        await send(message)
-
-    return protected

@@ -17,16 +17,17 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
-from cosim.interactive.ensemble import Ensemble, explore_ensemble
-from cosim.interactive.exploration import Exploration, explore, simulate_sampled, why_not_exact
-from cosim.interactive.exploration_figure import Shown
-from cosim.interactive.scenario_guarantee import (
-    Guarantee,
-    Margin,
-    certify,
-    margin_of,
-    warning,
+from cosim.interactive.ensemble import explore_ensemble
+from cosim.interactive.exploration import Exploration, run_of, why_not_exact
+from cosim.interactive.exploration_figure import (
+    CERTIFICATE,
+    ENSEMBLE,
+    MARGIN,
+    RUN,
+    DraftResults,
+    Shown,
 )
+from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
 from cosim.record.run_directory import SUMMARY_FILE
 from noack.config.scenario import Scenario
@@ -181,10 +182,8 @@ class Session:
     draft: Draft
     on_drawn: Callable[[], Awaitable[None]]
     """Called when there is something new to draw."""
-    run: Exploration | None = None
-    ensemble: Ensemble | None = None
-    guarantee: Guarantee | None = None
-    margin: Margin | None = None
+    results: DraftResults | None = None
+    """Of the draft; None without a run."""
     reference: Exploration | None = None
     state: int = 0
     mistakes: list[Mistake] = field(default_factory=list)
@@ -224,55 +223,52 @@ class Session:
             self._busy = False
         self._later = asyncio.create_task(self._compute_rest())
 
-    @property
-    def warning(self) -> str:
-        """In words: whether the loop is unstable, and why nothing is guaranteed."""
-        return "" if self.run is None else warning(self.run, self.guarantee, self.margin)
-
     def keep(self) -> None:
         """Keep the run for comparison, or forget the one that was kept."""
-        self.reference = self.run if self.reference is None else None
+        kept = self.reference is not None
+        self.reference = None if kept or self.results is None else self.results.run
 
     def shown(self) -> Shown | None:
         """Return what the figure shows; None without a run."""
-        if self.run is None:
+        if self.results is None:
             return None
-        self.state = min(self.state, self.run.x.shape[1] - 1)
-        return Shown(self.run, self.state, self.ensemble, self.guarantee, self.reference)
+        self.state = min(self.state, self.results.run.x.shape[1] - 1)
+        return self.results.shown(self.state)._replace(reference=self.reference)
 
     async def _explore(self) -> None:
-        self.ensemble = self.guarantee = self.margin = None
-        self.mistakes, self.note = [], ""
+        self.results, self.mistakes, self.note = None, [], ""
         try:
             scenario = self.draft.scenario
             if scenario.loops:
-                self.run, self.note = None, "a scenario of several loops: run it live"
+                self.note = "a scenario of several loops: run it live"
                 return
-            if (why := why_not_exact(scenario)) is None:
-                self.run = explore(scenario)
-            else:
-                self.note = f"in virtual time, which takes about a second: {why}"
-                self.run = await self._compute("run", simulate_sampled, scenario)
+            results = DraftResults(self.draft)
+            if (why := why_not_exact(scenario)) is not None:
+                self.note = f"in virtual time, which takes longer: {why}"
+                results.put(RUN, await self._compute("run", run_of, scenario))
+            _ = results.run  # an exact one takes some milliseconds
+            self.results, self.pending = results, "computing: certificate"
         except DraftError as error:
-            self.run, self.mistakes = None, error.mistakes
+            self.mistakes = error.mistakes
         except NoackError as error:
-            self.run, self.note = None, str(error)
-        self.pending = "" if self.run is None else "computing: certificate"
+            self.note = str(error)
 
     async def _compute_rest(self) -> None:
         """Compute what takes longer, once the settings have rested for a moment."""
-        if self.run is None:
+        if (results := self.results) is None:
             return
         await asyncio.sleep(_QUIET_S)
         scenario = self.draft.scenario
         try:
-            self.guarantee = await self._compute("certificate", certify, scenario)
+            results.put(CERTIFICATE, await self._compute("certificate", certify, scenario))
             await self.on_drawn()
             if why_not_exact(scenario) is None:
-                self.ensemble = await self._compute("bands", explore_ensemble, scenario)
+                results.put(ENSEMBLE, await self._compute("bands", explore_ensemble, scenario))
                 await self.on_drawn()
             await asyncio.sleep(_MARGIN_S)
-            self.margin = await self._compute("margin", margin_of, scenario)
+            margin = await self._compute("margin", margin_of, scenario)
+            if margin.defined:
+                results.put(MARGIN, margin)
         except NoackError as error:
             self.note, self.pending = str(error), ""
         await self.on_drawn()

@@ -15,14 +15,6 @@ from noack.core.errors import NoackError
 from noack.core.number_format import number
 from noack.runtime.run_registry import find, request_change
 
-_DRAWS_BY_PROCESSOR = """(() => {
-  const gl = document.createElement('canvas').getContext('webgl2');
-  const info = gl?.getExtension('WEBGL_debug_renderer_info');
-  const name = gl?.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-  gl?.getExtension('WEBGL_lose_context')?.loseContext();
-  return !name || /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
-})()"""
-"""Whether the browser has no graphics card to draw with."""
 _POLL_S = 0.25
 _REJOIN_S = 5.0
 _KILLABLE = ("sensor", "netem", "controller")
@@ -83,7 +75,7 @@ class LivePanel:
 
     async def begin(self) -> None:
         """Decide whether the viewer is shown without being asked for."""
-        slow = await ui.run_javascript(_DRAWS_BY_PROCESSOR, timeout=ANSWER_S)
+        slow = await ui.run_javascript("labDrawsByProcessor()", timeout=ANSWER_S)
         self._shows_viewer = not slow
 
     def take(self, draft: Draft) -> None:

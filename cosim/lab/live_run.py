@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.interactive.draft import Draft
-from cosim.live.launcher import Watcher, launch
+from cosim.live.launcher import launch
+from cosim.live.run_watcher import Watcher
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
@@ -190,7 +191,7 @@ def main() -> int:
         started=lambda run_dir: _say("started", run_dir=str(run_dir)),
         failed=lambda why, t_s, by_hand: _say("failed", why=why, t_s=t_s),
         restarted=lambda role, t_s: _say("restarted", role=role, t_s=t_s),
-        progress=lambda report: _say("progress", **report),
+        progress=lambda report: _say("progress", **report.fields()),
     )
     try:
         draft = Draft("scenario", folder, "", sys.stdin.buffer.read().decode())

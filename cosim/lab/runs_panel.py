@@ -4,7 +4,6 @@ The full report of a run is served below the page's address.
 """
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -13,6 +12,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
 
+from cosim.lab.explore_panel import Rows
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls
 from cosim.output.figure_format import SCREEN_IN
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
@@ -20,7 +20,7 @@ from noack.core.errors import NoackError
 
 _COLUMN_IN = 3.5
 """Width for which figures are laid out on a small screen."""
-_FIGURES = ("states", "errors", "state-norm", "input", "inter-event")
+_FIGURES = ("network", "loops", "map", "states", "errors", "state-norm", "input", "inter-event")
 
 
 NARROW_PX = 800
@@ -42,17 +42,17 @@ class Opened(NamedTuple):
 def opened(directory: Path, width_in: float) -> Opened:
     """Read a run and draw figures of a width; called in the worker process."""
     import noack
-    from cosim.output.figure_files import markup_of
+    from cosim.output.figure_files import inline
     from cosim.output.figure_style import figure_width
+    from cosim.output.run_figures import page_figures
     from cosim.output.run_tables import run_facts
     from cosim.output.run_verdict import verdict
+    from cosim.record.run_record import load_run
 
     run = noack.open_run(directory)
-    figures = []
+    known = page_figures(load_run(directory), lambda: run.summary)
     with figure_width(width_in):
-        for name in _FIGURES:
-            with suppress(NoackError):
-                figures.append(markup_of(run.plot(name), f"run-{name}", f"figure: {name}"))
+        figures = [inline(known[name]()) for name in _FIGURES if name in known]
     claims = [(str(one.verdict), f"{one.what} ({one.source})") for one in run.claims]
     lines = [(line.text, line.style) for line in verdict(run.summary)]
     return Opened(lines, run_facts(run.summary, run.directory), claims, figures)
@@ -140,12 +140,7 @@ class RunsPanel:
 
     def _show(self, found: Opened, directory: Path) -> None:
         show_verdict(found.verdict, directory.name)
-        with ui.element("dl").classes("lab-rows"):
-            for name, value in found.facts:
-                with ui.element("dt"):
-                    ui.label(name)
-                with ui.element("dd"):
-                    ui.label(value)
+        Rows("lab-rows", found.facts)
         with ui.expansion(f"{len(found.claims)} claims").classes("w-full"):
             for verdict, claim in found.claims:
                 ui.label(f"{verdict}: {claim}")

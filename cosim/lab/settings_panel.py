@@ -26,26 +26,6 @@ from cosim.interactive.draft import Draft, DraftError, Mistake
 from noack.core.errors import NoackError
 from noack.core.number_format import number
 
-_NAME_EDITOR = """() => {
-  for (const text of document.querySelectorAll('.cm-content')) text.ariaLabel = 'scenario as TOML';
-  for (const area of document.querySelectorAll('.cm-scroller')) area.tabIndex = 0;
-}"""
-"""The editor cannot be given these from the server."""
-_SPEAK = """
-const panel = document.querySelector('.lab-settings');
-const speak = () => {
-  for (const slider of panel.querySelectorAll('.q-slider')) {
-    const text = slider.previousElementSibling.lastElementChild.textContent;
-    if (slider.ariaValueText !== text) slider.ariaValueText = text;
-  }
-};
-new MutationObserver(speak).observe(panel, {subtree: true, childList: true, characterData: true});
-speak();
-"""
-"""Gives each slider its value in words: the place of a logarithmic one is the value's logarithm.
-
-Set by the server, it would send the slider's old place, too, while it is dragged.
-"""
 Changed = Callable[[Draft, str], Awaitable[None]]
 """Called with the new draft and the key that changed; an empty key: the whole text."""
 
@@ -79,7 +59,7 @@ class SettingsPanel:
             self._editor = ui.codemirror(
                 draft.text, language="TOML", line_wrapping=False, on_change=self._edited
             ).classes("w-full h-96")
-        whole.on("after-show", js_handler=_NAME_EDITOR)
+        whole.on("after-show", js_handler="labNameEditor")
         self._build()
 
     def show(self, draft: Draft, *, text: bool = True) -> None:
@@ -96,7 +76,7 @@ class SettingsPanel:
 
     def begin(self) -> None:
         """Name in the browser what can only be named there."""
-        ui.run_javascript(_SPEAK)
+        ui.run_javascript("labSpeakSliders()")
 
     def show_dark(self, *, dark: bool) -> None:
         """Choose the colours of the editor."""

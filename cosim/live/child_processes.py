@@ -22,6 +22,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
+from cosim.live.run_watcher import Watcher
 from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError
@@ -97,11 +98,7 @@ class Hosts(ScenarioSection):
 
 
 def load_hosts(path: Path) -> Hosts:
-    """Read a file of hosts.
-
-    Raises:
-        CallerError: it is wrong, or no ssh client is installed.
-    """
+    """Read a file of hosts; raise CallerError if it is wrong, or no ssh client is installed."""
     hosts = toml_file.validated(Hosts, toml_file.read(path, Hosts), str(path))
     if shutil.which("ssh") is None:
         raise CallerError("--hosts: no ssh client is installed; install openssh-client")
@@ -119,8 +116,7 @@ class RemoteStart(NamedTuple):
 def start_over_ssh(role: str, host: Host, invitation: str, log: IO[str]) -> subprocess.Popen[str]:
     """Start a process on another host, which ends by itself, with the run.
 
-    Raises:
-        OSError: ssh cannot be started.
+    Raise OSError if ssh cannot be started.
     """
     remote = f"{host.command} {role} --invitation - --runs {shlex.quote(host.runs)}"
     child = subprocess.Popen(
@@ -165,8 +161,7 @@ class ChildProcesses:
     def started(self, *, live: bool) -> Iterator[None]:
         """Start the processes; end all of them with the context.
 
-        Raises:
-            MachineError: a process cannot be started.
+        Raise MachineError if a process cannot be started.
         """
         try:
             for role in self._roles:
@@ -179,8 +174,7 @@ class ChildProcesses:
     def restart(self, role: str) -> None:
         """End a process and start another of its role.
 
-        Raises:
-            MachineError: it cannot be started.
+        Raise MachineError if it cannot be started.
         """
         _end(self._children[role])
         self._children[role] = self._start(role, live=False)
@@ -247,7 +241,9 @@ class ChildProcesses:
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         lines, own = self._log_lines(role), f"noack {role}: "
         # Libraries write to the log, too; and on a full disk the log may be empty.
-        logged = next((one.removeprefix(own) for one in lines[::-1] if one.startswith(own)), None)
+        logged = next(
+            (line.removeprefix(own) for line in lines[::-1] if line.startswith(own)), None
+        )
         why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
 
@@ -303,14 +299,10 @@ class RestartPolicy:
         scenario: Scenario,
         coordinator: Coordinator,
         children: ChildProcesses,
-        on_failure: Callable[[str, float, str | None], None],
-        on_restart: Callable[[str, float], None],
+        watcher: Watcher,
     ) -> None:
-        self._scenario = scenario
-        self._coordinator = coordinator
-        self._children = children
-        self._on_failure = on_failure
-        self._on_restart = on_restart
+        self._scenario, self._coordinator = scenario, coordinator
+        self._children, self._watcher = children, watcher
         self._failed: dict[str, _Failed] = {}
 
     def check(self) -> Failure | None:
@@ -330,7 +322,7 @@ class RestartPolicy:
         for role, ((status, why), until_s) in list(self._failed.items()):
             if self._coordinator.running_generation(role) is not None:
                 del self._failed[role]
-                self._on_restart(role, self._t_s())
+                self._watcher.restarted(role, self._t_s())
             elif role in exited:
                 return exited[role][0], f"{why}; restarted, {exited[role][1]}"
             elif time.monotonic() > until_s:
@@ -349,7 +341,7 @@ class RestartPolicy:
             self._failed[role] = _Failed((status, why), time.monotonic() + within_s)
             launched = role in self._children
             self._coordinator.allow_restart(role, why, dead=self._children.is_dead(role))
-            self._on_failure(why, self._t_s(), None if launched else role)
+            self._watcher.failed(why, self._t_s(), None if launched else role)
             if launched:
                 try:
                     self._children.restart(role)
@@ -368,7 +360,11 @@ class RestartPolicy:
         }
         if self._is_past_horizon() and RECORDER in running:
             failures.pop(RECORDER, None)  # sorting a long record, it may not respond
-        return {role: one for role, one in (failures | exited).items() if role not in self._failed}
+        return {
+            role: failure
+            for role, failure in (failures | exited).items()
+            if role not in self._failed
+        }
 
     def _is_past_horizon(self) -> bool:
         return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns

@@ -40,12 +40,12 @@ class ClaimMonitor:
 
     def __init__(self, scenario: Scenario) -> None:
         loops = resolved_loops(scenario)
-        self._names = [one.name for one in loops]
+        self._names = [loop.name for loop in loops]
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._stopped: str | None = None
         self._until_s = np.inf
         checked = loops if len(loops) <= MOST_CHECKED else ()
-        self._monitors = [AssumptionMonitor(one) for one in checked]
+        self._monitors = [AssumptionMonitor(checked_loop) for checked_loop in checked]
         if not checked:
             self.stop(f"the run has {len(loops)} loops; up to {MOST_CHECKED} are checked during it")
         self._growth = GrowthMonitor(loops)
@@ -57,7 +57,7 @@ class ClaimMonitor:
     @property
     def stopped(self) -> str | None:
         """Reason why assumptions are checked no longer; None while they are."""
-        ended = (one.stopped for one in self._monitors if one.stopped is not None)
+        ended = (monitor.stopped for monitor in self._monitors if monitor.stopped is not None)
         return self._stopped or next(ended, None)
 
     def stop(self, why: str) -> None:
@@ -68,8 +68,8 @@ class ClaimMonitor:
     def end_at(self, t_s: float) -> None:
         """Ignore what happens after a change of settings at a time of the run."""
         self._until_s = min(self._until_s, t_s)
-        for one, phase_ns in zip(self._monitors, self._phases_ns, strict=False):
-            one.end_at(t_s - phase_ns / NS_PER_S)
+        for monitor, phase_ns in zip(self._monitors, self._phases_ns, strict=False):
+            monitor.end_at(t_s - phase_ns / NS_PER_S)
 
     def take(self, table: str, rows: Rows) -> None:
         """Add rows of a table, in their order."""
@@ -112,9 +112,9 @@ class ClaimMonitor:
     def _check(
         self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]
     ) -> None:
-        for one in check(self._monitors[loop]):
-            t_ns = round(one.t_s * NS_PER_S)
-            self._add(loop, t_ns, "void", "void (assumption violated)", one.text)
+        for violation in check(self._monitors[loop]):
+            t_ns = round(violation.t_s * NS_PER_S)
+            self._add(loop, t_ns, "void", "void (assumption violated)", violation.text)
 
     def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
         own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"

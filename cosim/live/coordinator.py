@@ -8,6 +8,7 @@ change of runtime parameters is checked, given a time, and announced.
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from noack.config.parameter_changes import (
     current_parameters,
     scheduled,
 )
-from noack.config.scenario import loop_scenario
+from noack.config.scenario import loop_scenario, loop_sections
 from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
@@ -29,10 +30,14 @@ from noack.core.process_limits import cores
 from noack.impairments.loss_prediction import found_probabilities
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
 from noack.runtime.control_messages import (
+    Admission,
     AdmissionRequest,
+    ChangeAnnouncement,
+    ChangeReply,
     ChangeRequest,
     JoinRequest,
     RunProgress,
+    RunStart,
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, header_of, next_payload
@@ -48,8 +53,6 @@ _EXIT_GRACE_S = 5.0
 _CHANGE_DELAY_S = 0.2
 """Wall time from a change's announcement to its effect: processes look every 0.05 s."""
 _MILLISECOND_NS = 1_000_000
-
-
 _START_DELAY_NS, _LONG_START_DELAY_NS = 30_000_000, 100_000_000
 """From the last arrival to the common epoch: time for the message to reach all processes. The
 longer one is for processes on other hosts, and for a loaded machine."""
@@ -183,18 +186,15 @@ class Coordinator:
 
     def is_over(self, role: str) -> bool:
         """Whether the process of a role has joined, and has ended or is lost."""
-        member = self._members.get(role)
-        return member is not None and member.is_over
+        return role in self._members and self._members[role].is_over
 
     def has_ended(self, role: str) -> bool:
         """Whether the process of a role has reported its end; one that is lost has not."""
-        member = self._members.get(role)
-        return member is not None and member.state is State.GONE
+        return role in self._members and self._members[role].state is State.GONE
 
     def is_exiting(self, role: str) -> bool:
         """Whether a process reported its end a moment ago, so that it may not have exited yet."""
-        member = self._members.get(role)
-        return member is not None and member.state is State.GONE and member.age_s() < _EXIT_GRACE_S
+        return self.has_ended(role) and self._members[role].age_s() < _EXIT_GRACE_S
 
     def reported_failure(self, role: str) -> str | None:
         """Why a process ended early, by its own report; None without a report."""
@@ -223,15 +223,12 @@ class Coordinator:
         if dead:
             self._members[role].apply(Event.END, failure)
 
-    def progress(self) -> dict[str, Any] | None:
+    def progress(self) -> RunProgress | None:
         """The recorder's newest progress report; None without a new one."""
-        payload = next_payload(self._progress)
-        if payload is None:
-            return None
-        try:
-            return parse_message(RunProgress, payload)
-        except PeerError:  # not from the recorder
-            return None
+        with suppress(PeerError):  # not from the recorder
+            if (payload := next_payload(self._progress)) is not None:
+                return parse_message(RunProgress, payload)
+        return None
 
     def _apply(self, key_expr: object, event: Event, reason: str | None = None) -> None:
         if (member := self._admitted.get(_sender(key_expr))) is not None:
@@ -273,24 +270,19 @@ class Coordinator:
             self.plane.answer(query, answer)
 
     def _admit(self, role: str, query: zenoh.Query) -> None:
-        """Admit a process to the run.
-
-        Raises:
-            PeerError: it cannot join.
-        """
+        """Admit a process to the run; raise PeerError if it cannot join."""
         request = parse_message(AdmissionRequest, _payload(query))
-        instance = request["instance"]
         if role not in ROLES:
             raise PeerError("a run has no such process")
-        self._require_pass(role, request.get("admission_pass", ""))
+        self._require_pass(role, request.admission_pass)
         before, failure = self._vacant(role), self._replaceable.get(role)
         if self._clock is not None and (before is None or failure is None):
             raise PeerError("the run has started without it")
         admission = _admission(before, failure, self._clock)
-        member = _Member(role, instance, admission["generation"])
-        member.address = admission["address"]
+        member = _Member(role, request.instance, admission.generation)
+        member.address = admission.address
         member.apply(Event.ADMIT)
-        self._admitted[role, instance] = member
+        self._admitted[role, request.instance] = member
         self.plane.answer(query, admission)
 
     def _require_pass(self, role: str, shown: str) -> None:
@@ -306,11 +298,10 @@ class Coordinator:
     def _join(self, role: str, query: zenoh.Query) -> None:
         """Let a process wait at the start barrier; pass it if the run has started.
 
-        Raises:
-            PeerError: it cannot join.
+        Raise PeerError if it cannot join.
         """
         request = parse_message(JoinRequest, _payload(query))
-        member = self._admitted.get((role, request["instance"]))
+        member = self._admitted.get((role, request.instance))
         current = self._members.get(role)
         if current is not member:
             current = self._vacant(role)
@@ -319,14 +310,14 @@ class Coordinator:
             and member.generation <= current.generation
         ):  # fmt: skip
             raise PeerError("it was not admitted")
-        if (request["address"] is None) == (role in LOOP_ROLES):
+        if (request.address is None) == (role in LOOP_ROLES):
             raise PeerError("a process of the loop needs an address, the recorder has none")
-        if self._clock is not None and request["address"] != member.address:
+        if self._clock is not None and request.address != member.address:
             raise PeerError("it must use the address of the process before it")
         member.apply(Event.JOIN)
         if current is not None and current is not member:
             current.apply(Event.REPLACE)
-        member.address, member.query = request["address"], query
+        member.address, member.query = request.address, query
         self._members[role] = member
         if self._clock is not None:
             self._replaceable.pop(role, None)
@@ -335,8 +326,7 @@ class Coordinator:
     def _vacant(self, role: str) -> _Member | None:
         """Return the process that had the role before, which must be over.
 
-        Raises:
-            PeerError: it is not over.
+        Raise PeerError if it is not over.
         """
         before = self._members.get(role)
         if before is not None and before.state is State.UNREACHABLE:
@@ -358,28 +348,29 @@ class Coordinator:
         if member.state is State.AT_BARRIER:
             member.apply(Event.START)
         self.joined[member.instance] = {"process": member.role, "generation": member.generation}
-        addresses = {role: self._members[role].address for role in LOOP_ROLES}
+        members = [self._members[role] for role in LOOP_ROLES]
+        addresses = {
+            member.role: member.address for member in members if member.address is not None
+        }
         query, member.query = member.query, None
         assert query is not None
-        self.plane.answer(query, {
-            "epoch_ns": self.epoch_ns, "addresses": addresses, "changes": self._changes.announced,
-        })  # fmt: skip
+        assert self._clock is not None
+        epoch_ns, changes = self._clock.epoch_ns, self._changes.announced
+        self.plane.answer(query, RunStart(epoch_ns=epoch_ns, addresses=addresses, changes=changes))
 
 
-def _admission(
-    before: _Member | None, failure: str | None, clock: RunClock | None
-) -> dict[str, Any]:
+def _admission(before: _Member | None, failure: str | None, clock: RunClock | None) -> Admission:
     """The admission of a process: to a run that has not started, or in the place of another."""
     if clock is None or before is None:
-        return {"generation": 0, "admitted_ns": 0, "from_ns": 0, "address": None, "replaces": None}
+        return Admission(generation=0, admitted_ns=0, from_ns=0, address=None, replaces=None)
     now_ns = clock.now_ns()
-    return {
-        "generation": before.generation + 1,
-        "admitted_ns": now_ns,
-        "from_ns": now_ns + int(_RESTART_DELAY_S * NS_PER_S * clock.speed),
-        "address": before.address,
-        "replaces": failure,
-    }
+    return Admission(
+        generation=before.generation + 1,
+        admitted_ns=now_ns,
+        from_ns=now_ns + int(_RESTART_DELAY_S * NS_PER_S * clock.speed),
+        address=before.address,
+        replaces=failure,
+    )
 
 
 def _sender(key_expr: object) -> tuple[str, str]:
@@ -398,35 +389,33 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        loops = ticket.scenario.loops or ()
-        self._schedule, *self._of_loops = (
-            ChangeSchedule(one)
-            for one in (ticket.scenario, *(loop_scenario(ticket.scenario, one) for one in loops))
-        )
-        self.announced: list[dict[str, Any]] = []
+        self._schedule = ChangeSchedule(ticket.scenario)
+        self._entries = {
+            section.name: ChangeSchedule(loop_scenario(ticket.scenario, section))
+            for section in loop_sections(ticket.scenario)
+        }
+        """The changes of the loops of each entry of [[loops]], by its name."""
+        self.announced: tuple[ChangeAnnouncement, ...] = ()
         """Announcements of all changes so far."""
         for change in scheduled(ticket.scenario):
             self._add(change, 0, "in the scenario")
 
-    def answer(
-        self, request: bytes, clock: Callable[[], int], obstacle: str | None
-    ) -> dict[str, Any]:
+    def answer(self, request: bytes, clock: Callable[[], int], obstacle: str | None) -> ChangeReply:
         """Announce the requested change, unless there is an obstacle; return the parameters.
 
-        Raises:
-            CallerError: the settings cannot be changed, or not now.
-            PeerError: the message is not a change request.
+        Raise CallerError if the settings cannot be changed, or not now; PeerError if the message is
+        not a change request.
         """
-        settings = parse_message(ChangeRequest, request).get("settings", {})
-        from_s, now_ns = None, clock()
+        settings = parse_message(ChangeRequest, request).settings
+        from_s, now_ns, before = None, clock(), self._parameters()
         if settings:
             if obstacle is not None:
                 raise CallerError(obstacle)
             if len(self.announced) >= MOST_CHANGES:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
             # Before the time is chosen, as it may take long.
-            for one in (self._schedule, *self._of_loops):
-                changed(one.last, settings)
+            for schedule in self._schedules:
+                changed(schedule.last, settings)
             now_ns = clock()
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
@@ -438,37 +427,45 @@ class ChangeRequests:
             requested_at = datetime.now(UTC).isoformat(timespec="milliseconds")
             self._plane.announce_change(self._add(change, now_ns, requested_at))
             from_s = t_ns / NS_PER_S
-        return {
-            "name": self._scenario.name,
-            "run_dir": self._run_dir,
-            "t_s": now_ns / NS_PER_S,
-            "from_s": from_s,
-            "runtime_parameters": current_parameters(self._schedule.last),
-        }
+        loops = self._parameters()
+        return ChangeReply(
+            name=self._scenario.name,
+            run_dir=self._run_dir,
+            t_s=now_ns / NS_PER_S,
+            from_s=from_s,
+            runtime_parameters=current_parameters(self._schedule.last),
+            loops=loops,
+            changed_loops=tuple(name for name in loops if loops[name] != before[name]),
+        )
 
-    def _add(self, change: ParameterChange, requested_ns: int, requested_at: str) -> dict[str, Any]:
+    @property
+    def _schedules(self) -> tuple[ChangeSchedule, ...]:
+        return (self._schedule, *self._entries.values())
+
+    def _parameters(self) -> dict[str, dict[str, Any]]:
+        return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
+
+    def _add(
+        self, change: ParameterChange, requested_ns: int, requested_at: str
+    ) -> ChangeAnnouncement:
         """Check and store a change; return its announcement.
 
-        Raises:
-            CallerError: the change is not valid for this run.
+        Raise CallerError if the change is not valid for this run.
         """
-        schedules = (self._schedule, *self._of_loops)
-        for one in schedules:
-            one.check(change, -1)
-        for one in schedules:
-            one.announce("", change, 0, 0, -1)
-        announcement = {
-            "number": change.number,
-            "t_ns": change.t_ns,
-            "settings": dict(change.settings),
-            "requested_ns": requested_ns,
-            "requested_at": requested_at,
-            "kept_losses": found_probabilities(
-                *(
-                    one.network.link
-                    for one in self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
-                )
+        for schedule in self._schedules:
+            schedule.check(change, -1)
+        for schedule in self._schedules:
+            schedule.announce("", change, 0, 0, -1)
+        later = self._schedule.between(change.t_ns, self._scenario.timing.horizon_ns)
+        announcement = ChangeAnnouncement(
+            number=change.number,
+            t_ns=change.t_ns,
+            settings=dict(change.settings),
+            requested_ns=requested_ns,
+            requested_at=requested_at,
+            kept_losses=found_probabilities(
+                *(changed_scenario.network.link for changed_scenario in later)
             ),
-        }
-        self.announced.append(announcement)
+        )
+        self.announced += (announcement,)
         return announcement

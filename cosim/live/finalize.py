@@ -5,14 +5,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import summarise_run
+from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
@@ -41,14 +42,17 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
+from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
-_LOOPS_AT_ONCE = 16
+_LOOPS_AT_ONCE = 64
+"""Loops whose certificates are computed together."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
@@ -80,14 +84,14 @@ def finalize(
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         with work_bar("the record of the run") as show:
             run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
-        summary = _judged(run, ending)
+        summary, over_time = _judged(run, ending)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
             # That of an earlier attempt may be complete: it stays if there is no space for another.
             quiet = (MachineError,) if is_shown else ()
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
-                _write_recording(run, summary, run_dir, None)
+                _write_recording(run, summary, run_dir, None, over_time)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
             for name in (*names, None):
@@ -125,22 +129,33 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-def _judged(run: RecordedRun, ending: RunEnding) -> RunSummary:
-    """Judge every loop and the network; return the summary of the run."""
+class _Judged(NamedTuple):
+    """What the end of a run finds out about a loop."""
+
+    summary: LoopSummary
+    over_time: LoopOverTime | None
+    """Only of several loops; None if it could not be computed."""
+
+
+def _judged(
+    run: RecordedRun, ending: RunEnding
+) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
+    """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
     with _judged_loops(run, ending) as found, work_bar(f"claims of {loops} loops") as show:
         if run.kind == "live" and loops > 1:
             replayed = _replay(run.network)
-        judged = []
-        for one in found:
-            judged.append(one)
+        judged: list[_Judged] = []
+        for loop in found:
+            judged.append(loop)
             show(len(judged) / loops)
-    summary = _summary(run, ending, judged)
-    if replayed is None:
-        return summary
-    network = summary.network.model_copy(update={"replay": replayed})
-    end = _exit_after_replay(summary.exit, replayed)
-    return summary.model_copy(update={"network": network, "exit": end})
+    summary = _summary(run, ending, [loop.summary for loop in judged])
+    if replayed is not None:
+        network = summary.network.model_copy(update={"replay": replayed})
+        end = _exit_after_replay(summary.exit, replayed)
+        summary = summary.model_copy(update={"network": network, "exit": end})
+    over_time = [loop.over_time for loop in judged if loop.over_time is not None]
+    return summary, over_time if len(over_time) == loops else None
 
 
 def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) -> RunSummary:
@@ -149,8 +164,8 @@ def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) 
 
 
 @contextmanager
-def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[LoopSummary]]:
-    """Yield the summaries of the loops; those of a long run come from a process for each core."""
+def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[_Judged]]:
+    """Yield the results of the loops; those of a long run come from a process for each core."""
     timing, loops = run.scenario.timing, len(run.loops)
     workers = min(cores(), loops)
     if workers < 2 or loops * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
@@ -158,62 +173,85 @@ def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[Loop
         plain = [_loop_summary(run, record, ending) for record in records]
         # Written again with the results, so that none of them can cost the summary.
         _write_summary(ending.run_dir, _summary(run, ending, plain))
+        certificates = _certificates([record.scenario for record in records])
         yield (
-            _with_results(record, one, ending.run_dir, loops)
-            for record, one in zip(records, plain, strict=True)
+            _with_results(run, ending.run_dir, *each)
+            for each in zip(records, plain, certificates, strict=True)
         )
         return
     with processes(workers) as pool:
-        # Consecutive loops share parts of the files, and equal certificates.
+        # Consecutive loops share parts of the files.
         width = min(max(loops // (4 * workers), 1), _LOOPS_AT_ONCE)
         blocks = (range(first, min(first + width, loops)) for first in range(0, loops, width))
         with interrupts_held():
             found = [pool.submit(_judged_stored_loops, ending, block) for block in blocks]
-        yield (one for block in found for one in block.result())
+        yield (loop for block in found for loop in block.result())
 
 
 @np.errstate(all="ignore")
-def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[LoopSummary]:
-    run, found = _stored_run(ending.run_dir), []
-    for number in numbers:
+def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[_Judged]:
+    run, judged = _stored_run(ending.run_dir), []
+    certificates = _certificates([run.scenarios[number] for number in numbers])
+    for number, own in zip(numbers, certificates, strict=True):
         record = run.loops[number]
         summary = _loop_summary(run, record, ending)
-        found.append(_with_results(record, summary, ending.run_dir, len(run.loops)))
-    return found
+        judged.append(_with_results(run, ending.run_dir, record, summary, own))
+    return judged
 
 
 _stored_run = cache(load_run)
 """The run of a worker process."""
 
 
+def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
+    """Return the certificates of loops; None if they fail, which the claims then report."""
+    try:
+        return certificates_together(scenarios)
+    except Exception:
+        return [None] * len(scenarios)
+
+
 def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
-    phase_ns = run.phases_ns[record.number or 0]
+    phase_ns = run.phases_ns[record.number]
     return summarise(record, int(ending.status), ending.reason, phase_ns)
 
 
 def _with_results(
-    record: RunRecord, summary: LoopSummary, run_dir: Path, loops: int
-) -> LoopSummary:
+    run: RecordedRun,
+    run_dir: Path,
+    record: RunRecord,
+    summary: LoopSummary,
+    certificates: Sequence[ScenarioCertificate] | None,
+) -> _Judged:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
     with ReplayProcess(record, run_dir) as replaying:
-        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, loops)}
+        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
         try:
             results["linearisation"] = linearisation(record.scenario)
         except Exception as error:  # likewise
             print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
         try:
-            results |= _claim_results(record, summary)
+            results |= _claim_results(record, summary, certificates)
         except Exception as error:  # likewise
             print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
         if record.kind == "live":
             verdict = replaying.verdict()
             replayed = _replay(record) if verdict is None else ReplayPart(**verdict)
             results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
-    return summary.with_results(**results)
+    over_time = None
+    with suppress(Exception):  # the recording reports it
+        if len(run.loops) > 1:
+            over_time = loop_over_time(record, run.phases_ns[record.number or 0])
+    return _Judged(summary.with_results(**results), over_time)
 
 
-def _claim_results(record: RunRecord, summary: LoopSummary) -> dict[str, Any]:
+def _claim_results(
+    record: RunRecord,
+    summary: LoopSummary,
+    certificates: Sequence[ScenarioCertificate] | None,
+) -> dict[str, Any]:
     claims = claims_of(record)
+    claims.certificates = certificates
     longest = summary.longest_loss_burst
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
@@ -305,11 +343,15 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 
 
 def _write_recording(
-    run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    loop: str | None,
+    known: Sequence[LoopOverTime] | None = None,
 ) -> None:
     from cosim.output.viewer.run_recording import write_view  # imports rerun
 
-    write_view(run, summary, run_dir, loop)
+    write_view(run, summary, run_dir, loop, known)
 
 
 def _write_report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:

@@ -196,8 +196,7 @@ class ForkServer:
 def fork_server(server: ForkServer | None = None) -> Iterator[ForkServer | None]:
     """Have a fork server while the context lasts, this or a new one; None without Linux.
 
-    Raises:
-        MachineError: it cannot be started.
+    Raise MachineError if it cannot be started.
     """
     if sys.platform != "linux":
         yield None

@@ -12,15 +12,15 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ForkServer, fork_server
+from cosim.live.run_watcher import Watcher, joint_watcher
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,
@@ -36,6 +36,8 @@ from noack.config.resolution import resolve_run, resolved_loops, tables_of
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
+from noack.core.number_format import byte_size
+from noack.core.process_limits import cores as usable_cores
 from noack.protocol.record_tables import (
     CONTROLLER_STEP,
     PLANT_ACTUATION,
@@ -45,7 +47,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import PLANT, RECORDER, ROLES
 from noack.runtime import run_registry
 from noack.runtime.address import text_of
-from noack.runtime.command_line import Signals, log_event, stop_reason
+from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.control_plane import run_name
 from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
@@ -58,58 +60,11 @@ DEFAULT_S = 30.0
 _MOST_SLOWED = 20.0
 _OVERLOADED = 1.5
 """From this slow-down on, the message names the load as the likely cause."""
-_SOURCE = "noack"
-_EVERY_S = 1.0
 _UNTIL_THE_END = 3
 """At the end of a run, spool, record and view exist together, each of about the same size."""
-
-
 _POLL_S, _STARTING_POLL_S = 0.01, 0.002
-
-
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder writes the record, and a long run has many rows."""
-
-
-@dataclass(frozen=True)
-class Watcher:
-    """Callbacks of a launched run; each must return at once."""
-
-    waiting: Callable[[Sequence[str]], None] = lambda roles: None
-    listening: "Callable[[str, Listening], None]" = lambda address, how: None
-    started: Callable[[Path], None] = lambda run_dir: None
-    failed: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
-    restarted: Callable[[str, float], None] = lambda role, t_s: None
-    progress: Callable[[dict[str, Any]], None] = lambda progress: None
-    stopping: Callable[[str], None] = lambda why: None
-    notice: Callable[[str], None] = lambda line: None
-
-
-def joint_watcher(watchers: Sequence[Watcher]) -> Watcher:
-    """Return a watcher that calls others in order; after an OSError, no more of that one."""
-    left = list(watchers)
-
-    def call(name: str) -> Callable[..., None]:
-        def each(*arguments: object) -> None:
-            for one in [*left]:
-                try:
-                    getattr(one, name)(*arguments)
-                except OSError:  # nobody reads its output any more
-                    left.remove(one)
-
-        return each
-
-    return Watcher(*(call(field.name) for field in fields(Watcher)))
-
-
-def later_watcher(open_watcher: Callable[[], Watcher]) -> Watcher:
-    """Return a watcher that is opened at its first callback, after the start of the processes."""
-    opened = cache(open_watcher)
-
-    def call(name: str) -> Callable[..., None]:
-        return lambda *arguments: getattr(opened(), name)(*arguments)
-
-    return Watcher(*(call(field.name) for field in fields(Watcher)))
 
 
 def launch(
@@ -164,7 +119,7 @@ def launch(
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
         coordinator = Coordinator(ticket, here)
         stack.callback(coordinator.close)
-        watcher, remote = watcher or Watcher(), None
+        watcher, remote = joint_watcher([] if watcher is None else [watcher]), None
         notices: SimpleQueue[str] = SimpleQueue()
         with _no_directory_if_refused(run_dir):
             if listening is not None:
@@ -230,13 +185,7 @@ class _Run:
         self._missing: tuple[str, ...] = ()
         self._limit = WaitLimit(self._start_within_s())
         """How long the launcher still waits: for the start, for the end, or for the stop."""
-        self._policy = RestartPolicy(
-            ticket.scenario,
-            coordinator,
-            children,
-            lambda *failure: self._notify("failed", *failure),
-            lambda *restart: self._notify("restarted", *restart),
-        )
+        self._policy = RestartPolicy(ticket.scenario, coordinator, children, watcher)
 
     def watch(self, signals: Signals, store: Callable[[ExitStatus, str], None]) -> Failure:
         """Follow the run to its end; return its exit status and the reason of the end.
@@ -259,7 +208,7 @@ class _Run:
                 # Now, as nothing waits for the launcher: the versions of all packages take 0.02 s.
                 write_environment(self._run_dir, "live", run_name(self._run_id))
                 point_to_latest(self._run_dir)
-                self._notify("started", self._run_dir)
+                self._watcher.started(self._run_dir)
                 self._limit = WaitLimit(overtime_s(self._scenario.horizon_s / self._scenario.speed))
             if len(self._coordinator.joined) > joined:
                 joined = len(self._coordinator.joined)
@@ -273,7 +222,7 @@ class _Run:
                     store(*result)
                     self._coordinator.stop(result[1])
                     if started:
-                        self._notify("stopping", result[1])
+                        self._watcher.stopping(result[1])
                     self._limit = WaitLimit(_STOP_TIMEOUT_S)
             elif self._limit.is_reached:
                 break
@@ -310,19 +259,13 @@ class _Run:
         missing = tuple(role for role in self._coordinator.missing() if role in self._by_hand)
         if missing != self._missing:
             self._missing = missing
-            self._notify("waiting", missing)
+            self._watcher.waiting(missing)
 
     def _notify_progress(self) -> None:
         if (progress := self._coordinator.progress()) is not None:
-            self._notify("progress", progress)
+            self._watcher.progress(progress)
         while not self._notices.empty():
-            self._notify("notice", self._notices.get_nowait())
-
-    def _notify(self, callback: str, *arguments: object) -> None:
-        try:
-            getattr(self._watcher, callback)(*arguments)
-        except OSError:  # nobody reads the output any more; the run goes on
-            self._watcher = Watcher()
+            self._watcher.notice(self._notices.get_nowait())
 
     def _start_within_s(self) -> float:
         given_s = self._scenario.start_within_s
@@ -354,10 +297,6 @@ def overtime_s(run_s: float) -> float:
     return run_s * _OVERTIME_SHARE + _OVERTIME_S
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 @dataclass
 class WaitLimit:
     """The time that the processes of a run have to get ready, or to end.
@@ -367,7 +306,7 @@ class WaitLimit:
     """
 
     within_s: float
-    cores: int = field(default_factory=_cores)
+    cores: int = field(default_factory=usable_cores)
     waited_s: float = 0.0
     """Waited wall time, in seconds."""
     counted_s: float = 0.0
@@ -413,39 +352,6 @@ class WaitLimit:
         return "too slow or stopped; reduce the speed or the rates"
 
 
-class RunLog:
-    """Logs the start of a run, and its progress once a second of wall time."""
-
-    def __init__(self) -> None:
-        self._due_s = 0.0
-
-    def watcher(self) -> Watcher:
-        """Return the callbacks of the launcher."""
-        return Watcher(started=self._started, progress=self._progress)
-
-    def _started(self, run_dir: Path) -> None:
-        log_event(
-            "info", _SOURCE, f"run {run_dir} is prepared", event="run", directory=str(run_dir)
-        )
-
-    def _progress(self, report: dict[str, Any]) -> None:
-        if time.monotonic() < self._due_s:
-            return
-        self._due_s = time.monotonic() + _EVERY_S
-        names = ("t_s", "events", "deliveries", "longest_loss_burst", "x_norm")
-        message = f"simulated {report['t_s']:.1f} s"
-        fields = {name: report[name] for name in names}
-        log_event("info", _SOURCE, message, event="progress", **fields)
-
-
-def log_end(status: int, reason: str, run_dir: Path) -> None:
-    """Log how a run ended."""
-    log_event(
-        "info" if status == 0 else "error", _SOURCE, f"ended: {reason}",
-        event="end", status=status, reason=reason, directory=str(run_dir),
-    )  # fmt: skip
-
-
 def spool_bytes(resolved: Scenario) -> int:
     """Bytes of the rows on fixed time grids; the number of event rows is not known in advance."""
     steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
@@ -468,27 +374,19 @@ def needed_bytes(resolved: Scenario) -> int:
 def require_disk_space(loops: Sequence[Scenario], runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
-    Raises:
-        MachineError: the record needs more than the free space.
+    Raise MachineError if the record needs more than the free space.
     """
-    folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
+    folder = next((path for path in (runs, *runs.absolute().parents) if path.is_dir()), None)
     if folder is None:
         return
     free, spool = shutil.disk_usage(folder).free, sum(map(spool_bytes, loops))
     if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
         return
+    most = byte_size(_UNTIL_THE_END * spool)
     text = (
-        f"{runs}: this run records {_size(spool)} and needs {_size(_UNTIL_THE_END * spool)} until "
-        f"its end; {_size(free)} are free on the disk"
+        f"{runs}: this run records {byte_size(spool)} and needs {most} until its end; "
+        f"{byte_size(free)} are free on the disk"
     )
     if free < spool:
         raise MachineError(f"{text}; reduce horizon_s, or choose another disk with --runs")
     print(f"noack: warning: {text}", file=sys.stderr)
-
-
-def _size(count: int) -> str:
-    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB"):
-        if count < 1024 or unit == "PiB":
-            break
-        count //= 1024
-    return f"{count} {unit}"

@@ -2,21 +2,22 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from cosim.live.run_watcher import Watcher
 from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
+from noack.runtime.control_messages import RunProgress
 from noack.runtime.join_ticket import DEFAULT_SESSION
 
 if TYPE_CHECKING:
-    from cosim.live.launcher import Watcher
     from cosim.live.remote_access import Listening
 
 _PLAIN_LINES = 10
@@ -25,20 +26,23 @@ _LINE_EVERY_S = 5.0
 """Time between two lines about the completed runs, if there is no terminal."""
 
 
-class PatientConsole(Console):
-    """A console that survives a closed pipe; rich would end the program, and with it the run."""
+class PipeSafeConsole(Console):
+    """A console that ignores a broken pipe; rich would end the program, and with it the run."""
 
     def on_broken_pipe(self) -> None:
         """Ignore it."""
 
 
+def error_console() -> Console:
+    """Return such a console on standard error."""
+    return PipeSafeConsole(stderr=True)
+
+
 @contextmanager
 def progress_line(
     console: Console, scenario: Scenario, session: str | None = None
-) -> "Iterator[Watcher]":
+) -> Iterator[Watcher]:
     """Show the progress of a run while the context lasts."""
-    from cosim.live.launcher import Watcher  # its imports are of no use to the other bars
-
     live = console.is_terminal and not console.is_dumb_terminal
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
@@ -112,15 +116,15 @@ class _RunProgress:
         """Show a line about the run."""
         self._print(escape(line))
 
-    def update(self, report: dict[str, Any]) -> None:
+    def update(self, report: RunProgress) -> None:
         """Show the recorder's progress report."""
-        self._print_new("live", [report["live"]] if report["live"] else [], "{}")
-        self._print_new("warnings", report.get("warnings", []), "[yellow]{}[/]")
-        self._print_new("changes", report.get("changes", []), "changed: {}")
+        self._print_new("live", [report.live] if report.live else [], "{}")
+        self._print_new("warnings", report.warnings, "[yellow]{}[/]")
+        self._print_new("changes", report.changes, "changed: {}")
         text = progress_text(report, self._scenario.horizon_s, self._loops)
         if self._task is not None:
-            self._progress.update(self._task, completed=report["t_s"], description=text)
-        due = math.floor(report["t_s"] / self._scenario.horizon_s * _PLAIN_LINES)
+            self._progress.update(self._task, completed=report.t_s, description=text)
+        due = math.floor(report.t_s / self._scenario.horizon_s * _PLAIN_LINES)
         if self._console.is_dumb_terminal and due > self._plain_lines:
             self._plain_lines = due
             self._print(text)
@@ -151,7 +155,7 @@ def _bar(
 @contextmanager
 def work_bar(what: str) -> Iterator[Callable[[float], None]]:
     """Show the completed share of some work."""
-    with _bar(PatientConsole(stderr=True), 1.0, what=what) as update:
+    with _bar(error_console(), 1.0, what=what) as update:
         yield lambda share: update(completed=share)
 
 
@@ -161,14 +165,6 @@ def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int
     column = TextColumn("{task.completed:.1f}/{task.total:g} s simulated")
     with _bar(console, horizon_s, column) as update:
         yield lambda now_ns: update(completed=now_ns / NS_PER_S)
-
-
-@contextmanager
-def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show the number of completed draws."""
-    column = TextColumn("{task.completed:g}/{task.total:g} draws")
-    with _bar(console, 1, column) as update:
-        yield lambda done, total: update(completed=done, total=total)
 
 
 @contextmanager
@@ -204,7 +200,7 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
     """Show the state of an adversary's search, on a terminal only."""
     began_s = time.monotonic()
-    with PatientConsole(stderr=True).status("searching") as status:
+    with error_console().status("searching") as status:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             def report(what: str, nodes: int, value: float) -> None:
@@ -218,12 +214,12 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
         yield named
 
 
-def progress_text(report: Mapping[str, Any], horizon_s: float, loops: int = 1) -> str:
+def progress_text(report: RunProgress, horizon_s: float, loops: int = 1) -> str:
     """The recorder's progress report as one line; ``loops`` is the number of loops."""
-    norm = "-" if report["x_norm"] is None else f"{report['x_norm']:.3g}"
+    norm = "-" if report.x_norm is None else f"{report.x_norm:.3g}"
     of_loops = f"{loops} loops  " if loops > 1 else ""
     return (
-        f"{report['t_s']:.1f}/{horizon_s:g} s  {of_loops}events {report['events']}  "
-        f"delivered {report['deliveries']}  longest loss burst {report['longest_loss_burst']}  "
+        f"{report.t_s:.1f}/{horizon_s:g} s  {of_loops}events {report.events}  "
+        f"delivered {report.deliveries}  longest loss burst {report.longest_loss_burst}  "
         f"‖x‖ {norm}"
     )

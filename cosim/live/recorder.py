@@ -3,7 +3,6 @@
 :func:`main` drives a :class:`Recorder` to the end of its run, with a live viewer on request.
 """
 
-import json
 import math
 import sys
 import time
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.analysis.value_reduction import is_long
@@ -24,7 +24,7 @@ from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows
-from noack.config.parameter_changes import ParameterChange, change_notice
+from noack.config.parameter_changes import change_notice
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
@@ -40,6 +40,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
+from noack.runtime.control_messages import ChangeAnnouncement, RunProgress, message_json
 from noack.runtime.control_plane import ControlPlane, header_of
 from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
@@ -109,7 +110,7 @@ class ProcessTokens:
         def is_done(known: Mapping[str, float]) -> bool:
             if not known:
                 return discovered
-            waiting = [vanished for one, vanished in known.items() if one not in reported]
+            waiting = [vanished for instance, vanished in known.items() if instance not in reported]
             if len(waiting) < len(known):
                 return math.inf not in waiting
             return all(now_s - max(vanished, self._connected_s) > away_s for vanished in waiting)
@@ -117,43 +118,32 @@ class ProcessTokens:
         return all(map(is_done, self._vanished_s.values()))
 
 
-class ProgressReport:
-    """Fields of :class:`noack.runtime.control_messages.RunProgress`.
+class ProgressReport(RunProgress):
+    """The recorder's progress report, as it grows."""
 
-    They are those of all loops together; ‖x‖ is the largest.
-    """
-
-    def __init__(self, live: str | None) -> None:
-        self._fields: dict[str, Any] = {
-            "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None,
-            "live": live, "warnings": [], "changes": [],
-        }  # fmt: skip
+    model_config = ConfigDict(frozen=False)
 
     def add_warning(self, text: str) -> None:
         """Add a line, e.g. about void claims; of many, the last says where the others are."""
-        lines = self._fields["warnings"]
-        if len(lines) < _MOST_LINES:
-            lines.append(text)
-        elif len(lines) == _MOST_LINES:
-            lines.append("further void claims and diverging loops are in the logs of the loops")
-
-    def add_change(self, text: str) -> None:
-        """Add a line about a change of runtime parameters."""
-        self._fields["changes"].append(text)
+        if len(self.warnings) < _MOST_LINES:
+            self.warnings.append(text)
+        elif len(self.warnings) == _MOST_LINES:
+            self.warnings.append(
+                "further void claims and diverging loops are in the logs of the loops"
+            )
 
     @np.errstate(all="ignore")  # a run may diverge
     def count(self, table: str, rows: Rows) -> None:
         """Count rows of a table."""
-        fields = self._fields
         if table == SENSOR_MEASUREMENT:
-            fields["t_s"] = int(rows["t_ns"][-1]) / NS_PER_S
-            fields["events"] += int((rows["event"] >= 0).sum())
+            self.t_s = int(rows["t_ns"][-1]) / NS_PER_S
+            self.events += int((rows["event"] >= 0).sum())
             # Of each loop, the newest state in the batch.
             _, from_end = np.unique(rows[LOOP][::-1], return_index=True)
             newest = rows["x"][len(rows) - 1 - from_end]
-            fields["x_norm"] = float(np.linalg.norm(newest, axis=1).max())
+            self.x_norm = float(np.linalg.norm(newest, axis=1).max())
         elif table == CONTROLLER_DELIVERY:
-            fields["deliveries"] += len(rows)
+            self.deliveries += len(rows)
             # Includes stale updates, which the emulator cannot know in advance.
             self._count_losses(rows["dropouts"])
         elif table == NETEM_PACKET:
@@ -161,12 +151,7 @@ class ProgressReport:
             self._count_losses(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _count_losses(self, consecutive: NDArray[np.int64]) -> None:
-        longest = int(consecutive.max(initial=0))
-        self._fields["longest_loss_burst"] = max(self._fields["longest_loss_burst"], longest)
-
-    def dumps(self) -> str:
-        """The report as JSON."""
-        return json.dumps(self._fields)
+        self.longest_loss_burst = max(self.longest_loss_burst, int(consecutive.max(initial=0)))
 
 
 class Recorder:
@@ -183,12 +168,13 @@ class Recorder:
     ) -> None:
         self._run_dir = run_dir
         self._plane = plane
-        self._store = TelemetryStore(scenario, run_dir, plane.instance, start)
+        self.store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
         self._feed: LoopFeed | NetworkFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
-        self._blind_reported = self._monitoring_ended = False
+        self._blind_reported = self.is_stopping = False
+        """Whether the processes of the run end one by one: no more assumptions are checked."""
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"),
@@ -198,12 +184,15 @@ class Recorder:
         self._tokens = ProcessTokens(plane, restarted=start.is_restart)
         self._reports: dict[str, dict[str, Any]] = {}
         """Final reports by instance."""
-        self._out_of_order = start.is_restart
+        self.view_is_incomplete = start.is_restart
+        """Whether batches came late or out of order, so that the view must be written again."""
         self._invalid = 0
-        self._progress = ProgressReport(live)
+        self._progress = ProgressReport(
+            t_s=0.0, events=0, deliveries=0, longest_loss_burst=0, x_norm=None, live=live
+        )
         if start.is_restart:
             self._monitor.stop("the recorder was restarted")
-            self._store.load(self._progress.count)
+            self.store.load(self._progress.count)
 
     @cached_property
     def _monitor(self) -> "ClaimMonitor":
@@ -215,7 +204,7 @@ class Recorder:
     @property
     def finished(self) -> bool:
         """Whether every process of the loop has handed over its rows, or is gone."""
-        return self._tokens.all_done(self._reports.keys(), stopping=self._monitoring_ended)
+        return self._tokens.all_done(self._reports.keys(), stopping=self.is_stopping)
 
     @property
     def without_report(self) -> list[str]:
@@ -245,10 +234,6 @@ class Recorder:
         self._tokens.update()
         return more
 
-    def end_monitoring(self) -> None:
-        """Check no more assumptions: the run is stopping, and its processes end one by one."""
-        self._monitoring_ended = True
-
     def show(self) -> None:
         """Bring the view and the progress report up to date."""
         self._monitor_assumptions(self._monitor.advance)
@@ -259,28 +244,24 @@ class Recorder:
             except MachineError as error:
                 self.give_up_view(error)
 
-    def note(self, notice: Notice) -> None:
-        """Store a line of the recorder's own for the run's log."""
-        self._store.add_own_notice(notice)
-
-    def change(self, change: ParameterChange, announcement: Mapping[str, Any]) -> None:
+    def change(self, announced: ChangeAnnouncement) -> None:
         """Log a change of runtime parameters, with the time of its request."""
-        at_s, date = announcement["requested_ns"] / NS_PER_S, announcement["requested_at"]
-        notice = change_notice(change, f"; requested at {at_s:.3f} s, {date}")
-        self.note(notice)
-        self._progress.add_change(notice.text)
-        if not is_of_loss_alone(change.settings):
-            self._monitor.end_at(change.t_ns / NS_PER_S)
+        at_s = announced.requested_ns / NS_PER_S
+        requested = f"; requested at {at_s:.3f} s, {announced.requested_at}"
+        notice = change_notice(announced.change, requested)
+        self.store.add_own_notice(notice)
+        self._progress.changes.append(notice.text)
+        if not is_of_loss_alone(announced.settings):
+            self._monitor.end_at(announced.t_ns / NS_PER_S)
         if self._feed is not None:
             self._feed.log(notice.line())
 
     def acknowledge(self) -> None:
         """Confirm to each process which of its rows are on disk, so that it can drop them.
 
-        Raises:
-            MachineError: stored rows are no longer on disk.
+        Raise MachineError if stored rows are no longer on disk.
         """
-        for role, content in self._store.acknowledgements():
+        for role, content in self.store.acknowledgements():
             self._plane.acknowledge_rows(role, content)
 
     def finish(self) -> None:
@@ -288,10 +269,10 @@ class Recorder:
         self._monitor_assumptions(self._monitor.end)
         self._publish_progress()
         try:
-            self._store.require_present()
+            self.store.writer.require_present()
         except MachineError as error:
             self.lost = error
-        self._store.close()
+        self.store.writer.close()
         if self._feed is not None:
             try:
                 self._feed.advance(final=True)
@@ -299,21 +280,8 @@ class Recorder:
                 self.give_up_view(error)
 
     def report(self) -> None:
-        """Write the final reports of the processes, as the last step.
-
-        Raises:
-            MachineError: they cannot be written.
-        """
+        """Write the final reports of the processes; raise MachineError if that fails."""
         write_reports(self._run_dir, self._reports.values())
-
-    def abandon(self) -> None:
-        """Keep the spool as it is."""
-        self._store.close()
-
-    @property
-    def view_is_incomplete(self) -> bool:
-        """Whether batches came late or out of order, so that the view must be written again."""
-        return self._out_of_order
 
     def _take(self, sample: zenoh.Sample) -> None:
         role, table = str(sample.key_expr).split("/")[-2:]
@@ -323,12 +291,12 @@ class Recorder:
                 raise PeerError("it was sent with another key")
             generation, first = first_row(header)
             if table == NOTICES and role in LOOP_ROLES:
-                lines = self._store.add_notices(role, generation, first, payload)
+                lines = self.store.add_notices(role, generation, first, payload)
                 if self._feed is not None:
                     for line in lines:
                         self._feed.log(line)
             else:
-                rows, follows = self._store.add_rows(role, table, generation, first, payload)
+                rows, follows = self.store.add_rows(role, table, generation, first, payload)
                 self._take_rows(table, rows, follows=follows)
         except (PeerError, ValueError) as error:
             if not self._invalid:
@@ -338,7 +306,7 @@ class Recorder:
     def _take_rows(self, table: str, rows: Rows, *, follows: bool) -> None:
         """Count, check and show rows that are stored."""
         if not follows:
-            self._out_of_order = True
+            self.view_is_incomplete = True
             self._monitor.stop("telemetry is missing or arrived out of order")
             return
         self._progress.count(table, rows)
@@ -348,7 +316,7 @@ class Recorder:
 
     def _monitor_assumptions(self, check: "Callable[[], list[Finding]]") -> None:
         """Report violated assumptions in the log, the view and the progress report."""
-        if self._monitoring_ended:
+        if self.is_stopping:
             return
         try:
             findings = check()
@@ -356,7 +324,7 @@ class Recorder:
             findings = []
             self._monitor.stop(repr(error))
         for notice, text in findings:
-            self.note(notice)
+            self.store.add_own_notice(notice)
             self._progress.add_warning(text)
             if self._feed is not None:
                 self._feed.log(notice.line())
@@ -367,7 +335,7 @@ class Recorder:
             )
 
     def _publish_progress(self) -> None:
-        self._plane.publish("progress", content=self._progress.dumps())
+        self._plane.publish("progress", content=message_json(self._progress))
 
     def _take_report(self, query: zenoh.Query) -> None:
         """Answer a final report with the rows that are missing."""
@@ -376,24 +344,24 @@ class Recorder:
         try:
             if role not in LOOP_ROLES:
                 raise PeerError(f"{role} has nothing to report")
-            fields = report_of(role, payload, self._store.types)
+            fields = report_of(role, payload, self.store.types)
         except PeerError as error:
             self._plane.refuse(query, str(error))
             return
         report: dict[str, Any] = {"generation": 0, "instance": ""} | fields | {"process": role}
-        if stored := self._store.add_stored(report):
+        if stored := self.store.add_stored(report):
             text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
-            self.note(Notice(report.get("reached_ns") or 0, "info", text))
+            self.store.add_own_notice(Notice(report.get("reached_ns") or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
         self._await_rows(report)
-        missing = self._store.missing(report)
+        missing = self.store.missing(report)
         if not missing:
             self._reports[report["instance"]] = report
         self._plane.answer(query, {"rows": missing})
 
     def _await_rows(self, report: dict[str, Any]) -> None:
         deadline_s = time.monotonic() + _ROWS_IN_FLIGHT_S
-        while self._store.missing(report) and time.monotonic() < deadline_s:
+        while self.store.missing(report) and time.monotonic() < deadline_s:
             sample = self._batches.try_recv()
             if sample is None:
                 time.sleep(0.005)
@@ -404,7 +372,7 @@ class Recorder:
         """Show the run no longer; the view is written again at the end."""
         print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
         self._feed = None
-        self._out_of_order = True
+        self.view_is_incomplete = True
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
@@ -431,7 +399,9 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     status = live_view.status if live_view else None
     recorder = Recorder(process.scenario, run_dir, process.plane, status, start=process.start)
     if process.replaces is not None:
-        recorder.note(Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}"))
+        recorder.store.add_own_notice(
+            Notice(process.start.from_ns, RESTART, f"restarted: {process.replaces}")
+        )
     process.join(None)
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
@@ -444,7 +414,7 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
             recorder.give_up_view(error)
     if not _poll_to_the_end(process, recorder):
         # The other processes spool their last rows now; `noack summary` completes the record.
-        recorder.abandon()
+        recorder.store.writer.close()
         if view is not None:
             view.close()
         return
@@ -483,10 +453,9 @@ def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:
     acknowledged_s = time.monotonic()
     while not recorder.finished:
         more = recorder.poll()
-        if process.stopping:
-            recorder.end_monitoring()
-        for change, announcement in process.updates.take():
-            recorder.change(change, announcement)
+        recorder.is_stopping = process.stopping
+        for announced in process.updates.take():
+            recorder.change(announced)
         now_s = time.monotonic()
         if shown_s is None or now_s - shown_s >= _SHOW_S:
             recorder.show()

@@ -1,7 +1,7 @@
 """Opens a run to other hosts: TLS listener, invitation, and answers to questions about the time.
 
-An authority signs one certificate for the coordinator and one for all that join; its own key is
-forgotten. Each end accepts only the other one's certificate.
+The coordinator has a certificate, and all that join have one, each signed by itself. Each end
+accepts only the other one's.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ import socket
 import ssl
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
@@ -21,7 +21,7 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import NameOID
 
 from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
@@ -71,8 +71,7 @@ class Opened(NamedTuple):
 def listening_for(path: Path) -> Listening:
     """Return how processes join that the launcher starts on the hosts of a file.
 
-    Raises:
-        CallerError: the file is wrong, or others cannot reach this host at its address.
+    Raise CallerError if the file is wrong, or others cannot reach this host at its address.
     """
     hosts = load_hosts(path)
     return Listening(listen_address(hosts.listen, f"{path}: listen"), hosts=hosts.by_role)
@@ -81,8 +80,7 @@ def listening_for(path: Path) -> Listening:
 def listen_address(text: str, option: str = "--listen") -> Address:
     """Parse an address of this host: ``192.0.2.1``, ``192.0.2.1:7000``, ``2001:db8::1``.
 
-    Raises:
-        CallerError: it is not an address at which others can reach this host.
+    Raise CallerError if it is not an address at which others can reach this host.
     """
     with suppress(ValueError):  # an IPv6 address without brackets
         text = f"[{ipaddress.IPv6Address(text)}]"
@@ -128,8 +126,7 @@ def open_to_hosts(
 ) -> Iterator[Opened]:
     """Listen for processes of other hosts meanwhile, and make their invitation.
 
-    Raises:
-        CallerError: the address cannot be used.
+    Raise CallerError if the address cannot be used.
     """
     keys, path = new_tls_keys(listening.address[0]), socket_path(RUNS, run_name(ticket.run_id))
     with ExitStack() as stack:
@@ -147,9 +144,8 @@ def open_to_hosts(
         stack.enter_context(answering(times))
         until = datetime.datetime.now().astimezone() + datetime.timedelta(seconds=listening.valid_s)
         remote = RemoteAccess(
-            host=host, port=port, authority=keys.authority,
-            certificate=keys.joining.certificate, private_key=keys.joining.private_key,
-            valid_until=until.isoformat(timespec="seconds"),
+            host=host, port=port, coordinator=keys.coordinator.certificate,
+            **keys.joining._asdict(), valid_until=until.isoformat(timespec="seconds"),
         )  # fmt: skip
         shown = new_admission_pass()
         roles = LOOP_ROLES if listening.role is None else (listening.role,)
@@ -205,75 +201,36 @@ class KeyPair(NamedTuple):
 class TlsKeys(NamedTuple):
     """The keys of one run."""
 
-    authority: str  # its certificate
     coordinator: KeyPair
     joining: KeyPair
 
 
 def new_tls_keys(host: str) -> TlsKeys:
     """Return keys for a coordinator at a numeric address."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = _name("noack run")
-    authority = (
-        _builder(name, name, key.public_key())
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    addresses = [x509.IPAddress(ipaddress.ip_address(host))]
-    joining = [x509.DNSName("joining")]
     return TlsKeys(
-        _pem(authority),
-        _signed("coordinator", addresses, ExtendedKeyUsageOID.SERVER_AUTH, name, key),
-        _signed("joining", joining, ExtendedKeyUsageOID.CLIENT_AUTH, name, key),
+        _new_key_pair(x509.IPAddress(ipaddress.ip_address(host))),
+        _new_key_pair(x509.DNSName("joining")),
     )
 
 
-def _signed(
-    who: str,
-    subjects: Sequence[x509.GeneralName],
-    usage: x509.ObjectIdentifier,
-    issuer: x509.Name,
-    authority: ec.EllipticCurvePrivateKey,
-) -> KeyPair:
+def _new_key_pair(whose: x509.GeneralName) -> KeyPair:
     key = ec.generate_private_key(ec.SECP256R1())
-    certificate = (
-        _builder(_name(who), issuer, key.public_key())
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(x509.SubjectAlternativeName(subjects), critical=False)
-        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
-        .sign(authority, hashes.SHA256())
-    )
-    private = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
-    return KeyPair(_pem(certificate), private.decode())
-
-
-def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey
-) -> x509.CertificateBuilder:
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "noack run")])
     now = datetime.datetime.now(datetime.UTC)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
+    certificate = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
         .not_valid_before(now - _VALID)
         .not_valid_after(now + _VALID)
+        .add_extension(x509.SubjectAlternativeName([whose]), critical=False)
+        .sign(key, hashes.SHA256())
     )
-
-
-def _name(text: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
-
-
-def _pem(certificate: x509.Certificate) -> str:
-    return certificate.public_bytes(serialization.Encoding.PEM).decode()
+    pem = serialization.Encoding.PEM
+    private = key.private_bytes(
+        pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return KeyPair(certificate.public_bytes(pem).decode(), private.decode())
 
 
 def coordinator_context(keys: TlsKeys) -> ssl.SSLContext:
     """Return the TLS settings of the coordinator's end."""
-    return tls_context(keys.authority, *keys.coordinator, server=True)
+    return tls_context(keys.joining.certificate, *keys.coordinator, server=True)

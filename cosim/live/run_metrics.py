@@ -7,7 +7,6 @@ not asked.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from prometheus_client import Metric
 from prometheus_client.metrics_core import (
@@ -16,8 +15,9 @@ from prometheus_client.metrics_core import (
     InfoMetricFamily,
 )
 
-from cosim.live.launcher import Watcher
+from cosim.live.run_watcher import Watcher
 from noack.config.scenario import Scenario
+from noack.runtime.control_messages import RunProgress
 
 _PREFIX = "noack_run"
 _GAUGES = {
@@ -26,12 +26,10 @@ _GAUGES = {
     "state_norm": ("x_norm", "norm of the newest measured state; of several loops the largest"),
 }
 _COUNTERS = {
-    "events": ("events", "updates sent by the sensor"),
-    "deliveries": ("deliveries", "updates received by the controller"),
-}
-_LISTS = {
-    "warnings": ("warnings", "void claims and diverging loops"),
-    "changes": ("changes", "changes of settings during the run"),
+    "events": "updates sent by the sensor",
+    "deliveries": "updates received by the controller",
+    "warnings": "void claims and diverging loops",
+    "changes": "changes of settings during the run",
 }
 
 
@@ -41,7 +39,7 @@ class RunMetrics:
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._directory = ""
-        self._report: dict[str, Any] | None = None
+        self._report: RunProgress | None = None
         self._waiting = 0
         self._failures: Counter[str] = Counter()
         self._restarts: Counter[str] = Counter()
@@ -65,8 +63,8 @@ class RunMetrics:
     def _restart(self, role: str, t_s: float) -> None:
         self._restarts[role] += 1
 
-    def _progress(self, report: dict[str, Any]) -> None:
-        self._report = dict(report)
+    def _progress(self, report: RunProgress) -> None:
+        self._report = report
 
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics; those of the loop from its first report on."""
@@ -94,11 +92,11 @@ class RunMetrics:
             yield from _of_loop(report)
 
 
-def _of_loop(report: dict[str, Any]) -> Iterator[Metric]:
+def _of_loop(report: RunProgress) -> Iterator[Metric]:
     for name, (key, text) in _GAUGES.items():
-        if report[key] is not None:
-            yield GaugeMetricFamily(f"{_PREFIX}_{name}", text, report[key])
-    for name, (key, text) in _COUNTERS.items():
-        yield CounterMetricFamily(f"{_PREFIX}_{name}", text, report[key])
-    for name, (key, text) in _LISTS.items():
-        yield CounterMetricFamily(f"{_PREFIX}_{name}", text, len(report.get(key, ())))
+        if (value := getattr(report, key)) is not None:
+            yield GaugeMetricFamily(f"{_PREFIX}_{name}", text, value)
+    for key, text in _COUNTERS.items():
+        value = getattr(report, key)
+        count = len(value) if isinstance(value, list) else value
+        yield CounterMetricFamily(f"{_PREFIX}_{key}", text, count)

@@ -46,8 +46,8 @@ class TelemetryStore:
         self.types = run_tables(scenario)
         """Row type of each table."""
         self._folder = run_dir / SPOOL
-        self._writer = SpoolWriter(self._folder, instance if start.is_restart else RECORDER)
-        self._writer.prepare([*self.types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
+        self.writer = SpoolWriter(self._folder, instance if start.is_restart else RECORDER)
+        self.writer.prepare([*self.types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._received: defaultdict[tuple[str, str, int], ReceivedRows] = defaultdict(ReceivedRows)
         """By role, table and generation."""
 
@@ -56,11 +56,12 @@ class TelemetryStore:
     ) -> list[dict[str, Any]]:
         """Store a batch of lines of the log; return the fields of each.
 
-        Raises:
-            PeerError: the payload has something else.
+        Raise PeerError if the payload has something else.
         """
-        lines = [parse_message(LogLine, one) | {"process": role} for one in lines_in(payload)]
-        self._writer.append(notices_of(role), notice_number(generation, first), payload)
+        lines = [
+            parse_message(LogLine, line).fields() | {"process": role} for line in lines_in(payload)
+        ]
+        self.writer.append(notices_of(role), notice_number(generation, first), payload)
         self._received[role, NOTICES, generation].add(first, first + len(lines))
         return lines
 
@@ -81,7 +82,7 @@ class TelemetryStore:
         rows: Rows = np.frombuffer(payload, self.types[table])
         if not len(rows) or int(rows["input"][0]) // GENERATION != generation:
             raise PeerError("a batch without rows, or with rows of another process")
-        self._writer.append(table, first, payload)
+        self.writer.append(table, first, payload)
         received = self._received[role, table, generation]
         follows = first == received.end
         received.add(first, first + len(rows))
@@ -101,7 +102,7 @@ class TelemetryStore:
     def add_own_notice(self, notice: Notice) -> None:
         """Store a line of the recorder's own for the log."""
         payload = json.dumps(notice.line()).encode()
-        self._writer.append(notices_of(RECORDER), 0, payload)
+        self.writer.append(notices_of(RECORDER), 0, payload)
 
     def load(self, on_rows: Callable[[str, Rows], None]) -> None:
         """Read what an earlier recorder of this run has stored."""
@@ -131,10 +132,9 @@ class TelemetryStore:
     def acknowledgements(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield, for the newest process of each role, which of its rows are on disk.
 
-        Raises:
-            MachineError: files of the spool were deleted or moved.
+        Raise MachineError if files of the spool were deleted or moved.
         """
-        self.require_present()
+        self.writer.require_present()
         newest: dict[str, int] = {}
         for role, _, generation in self._received:
             newest[role] = max(newest.get(role, 0), generation)
@@ -145,15 +145,3 @@ class TelemetryStore:
                 if (of, number) == (role, generation)
             }
             yield role, {"generation": generation, "rows": rows}
-
-    def require_present(self) -> None:
-        """Check that the spool's files are still in place.
-
-        Raises:
-            MachineError: files of the spool were deleted or moved.
-        """
-        self._writer.require_present()
-
-    def close(self) -> None:
-        """Close the spool's files."""
-        self._writer.close()

@@ -94,11 +94,10 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
     delay_ns = network_delay_ns(resolved, resolved.certificate.late_periods)
     end_ns = int(max(trace.sent_ns[-1], trace.received_ns.max()))
     every = list(_violations(trace, allowed, delay_ns, end_ns))
-    spans = [one for one in every if len(one.begin_ns)]
-    whole = max(end_ns, 1)
-    union_ns = _covered_ns(
-        np.concatenate([_NONE, *(one.begin_ns for one in spans)]),
-        np.concatenate([_NONE, *(one.end_ns for one in spans)]),
+    spans, whole = [one for one in every if len(one.begin_ns)], max(end_ns, 1)
+    union = (
+        np.concatenate([[], *times])
+        for times in ([one.begin_ns for one in spans], [one.end_ns for one in spans])
     )
     return CertificateTime(
         scenario=resolved.name,
@@ -106,23 +105,17 @@ def certificate_time(trace: PacketTrace, scenario: Scenario) -> CertificateTime:
         allowed_losses=allowed.dropouts,
         allowed_delay_s=delay_ns * 1e-9,
         observed_s=end_ns * 1e-9,
-        share=union_ns / whole,
+        share=_covered_ns(*union) / whole,
         causes=tuple(
-            VoidShare(
-                one.cause,
-                _covered_ns(one.begin_ns, one.end_ns) / whole,
-                float(one.begin_ns.min()) * 1e-9,
-                one.worst,
-                one.text,
-            )
+            VoidShare(one.cause, _covered_ns(one.begin_ns, one.end_ns) / whole,
+                      float(one.begin_ns.min()) * 1e-9, one.worst, one.text)
             for one in spans
         ),
         kept={
             one.cause: f"kept: {one.text}" if one.worst else "kept"
-            for one in every
-            if not len(one.begin_ns) and not one.cause.endswith(ORDER)
+            for one in every if not len(one.begin_ns) and not one.cause.endswith(ORDER)
         },
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +169,3 @@ def _covered_ns(begin_ns: Times, end_ns: Times) -> int:
     begin_ns, end_ns = begin_ns[order], end_ns[order]
     latest_ns = np.append(-1, np.maximum.accumulate(end_ns))[:-1]
     return int(np.maximum(end_ns - np.maximum(begin_ns, latest_ns), 0).sum())
-
-
-_NONE: Times = np.zeros(0, np.int64)

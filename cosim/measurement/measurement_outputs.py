@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from cosim.live.progress import PatientConsole
+from cosim.live.progress import error_console
 from cosim.measurement.chain_fits import ChainFit
-from cosim.measurement.measurement_tables import print_measurement
+from cosim.measurement.measurement_page import print_measurement, write_page
 from cosim.measurement.network_measurement import Measurement
 from cosim.output.figure_format import FigureFiles
 from noack.config import toml_file
@@ -59,15 +59,13 @@ def report(found: Measurement, request: OutputRequest, console: Console | None) 
     Raises:
         NoackError: one line; a file cannot be written, or the scenario cannot be resolved.
     """
-    with PatientConsole(stderr=True).status("measuring"):
+    with error_console().status("measuring"):
         void = None if request.scenario is None else found.certificate_time(request.scenario)
         document = found.to_json()
     if console is not None:
         print_measurement(console, found, void)
     written: list[Path] = []
     if request.page is not None:
-        from cosim.measurement.measurement_page import write_page
-
         written += write_page(found, void, request.page, request.figure_files)
     if request.network is not None:
         written += write_network(found, request.network, request.form)
@@ -95,7 +93,8 @@ def write_network(found: Measurement, path: Path, form: Form) -> list[Path]:
         section, written = _trace_section(found, trace_path.name), [trace_path, path]
     else:
         section = _model_section(found)
-    text = _comment(found, form) + toml_text({"network": section})
+    cap = {"mansd": found.longest_loss_burst, "enforce_mansd": False}
+    text = _comment(found, form) + toml_text({"network": {**cap, **section}})
     source = f"--write {path}"
     content = toml_file.parsed(text, source)["network"]
     loaded = toml_file.validated(NetworkSection, content, source)
@@ -131,22 +130,16 @@ def _comment(found: Measurement, form: Form) -> str:
     return "".join(f"# {line}\n" for line in lines)
 
 
-def _common(found: Measurement) -> dict[str, Any]:
-    return {"mansd": found.longest_loss_burst, "enforce_mansd": False}
-
-
 def _trace_section(found: Measurement, name: str) -> Mapping[str, Any]:
-    section = _common(found)
-    if not found.outcomes.effective[0]:  # the network would deliver the first packet
-        section["initial_sync"] = "known_state"
+    # The network would deliver the first packet.
+    known = {} if found.outcomes.effective[0] else {"initial_sync": "known_state"}
     replay = {"kind": "replay", "file": name, "by": "time"}
-    return section | {"loss": {"model": "lossless"}, "impairments": [replay]}
+    return known | {"loss": {"model": "lossless"}, "impairments": [replay]}
 
 
 def _model_section(found: Measurement) -> Mapping[str, Any]:
-    impairments = [*_outage_chain(found), *_delay(found)]
     loss = _loss(found.chosen.fit) if found.models else {"model": "lossless"}
-    return _common(found) | {"loss": loss, "impairments": impairments}
+    return {"loss": loss, "impairments": [*_outage_chain(found), *_delay(found)]}
 
 
 def _loss(fit: ChainFit) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""The page of a measurement: its tables and figures, as one HTML file.
+"""What a measurement shows: tables of text, figures, and one HTML page with both.
 
 The figures show bursts, delays, correlation and (m, K).
 """
@@ -7,10 +7,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from rich.markup import escape
 
 from cosim.measurement.certificate_time import CertificateTime
-from cosim.measurement.loss_bursts import LEVEL, most_losses
-from cosim.measurement.measurement_tables import measurement_tables, void_remarks
+from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
 from cosim.measurement.network_measurement import Measurement
 from cosim.output import palette
 from cosim.output.figure_description import (
@@ -26,11 +27,164 @@ from cosim.output.figure_description import (
     one_panel,
     time_axis,
 )
-from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
-from cosim.output.page_kit import templates
+from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from noack.core.file_access import require_suffix, write_whole
-from noack.core.number_format import duration
+from noack.core.number_format import NONE, duration, number, percent
+
+_MODELS = {
+    "bernoulli": "independent losses",
+    "gilbert": "Gilbert",
+    "gilbert_elliott": "Gilbert–Elliott",
+}
+_PARAMETERS = {
+    "probability": "loss probability",
+    "good_to_bad": "p, good to bad",
+    "bad_to_good": "r, bad to good",
+    "loss_in_good": "loss in the good state",
+    "loss_in_bad": "loss in the bad state",
+}
+_SHOWN_DELAYS = {0.5: "p50", 0.9: "p90", 0.99: "p99", 0.999: "p99.9", 1.0: "max"}
+_MOST_LISTED = 12
+_MOST_OUTAGES = 5
+
+
+def measurement_tables(
+    found: Measurement, void: CertificateTime | None = None
+) -> Iterator[ResultTable]:
+    """Yield the tables of a measurement, and that of a scenario's certificate."""
+    without = ", without the outages" if found.is_outage.any() else ""
+    estimates = ("estimate", "95 % interval")
+    heads: tuple[str, ...]
+    yield ResultTable("numbers", "losses and delays", KEY_VALUE, [*_numbers(found, without)])
+    rows = [
+        (f"{100 * one.share:.6g} %", str(one.bursts), str(one.bursts_confident or "too few bursts"),
+         str(one.packets))
+        for one in found.quantiles
+    ]  # fmt: skip
+    heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
+    yield ResultTable("m", f"M: at most M − 1 consecutive losses{without}", heads, rows)
+    if found.windows:
+        columns = 3 if without else 2
+        windows = [
+            (str(window), str(every), NONE if usual is None else str(usual))[:columns]
+            for window, (every, usual) in found.windows.items()
+        ]
+        heads = ("K", "m", "m in windows without an outage")
+        what = "(m, K): most losses m in any K consecutive packets"
+        yield ResultTable("windows", what, heads[:columns], windows)
+    if found.models:
+        heads = ("model and parameter", *estimates)
+        yield ResultTable("models", f"loss models{without}", heads, [*_model_rows(found)])
+    heads = ("parameter", *estimates)
+    yield ResultTable("outages", "model of the outages", heads, [*_outage_rows(found)])
+    if void is not None:
+        what = f"{void.scenario}: when the network violates a condition of its certificates"
+        heads = ("condition", "share of the time", "first", "worst")
+        yield ResultTable("certificate", what, heads, [*_void_rows(void)])
+
+
+def print_measurement(
+    console: Console, found: Measurement, void: CertificateTime | None = None
+) -> None:
+    """Print the tables and the remarks."""
+    console.print(found.name, markup=False, highlight=False, soft_wrap=True)
+    for table in measurement_tables(found, void):
+        console.print(f"\n[bold]{escape(table.caption)}[/]", highlight=False)
+        console.print(terminal_table(table._replace(caption="")))
+    for line in (*found.remarks, *void_remarks(void)):
+        console.print(line, markup=False, highlight=False)
+
+
+def _numbers(found: Measurement, without: str) -> Iterator[tuple[str, str]]:
+    count, deadline_s = len(found.trace), found.options.deadline_s
+    yield "packets", f"{count} in {found.observed_s:.1f} s"
+    yield "lost", _share(int(found.outcomes.lost.sum()), count)
+    yield "out of order (stale)", _share(int(found.outcomes.out_of_order.sum()), count)
+    if deadline_s is not None:
+        name = f"later than the deadline of {duration(deadline_s)}"
+        yield name, _share(int(found.outcomes.late.sum()), count)
+    yield "effective losses (all of these)", _share(found.bursts.losses, count)
+    bursts = found.bursts
+    if len(bursts.length):
+        listed = [f"{count} × {length}" for length, count in histogram(bursts).items()]
+        if len(listed) > _MOST_LISTED:
+            listed[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
+        yield "loss bursts (number × length)", ", ".join(listed)
+        yield "longest loss burst", _burst(found, int(np.argmax(bursts.length)))
+        outages = np.flatnonzero(found.is_outage).tolist()
+        yield "outages", str(len(outages)) if outages else f"none: {found.outage_rule.reason}"
+        for place in outages[:_MOST_OUTAGES]:
+            yield "  outage", _burst(found, place)
+        if outages:
+            yield "  rule", found.outage_rule.reason
+    longest = found.longest_loss_burst
+    yield f"M{without}", f"{longest + 1} (maximum consecutive losses M − 1: {longest})"
+    if (fewest := found.fewest_deliveries) is not None:
+        yield "fewest deliveries between two bursts", str(fewest)
+    delays = found.delays
+    if delays.received:
+        values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
+        yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
+    if delays.correlation:
+        yield "correlation of successive delays", f"{delays.correlation[0]:.2f}"
+
+
+def _share(part: int, of: int) -> str:
+    return f"{part} ({percent(part / of)})" if part else "0"
+
+
+def _burst(found: Measurement, place: int) -> str:
+    one = found.burst_json(place)
+    return f"{one['losses']} packets, {one['duration_s']:.3g} s, from {one['begin_s']:.3f} s"
+
+
+def _model_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
+    for name, model in found.models.items():
+        chosen = " (preferred)" if name == found.chosen.fit.model else ""
+        yield f"{_MODELS[name]}{chosen}", "", ""
+        for parameter, estimate in model.fit.estimates.items():
+            yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
+        yield "  mean loss rate", number(model.fit.rates.loss_rate), ""
+        yield "  fit", model.test.verdict, model.test.figures
+
+
+def _estimate(estimate: Estimate | None, digits: int = 3) -> tuple[str, str]:
+    if estimate is None:
+        return "not determined", ""
+    low, high = number(estimate.low, digits), number(estimate.high, digits)
+    return number(estimate.value, digits), f"{low} to {high}"
+
+
+def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
+    fit = found.outage_fit
+    per_hour = fit.rate_per_s and Estimate(*(3600 * value for value in fit.rate_per_s))
+    yield "outages per hour", *_estimate(per_hour)
+    if fit.count:
+        yield "mean duration in s", *_estimate(fit.duration_s)
+        yield "fit", fit.text, ""
+
+
+def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str]]:
+    for one in void.causes:
+        yield one.cause, percent(one.share), f"{one.first_s:.3f} s", one.text
+    for cause, text in void.kept.items():
+        yield cause, percent(0.0), NONE, text
+    first = NONE if void.first_s is None else f"{void.first_s:.3f} s"
+    yield "any of them", percent(void.share), first, ""
+
+
+def void_remarks(void: CertificateTime | None) -> Iterator[str]:
+    """Yield the remarks about a scenario's certificate."""
+    if void is None:
+        return
+    for scope, reason in void.certificates.items():
+        if reason is not None:
+            yield f"no certificate for {scope}: {reason}"
+    yield (
+        f"each packet counts as an update of {void.scenario}; a claim about a run is void from the "
+        "first violation on"
+    )
 
 
 def write_page(
@@ -45,6 +199,9 @@ def write_page(
         CallerError: the name does not end in .html.
         MachineError: the page cannot be written.
     """
+    from cosim.output.figure_files import save_figures  # they import matplotlib
+    from cosim.output.page_kit import templates
+
     require_suffix(path, "--out", ".html")
     template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
     figures = list(measurement_figures(found))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,16 +122,11 @@ class MeasurementOptions:
     """Bursts of this duration or more are outages; None: the statistical rule."""
 
 
-class FittedModel:
+class FittedModel(NamedTuple):
     """A loss model, fitted to the bursts that are no outages, with its test."""
 
-    def __init__(self, fit: ChainFit, test: FitTest) -> None:
-        self.fit, self.test = fit, test
-
-    @property
-    def is_rejected(self) -> bool:
-        """Whether the test rejects the model."""
-        return self.test.verdict == "rejected"
+    fit: ChainFit
+    test: FitTest
 
     def to_json(self) -> dict[str, Any]:
         """Return the fit for JSON."""
@@ -220,15 +215,12 @@ class Measurement:
     @cached_property
     def models(self) -> dict[str, FittedModel]:
         """The fitted loss models, by name; empty without losses."""
-        return {one.model: self._tested(one) for one in self._fits.all()}
+        return {fit.model: FittedModel(fit, self._fits.tested(fit)) for fit in self._fits.all()}
 
     @cached_property
     def chosen(self) -> FittedModel:
         """The model that the Bayesian information criterion prefers."""
-        return self._tested(self._fits.chosen)
-
-    def _tested(self, fit: ChainFit) -> FittedModel:
-        return FittedModel(fit, self._fits.tested(fit))
+        return FittedModel(self._fits.chosen, self._fits.tested(self._fits.chosen))
 
     @cached_property
     def outage_fit(self) -> OutageFit:
@@ -255,7 +247,10 @@ class Measurement:
             found.append("a loss burst is cut by the beginning or end of the trace")
         if self.is_outage.any():
             found.append("outages are reported as such: M and the loss models do not include them")
-            if self.options.outage_s is None and self.models["gilbert_elliott"].is_rejected:
+            if (
+                self.options.outage_s is None
+                and self.models["gilbert_elliott"].test.verdict == "rejected"
+            ):
                 found.append(
                     "the fitted chain is itself rejected by its test: what counts as an outage "
                     "depends on it; --outage TIME sets the limit by hand"
@@ -264,6 +259,7 @@ class Measurement:
 
     def to_json(self) -> dict[str, Any]:
         """Return all results for JSON."""
+        lengths, outages = self.bursts.length, self.outage_fit
         return {
             "name": self.name,
             "packets": len(self.trace),
@@ -274,17 +270,16 @@ class Measurement:
             "late": int(self.outcomes.late.sum()),
             "effective_losses": self.bursts.losses,
             "histogram": {str(length): count for length, count in histogram(self.bursts).items()},
-            "longest": self.burst_json(int(np.argmax(self.bursts.length)))
-            if len(self.bursts.length)
-            else None,
-            "outages": [
-                self.burst_json(place) for place in np.flatnonzero(self.is_outage).tolist()
-            ],
+            "longest": self.burst_json(int(lengths.argmax())) if len(lengths) else None,
+            "outages": [*map(self.burst_json, np.flatnonzero(self.is_outage).tolist())],
             "outage_rule": self.outage_rule.reason,
             "M": self.longest_loss_burst + 1,
             "quantiles": [asdict(one) for one in self.quantiles],
             "fewest_deliveries_between_bursts": self.fewest_deliveries,
-            "windows": {str(window): asdict_window(*most) for window, most in self.windows.items()},
+            "windows": {
+                str(window): {"most_losses": every, "without_outages": usual}
+                for window, (every, usual) in self.windows.items()
+            },
             "delay_s": {str(share): value for share, value in self.delays.quantiles_s.items()},
             "delay_correlation": dict(
                 zip(map(str, self.delays.lags), self.delays.correlation, strict=True)
@@ -293,11 +288,10 @@ class Measurement:
             "models": {name: one.to_json() for name, one in self.models.items()},
             "chosen_model": self.chosen.fit.model if self.models else None,
             "outage_fit": {
-                "count": self.outage_fit.count,
-                "rate_per_s": _interval(self.outage_fit.rate_per_s),
-                "duration_s": _interval(self.outage_fit.duration_s),
-                "p_value": self.outage_fit.p_value,
-                "text": self.outage_fit.text,
+                **vars(outages),
+                "rate_per_s": _interval(outages.rate_per_s),
+                "duration_s": _interval(outages.duration_s),
+                "text": outages.text,
             },
             "remarks": self.remarks,
         }
@@ -310,22 +304,15 @@ class Measurement:
 
     def burst_json(self, place: int) -> Mapping[str, Any]:
         """Return a burst for JSON: losses, begin and duration."""
-        begin_s, duration_s = self.bursts.only(np.arange(len(self.bursts.length)) == place).times_s(
-            self.trace
-        )
+        begin_s, duration_s = self.bursts.times_s(self.trace)
         return {
             "losses": int(self.bursts.length[place]),
-            "begin_s": float(begin_s[0]),
-            "duration_s": float(duration_s[0]),
+            "begin_s": float(begin_s[place]),
+            "duration_s": float(duration_s[place]),
         }
 
 
 _FEW_BURSTS = 20
-
-
-def asdict_window(every: int, usual: int | None) -> dict[str, int | None]:
-    """Return an entry of the (m, K) table for JSON."""
-    return {"most_losses": every, "without_outages": usual}
 
 
 def _interval(estimate: Estimate | None) -> dict[str, float] | None:

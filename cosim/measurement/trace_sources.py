@@ -12,11 +12,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
+from functools import reduce
+from operator import and_
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from cosim.record.run_events import packet_outcomes
@@ -165,16 +168,12 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
         chosen, packets = counts.most_common(number)[-1]
         if packets > MAX_PACKETS:
             raise CallerError(f"{path}: the flow has more than {MAX_PACKETS} packets")
-        parts = []
-        for batch in file.iter_batches(columns=list(_COLUMNS)):
-            columns = {
-                name: np.asarray(batch[name].to_numpy(zero_copy_only=False)) for name in _COLUMNS
-            }
-            here = np.logical_and.reduce(
-                [columns[name] == value for name, value in zip(_FLOW, chosen, strict=True)]
-            )
-            parts.append([columns[name][here] for name in _COLUMNS[3:]])
-    rows = dict(zip(_COLUMNS[3:], map(np.concatenate, zip(*parts, strict=True)), strict=True))
+        is_chosen = reduce(
+            and_, (pc.field(name) == value for name, value in zip(_FLOW, chosen, strict=True))
+        )
+        batches = (pa.Table.from_batches([one]) for one in file.iter_batches(columns=[*_COLUMNS]))
+        table = pa.concat_tables([batch.filter(is_chosen) for batch in batches])
+    rows = {name: np.asarray(table[name].to_numpy()) for name in _COLUMNS[len(_FLOW) :]}
     received_ns, lost = _received(path, rows)
     try:
         trace = packet_trace(rows["arrival_ns"], received_ns, lost, rows["packet"])
@@ -189,16 +188,15 @@ def _received(
     path: Path, rows: dict[str, NDArray[Any]]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the times of the first intact delivery, and which packets have none."""
-    delays = rows["delay_ns"], rows["copy_delay_ns"]
-    if max(int(np.abs(one).max(initial=0)) for one in (*delays, rows["arrival_ns"])) > _LATEST_NS:
+    times = (rows[name] for name in ("delay_ns", "copy_delay_ns", "arrival_ns"))
+    if max(int(np.abs(time_ns).max(initial=0)) for time_ns in times) > _LATEST_NS:
         raise CallerError(f"{path}: has a time that is too large")
     never = np.iinfo(np.int64).max
     dropped = np.isin(rows["fate"], [Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT])
-    intact = [
-        np.where((delay >= 0) & (rows[bit] < 0) & ~dropped, delay, never)
-        for delay, bit in zip(delays, ("bit", "copy_bit"), strict=True)
-    ]
-    delay_ns = np.minimum(*intact)
+    delay_ns = np.minimum(*(
+        np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never)
+        for delay, bit in (("delay_ns", "bit"), ("copy_delay_ns", "copy_bit"))
+    ))  # fmt: skip
     lost = delay_ns == never
     return np.where(lost, LOST_NS, rows["arrival_ns"] + np.where(lost, 0, delay_ns)), lost
 

@@ -6,7 +6,8 @@ Arrays may have any length, including 0. Values that are not finite are drawn as
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -34,6 +35,12 @@ Steps = Literal["", "pre", "mid", "post"]
 """Whether a curve is a staircase, and where its steps are."""
 BoundKind = Literal["certified", "identity", "printed"]
 """Source of a bound: a certificate, identity (I1), or ("printed") a formula of the paper."""
+_BOUND_STYLES: dict[BoundKind, tuple[Colour, tuple[Dash, ...]]] = {
+    # There may be several certificates, for different conditions.
+    "certified": (palette.CERTIFIED, (DASHED, (3, 1.5), (6, 2, 1.5, 2), (10, 3))),
+    "identity": (palette.IDENTITY, ((1.2, 1.4),)),
+    "printed": (palette.PRINTED, ((6, 1.5, 1, 1.5, 1, 1.5),)),
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,16 +61,6 @@ class Line:
     marker: str = ""
     size: float = 5.0
     """Size of the marker."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Bound:
-    """A curve that bounds a measured quantity; each kind has its colour, each bound its dashes."""
-
-    label: str
-    x: Reals
-    y: Reals
-    kind: BoundKind = "certified"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -161,7 +158,7 @@ class Heat:
     """Write the values where there is room."""
 
 
-Item = Line | Bound | Band | Marks | Bars | Rule | Spans | Heat
+Item = Line | Band | Marks | Bars | Rule | Spans | Heat
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -199,6 +196,13 @@ class Panel:
     """Text in a panel without data."""
     beside: "Panel | None" = None
     """A panel with the same vertical axis at the right: a histogram."""
+
+    @property
+    def labels(self) -> Sequence[str]:
+        """Labels in the legend, in order."""
+        if self.legend is not None:
+            return self.legend
+        return [*dict.fromkeys(filter(None, (getattr(item, "label", "") for item in self.items)))]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -262,6 +266,21 @@ def time_axis(t_s: Reals, *, numbers: bool = True, label: str = TIME) -> Axis:
         start = 0.0 if 0 <= t_s[0] < 0.05 * t_s[-1] else float(t_s[0])
         ends = (start, float(t_s[-1]))
     return Axis(label=label if numbers else "", ends=ends, numbers=numbers)
+
+
+def bound_lines(bounds: Iterable[tuple[str, Reals, Reals, BoundKind]]) -> list[Line]:
+    """Return the curves of bounds; each kind has its colour, each bound of a kind its dashes.
+
+    A bound has a label, points (k,), values (k,) and its source.
+    """
+    lines, counts = [], Counter[BoundKind]()
+    for label, x, y, kind in bounds:
+        colour, dashes = _BOUND_STYLES[kind]
+        dash = dashes[counts[kind] % len(dashes)]
+        counts[kind] += 1
+        y = finite(y, positive=True)  # a gap after a reset shows the curve behind
+        lines.append(Line(x=x, y=y, label=label, colour=colour, dash=dash, width=1.6))
+    return lines
 
 
 def series_colour(i: int) -> Colour:

@@ -1,17 +1,14 @@
 """Draws a figure by matplotlib: for reports and pages, files and notebooks.
 
-Panels have positions in inches: this needs no layout engine, aligns the figures of a page with each
-other, and gives the same figure the same bytes. Read :func:`draw` first; then the places of panels,
-their items, their axes, and legends.
+Read :func:`draw` first; then panels and their items, axes, and heads.
 """
 
 import math
 import re
 import textwrap
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import singledispatch
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -20,56 +17,47 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from cosim.analysis.value_reduction import decimate
-from cosim.output import palette
 from cosim.output.figure_description import (
     LARGEST,
     Axis,
     Band,
     Bars,
-    Bound,
-    BoundKind,
     ColourScale,
-    Dash,
     FigureDescription,
     Heat,
     Line,
     Marks,
     Panel,
-    Row,
     Rule,
     Spans,
     finite,
 )
-from cosim.output.figure_style import PAPER, NotebookFigure, layout, rgb, styled
+from cosim.output.figure_placing import (
+    BAR_IN,
+    Box,
+    Place,
+    legend_rows,
+    legend_text,
+    place_panels,
+)
+from cosim.output.figure_style import PAPER, POINTS_PER_IN, NotebookFigure, layout, rgb, settings
 from cosim.record.align import Reals
 
 Shown = tuple[Artist, str]
 """A drawn object and its label in the legend."""
 
-_BESIDE_IN, _BESIDE_GAP_IN, _UNTITLED_IN = 2.0, 0.27, 0.08
-_BAR_IN = 0.2
-"""Width of the bar that explains the colours."""
 _NARROW_IN = 2.5
 """A shorter axis has few numbers."""
-_TITLE_CHARACTERS = 31
-"""Room for a title beside a legend."""
 _COLUMNS = 600
 """Pixel columns of a panel, to which lines are reduced."""
 _MARKS, _CROWD = 120, 80
 """Columns of markers in a panel, which are wider than a pixel; more markers than ``_CROWD`` are
 drawn smaller."""
-_IN_SHORT = (
-    ("certified for every plant of the uncertainty ", "certified: "),
-    ("certified for the scenario's ", "certified: "),
-    ("bound, given ", "given "),
-)
-"""What the legends of papers leave out of the labels of bounds."""
-_MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 _CROWDED = 6.0
 """Ratio of the ends of a logarithmic axis from which it has room for few numbers in a paper."""
 _NARROWEST_CELL_IN = 0.42
@@ -78,166 +66,61 @@ _MOST_CELLS = 1000
 """A map of more cells is a bitmap."""
 _TOP, _DARK = 0.97, 0.6
 _EM_PER_CHARACTER_OF_LABEL = 0.5  # a label of an axis may be a little longer than the axis
-_POINTS_PER_IN = 72
 _SHORTEST_LINE = 8
 _UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
-_BOUND_STYLES: dict[BoundKind, tuple[palette.Colour, tuple[Dash, ...]]] = {
-    # There may be several certificates, for different conditions.
-    "certified": (palette.CERTIFIED, ((6, 2.5), (3, 1.5), (6, 2, 1.5, 2), (10, 3))),
-    "identity": (palette.IDENTITY, ((1.2, 1.4),)),
-    "printed": (palette.PRINTED, ((6, 1.5, 1, 1.5, 1, 1.5),)),
-}
+_DOLLAR = re.compile(r"(?<!\\)\$")
+_BOLD = ["cmb10", "DejaVu Serif"]
+_ELSEWHERE = str.maketrans({
+    "_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''",
+})  # fmt: skip
+"""Characters at whose places Computer Modern has others; its mathematical fonts have them."""
 
 
-@styled
 def draw(described: FigureDescription) -> Figure:
     """Draw a figure for the width of :func:`cosim.output.figure_style.figure_width`."""
-    placed, size_in = _placed(described)
+    with settings():
+        return _drawn(described)
+
+
+def _drawn(described: FigureDescription) -> Figure:
+    places, size_in = place_panels(described)
     figure, norm = NotebookFigure(figsize=size_in), _norm(described.scale)
-    for number, place in enumerate(placed):
-        axes = _axes(figure, place.box_in, place.panel)
+    for number, place in enumerate(places):
+        axes = _axes(figure, place, figure.axes[-1] if place.is_beside else None)
         shown = _draw_panel(axes, place, norm)
+        box, title = place.box, place.panel.title
         if described.heading and not number:
-            _heading(figure, described.heading, shown)
-        else:
-            _legend(axes, shown)
-        if place.beside_in is not None and place.panel.beside is not None:
-            beside = place._replace(panel=place.panel.beside)
-            second = _axes(figure, place.beside_in, beside.panel, sharey=axes)
-            second.tick_params(labelleft=False, which="both")
-            _draw_panel(second, beside, norm)
-            for bound, style in _styled_bounds(place.panel):
-                if len(bound.y):
-                    second.axhline(float(np.min(bound.y)), **style)
+            width_in = layout().width_in - layout().right_in - box.left
+            box, title = box._replace(width=width_in), described.heading
+        _head(axes, figure, box, title, shown)
     if described.scale is not None:
-        _colour_bar(figure, described.scale, norm, placed)
+        _colour_bar(figure, described.scale, norm, places)
     figure.align_ylabels()
     _fit_to_paper(figure)
+    if layout().latex:
+        for text in figure.findobj(Text):
+            assert isinstance(text, Text)
+            text.set_text(_for_font(text.get_text()))
+            if text.get_fontweight() == "bold":
+                text.set_fontfamily(_BOLD)
     return figure
 
 
-# Places of the panels
+# Panels and their items
 
 
-class _Box(NamedTuple):
-    """A rectangle in inches, from the figure's upper left corner."""
-
-    left: float
-    top: float
-    width: float
-    height: float
-
-
-class _Placed(NamedTuple):
-    """A panel and its axes."""
-
-    panel: Panel
-    box_in: _Box
-    beside_in: _Box | None
-    has_x: bool
-    """Whether the horizontal axis has its label and numbers here."""
-    has_y: bool
-
-
-def _placed(described: FigureDescription) -> tuple[list[_Placed], tuple[float, float]]:
-    """Place the panels; return them, and width and height of the figure in inches."""
-    space, placed = layout(), list[_Placed]()
-    top_in = 0.0
-    if described.heading:
-        top_in = _head_in(_labels(described.rows[0].panels[0]), space.width_in)
-    right_in = space.right_in + (4 * _BAR_IN if described.scale is not None else 0.0)
-    for row in described.rows:
-        columns = _columns(row, space.width_in)
-        for first in range(0, len(row.panels), columns):
-            has_heading = bool(described.heading) and not placed
-            line = _placed_line(row, first, columns, top_in, right_in, has_heading=has_heading)
-            placed += line
-            box_in = line[0].box_in
-            numbered = any(one.has_x for one in line)
-            top_in = box_in.top + box_in.height + (space.below_in if numbered else space.gap_in)
-    return placed, (space.width_in, top_in)
-
-
-def _columns(row: Row, room_in: float) -> int:
-    columns = min(row.columns or len(row.panels), len(row.panels))
-    return max(min(columns, int(room_in / row.narrowest_in)), 1) if row.narrowest_in else columns
-
-
-def _placed_line(
-    row: Row, first: int, columns: int, top_in: float, right_in: float, *, has_heading: bool
-) -> list[_Placed]:
-    """Place the panels of a row that are side by side, from number ``first`` on."""
-    space, panels = layout(), row.panels[first : first + columns]
-    left_in = row.left_in or max(map(_left_in, row.panels))
-    further_in = space.gap_in if row.common == "xy" else left_in
-    room_in = space.width_in - right_in - left_in - (columns - 1) * further_in
-    share_in = room_in / columns
-    width_in = min(share_in, row.widest_in)
-    height_in = row.height_in * space.scale
-    if not has_heading:
-        top_in += max(_panel_head_in(panel, width_in, is_first=not first) for panel in panels)
-    placed = []
-    for i, panel in enumerate(panels):
-        begin_in = left_in + i * (share_in + further_in)
-        main_in = _main_in(panel, width_in)
-        beside_in = None
-        if panel.beside is not None:
-            at_in = begin_in + main_in + _BESIDE_GAP_IN
-            beside_in = _Box(at_in, top_in, width_in - main_in - _BESIDE_GAP_IN, height_in)
-        is_last = first + i + columns >= len(row.panels)
-        placed.append(
-            _Placed(
-                panel, _Box(begin_in, top_in, main_in, height_in), beside_in,
-                has_x=panel.x.numbers and (is_last or not row.common),
-                has_y=panel.y.numbers and (i == 0 or row.common != "xy"),
-            )
-        )  # fmt: skip
-    return placed
-
-
-def _panel_head_in(panel: Panel, width_in: float, *, is_first: bool) -> float:
-    """Return the height above a panel; none below another one, without title and legend."""
-    labels = _labels(panel)
-    if not (panel.title or labels or is_first):
-        return 0.0
-    return _head_in(labels, _main_in(panel, width_in), titled=bool(panel.title))
-
-
-def _main_in(panel: Panel, width_in: float) -> float:
-    """Return the width of a panel without the one beside it."""
-    if panel.beside is None:
-        return width_in
-    return width_in - _BESIDE_IN * layout().beside_scale - _BESIDE_GAP_IN
-
-
-def _left_in(panel: Panel) -> float:
-    """Return the room for label and numbers at the left of a panel."""
-    space, texts = layout(), (panel.y.ticks or {}).values()
-    label_in = 2 * space.character_in if panel.y.label else 0.0
-    longest_in = max(map(len, texts), default=0) * space.character_in
-    return max(space.left_in, longest_in + _BAR_IN + label_in)
-
-
-def _head_in(labels: Sequence[str], width_in: float, *, titled: bool = True) -> float:
-    """Return the height of title and legend above axes of this width."""
-    space = layout()
-    title_in = space.above_in if titled or (space.beside_title and labels) else _UNTITLED_IN
-    rows = _legend_rows(labels, width_in)
-    return title_in + space.legend_row_in * (max(rows - 1, 0) if space.beside_title else rows)
-
-
-def _axes(figure: Figure, box_in: _Box, panel: Panel, **shared: Any) -> Axes:
-    figure_in, whole_in = figure.get_size_inches()
-    bottom_in = whole_in - box_in.top - box_in.height
+def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
+    (figure_in, whole_in), box = figure.get_size_inches(), place.box
+    bottom_in = whole_in - box.top - box.height
     axes = figure.add_axes(
-        (box_in.left / figure_in, bottom_in / whole_in, box_in.width / figure_in,
-         box_in.height / whole_in), **shared,
+        (box.left / figure_in, bottom_in / whole_in, box.width / figure_in,
+         box.height / whole_in), sharey=beside,
     )  # fmt: skip
     factor = axes.yaxis.get_offset_text()  # e.g. ×10⁻⁶; above the axes it would overlap the title
-    factor.set(x=-0.05 / box_in.width, horizontalalignment="right")
-    for which, axis in (("x", panel.x), ("y", panel.y)):
+    factor.set(x=-0.05 / box.width, horizontalalignment="right")
+    for which, axis in (("x", place.panel.x), ("y", place.panel.y)):
         if axis.logarithmic:
-            logarithmic(axes, which)  # type: ignore[arg-type]
+            _make_logarithmic(axes, which)  # type: ignore[arg-type]
         if None not in axis.ends:
             _set_ends(axes, which, axis)  # type: ignore[arg-type]
         if not axis.grid:
@@ -245,84 +128,38 @@ def _axes(figure: Figure, box_in: _Box, panel: Panel, **shared: Any) -> Axes:
     return axes
 
 
-def _heading(figure: Figure, text: str, shown: Sequence[Shown]) -> None:
-    """Write a title and a legend above all panels."""
-    space, height_in = layout(), figure.get_figheight()
-    left, y = space.left_in / space.width_in, 1 - 0.26 * space.above_in / height_in
-    figure.text(left, y, text, weight="bold", size=space.title_pt, va="top")
-    if shown:
-        handles, labels = zip(*shown, strict=True)
-        top_in = (0.18 if space.beside_title else 0.9) * space.above_in
-        corner = (1 - space.right_in / space.width_in, 1 - top_in / height_in)
-        columns = len(labels) if space.beside_title else _legend_columns(labels, space.width_in)
-        figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=columns)
-
-
-def _fit_to_paper(figure: Figure) -> None:
-    """In a paper, make lines thinner and markers smaller, and break long labels of axes."""
-    space = layout()
-    if not space.is_paper:
-        return
-    for line in figure.findobj(Line2D):
-        assert isinstance(line, Line2D)
-        line.set_linewidth(line.get_linewidth() * space.line_scale)
-        line.set_markersize(line.get_markersize() * space.line_scale)
-        line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
-    character_in = _EM_PER_CHARACTER_OF_LABEL * space.label_pt / _POINTS_PER_IN
-    for axes in figure.axes:
-        place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
-        for axis, length_in in (
-            (axes.xaxis, place.width * width_in), (axes.yaxis, place.height * height_in),
-        ):  # fmt: skip
-            most = max(int(length_in / character_in), _SHORTEST_LINE)
-            axis.set_label_text(_wrapped(axis.get_label_text(), most))
-
-
-def _wrapped(label: str, most: int) -> str:
-    """Break a label into lines; a unit in brackets stays in one line."""
-    bound = _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), label)
-    lines = textwrap.wrap(bound, most, break_long_words=False)
-    return "\n".join(lines).replace(_NO_BREAK, " ")
-
-
-# Panels and their items
-
-
-def _draw_panel(axes: Axes, place: _Placed, norm: Normalize | None) -> list[Shown]:
+def _draw_panel(axes: Axes, place: Place, norm: Normalize | None) -> list[Shown]:
     """Draw a panel; return what its legend shows."""
     panel, drawn = place.panel, dict[str, Artist]()
-    styles = iter(_styled_bounds(panel))
     for item in panel.items:
-        if isinstance(item, Bound):
-            values = finite(item.y, positive=True)
-            drawn[item.label] = _curve(axes, item.x, values, **next(styles)[1])
-        elif (artist := _draw(item, axes, norm)) is not None:
+        if (artist := _draw(item, axes, norm)) is not None:
             drawn.setdefault(getattr(item, "label", ""), artist)
-    axes.set_title(panel.title)
     _finish_axis(axes, "x", panel.x, place.has_x)
     _finish_axis(axes, "y", panel.y, place.has_y)
     if not np.isfinite(axes.dataLim.bounds).all():
         axes.text(0.5, 0.5, panel.empty, transform=axes.transAxes, ha="center", va="center")
         axes.tick_params(left=False, labelleft=False, which="both")
-    return [(drawn[label], label) for label in _labels(panel) if label in drawn]
+    return [(drawn[label], label) for label in panel.labels if label in drawn]
 
 
-def _labels(panel: Panel) -> Sequence[str]:
-    """Return the labels in the legend of a panel."""
-    if panel.legend is not None:
-        return panel.legend
-    return [*dict.fromkeys(one.label for one in panel.items if getattr(one, "label", ""))]  # type: ignore[union-attr]
-
-
-def _styled_bounds(panel: Panel) -> Iterator[tuple[Bound, dict[str, Any]]]:
-    """Yield the bounds of a panel with their styles: a colour for each kind, dashes for each."""
-    counts: Counter[BoundKind] = Counter()
-    for bound in panel.items:
-        if isinstance(bound, Bound):
-            colour, dashes = _BOUND_STYLES[bound.kind]
-            dash = dashes[counts[bound.kind] % len(dashes)]
-            counts[bound.kind] += 1
-            yield bound, {"color": rgb(colour), "linestyle": (0, dash), "linewidth": 1.6}
+def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Shown]) -> None:
+    """Write a title and a legend above a box, where there are no data."""
+    space, bottom_in = layout(), figure.get_figheight() - box.top
+    rows = legend_rows([label for _, label in shown], box.width)
+    right_in, title_in = box.left + box.width, 0.0
+    if not space.beside_title:  # the legend is below the title, and ends where all axes end
+        right_in, title_in = space.width_in - space.right_in, space.legend_row_in * len(rows)
+    for number, entries in enumerate(rows):
+        above = len(rows) - 1 - number
+        legend = axes.legend(
+            [shown[i][0] for i in entries], [legend_text(shown[i][1]) for i in entries],
+            loc="lower right", bbox_to_anchor=(right_in, bottom_in + above * space.legend_row_in),
+            bbox_transform=figure.dpi_scale_trans, ncols=len(entries),
+        )  # fmt: skip
+        if above:  # the next row would replace it
+            axes.add_artist(legend)
+    pad_pt = POINTS_PER_IN * title_in + mpl.rcParams["axes.titlepad"]
+    axes.set_title(title, loc="left", weight="bold", y=1.0, pad=pad_pt)
 
 
 @singledispatch
@@ -414,7 +251,7 @@ def _(item: Bars, axes: Axes, norm: Normalize | None) -> Artist | None:
         for x, height in zip(middles, item.heights, strict=True):
             if height:
                 axes.text(x, height, f"{height:,g}", ha="center", va="bottom",
-                          size=layout().text_pt)  # fmt: skip
+                          size=mpl.rcParams["legend.fontsize"])  # fmt: skip
     return axes.bar(middles, item.heights, widths, **style).patches[0]
 
 
@@ -466,15 +303,16 @@ def _norm(scale: ColourScale | None) -> Normalize | None:
 
 
 def _colour_bar(
-    figure: Figure, scale: ColourScale, norm: Normalize | None, placed: Sequence[_Placed]
+    figure: Figure, scale: ColourScale, norm: Normalize | None, places: Sequence[Place]
 ) -> None:
     """Draw the bar that explains the colours, at the right of all panels."""
-    boxes = [one.box_in for one in placed]
+    boxes = [place.box for place in places]
     top_in = min(box.top for box in boxes)
     height_in = max(box.top + box.height for box in boxes) - top_in
-    at_in = max(box.left + box.width for box in boxes) + _BAR_IN
-    box_in = _Box(at_in, top_in, _BAR_IN, height_in)
-    bar = _axes(figure, box_in, Panel(items=(), x=Axis(grid=False), y=Axis(grid=False)))
+    begin_in = max(box.left + box.width for box in boxes) + BAR_IN
+    panel = Panel(items=(), x=Axis(grid=False), y=Axis(grid=False))
+    box = Box(begin_in, top_in, BAR_IN, height_in)
+    bar = _axes(figure, Place(panel, box, has_x=False, has_y=True))
     mappable = ScalarMappable(norm, "viridis")
     extend: Any = "max" if scale.exceeded else "neither"
     figure.colorbar(mappable, cax=bar, label=scale.label, extend=extend)
@@ -504,7 +342,7 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
         few = box / axes.figure.dpi < _NARROW_IN
         axis.set_major_locator(MaxNLocator(integer=True, nbins=5 if few else "auto"))
     if described.ticks is not None:
-        axis.set_ticks([*described.ticks], labels=[*described.ticks.values()])
+        axis.set_ticks([*described.ticks], labels=[*map(_for_font, described.ticks.values())])
     if not has_numbers:
         axis.set_tick_params(which="both", labelbottom=False, labelleft=False)
     if described.about is not None and described.logarithmic:
@@ -513,6 +351,14 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
         _limit_axis(axes, described.about)
     if described.ends.count(None) == 1:
         _set_ends(axes, which, described)
+
+
+def _for_font(text: str) -> str:
+    """Write characters that the fonts of LaTeX lack as mathematics, which is between dollars."""
+    if not layout().latex:
+        return text
+    parts = _DOLLAR.split(text)
+    return "$".join(part if i % 2 else part.translate(_ELSEWHERE) for i, part in enumerate(parts))
 
 
 def _set_ends(axes: Axes, which: Literal["x", "y"], described: Axis) -> None:
@@ -562,7 +408,7 @@ class _Numbers(LogFormatter):
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+def _make_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """Make an axis logarithmic, with numbers that are easy to read."""
     axes.set(**{f"{which}scale": "log"})
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -570,81 +416,28 @@ def logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     axis.set_minor_formatter(_Numbers(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))
 
 
-# Legends
-
-
-def _legend(axes: Axes, shown: Sequence[Shown]) -> None:
-    """Put the legend above the axes at the right, where there are no data; the title is set."""
-    if not shown:
-        return
-    handles, labels = zip(*shown, strict=True)
-    space, place = layout(), axes.get_position()
-    width_in, right = place.width * space.width_in, 1.0
+def _fit_to_paper(figure: Figure) -> None:
+    """In a paper, make lines thinner and markers smaller, and break long labels of axes."""
+    space = layout()
     if not space.is_paper:
-        columns = _legend_columns(labels, width_in)
-        axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(right, 1), ncols=columns)
         return
-    rows = _packed(labels, width_in)
-    if not space.beside_title:  # it ends where the figure's axes end
-        right = (1 - space.right_in / space.width_in - place.x0) / place.width
-        pad_pt = _POINTS_PER_IN * space.legend_row_in * len(rows) + mpl.rcParams["axes.titlepad"]
-        axes.set_title(axes.get_title("left"), pad=pad_pt)
-    row = space.legend_row_in * axes.figure.dpi / axes.bbox.height
-    for above, entries in enumerate(reversed(rows)):
-        axes.add_artist(Legend(
-            axes, [handles[i] for i in entries], [_short(labels[i]) for i in entries],
-            loc="lower right", bbox_to_anchor=(right, 1 + above * row), ncols=len(entries),
-        ))  # fmt: skip
+    for line in figure.findobj(Line2D):
+        assert isinstance(line, Line2D)
+        line.set_linewidth(line.get_linewidth() * space.line_scale)
+        line.set_markersize(line.get_markersize() * space.line_scale)
+        line.set_markeredgewidth(line.get_markeredgewidth() * space.line_scale)
+    character_in = _EM_PER_CHARACTER_OF_LABEL * mpl.rcParams["axes.labelsize"] / POINTS_PER_IN
+    for axes in figure.axes:
+        place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
+        for axis, length_in in (
+            (axes.xaxis, place.width * width_in), (axes.yaxis, place.height * height_in),
+        ):  # fmt: skip
+            most = max(int(length_in / character_in), _SHORTEST_LINE)
+            axis.set_label_text(_wrapped(axis.get_label_text(), most))
 
 
-def _legend_rows(labels: Sequence[str], width_in: float) -> int:
-    """Return the number of rows of a legend."""
-    if layout().is_paper:
-        return len(_packed(labels, width_in))
-    return math.ceil(len(labels) / _legend_columns(labels, width_in))
-
-
-def _packed(labels: Sequence[str], width_in: float) -> list[list[int]]:
-    """Return which entries are in each row of a legend in a paper, in their order."""
-    rows, left_in = list[list[int]](), 0.0
-    for number, entry_in in enumerate(_entries_in(map(_short, labels))):
-        if entry_in > left_in:
-            rows.append([])
-            left_in = _legend_room_in(width_in)
-        rows[-1].append(number)
-        left_in -= entry_in
-    return rows
-
-
-def _legend_columns(labels: Sequence[str], width_in: float) -> int:
-    """Return the number of legend columns that fit beside the title, or below it.
-
-    Below the title, a legend may be as wide as the figure.
-    """
-    entries_in, room_in = _entries_in(labels), _legend_room_in(width_in)
-    for columns in range(len(labels), 1, -1):
-        widths_in = [max(column) for column in np.array_split(entries_in, columns)]
-        if sum(widths_in) <= room_in:
-            return columns
-    return 1
-
-
-def _legend_room_in(width_in: float) -> float:
-    """Return the width of a legend: beside the title, or below it as wide as the figure."""
-    space = layout()
-    if not space.beside_title:
-        return space.width_in - 2 * space.right_in
-    return width_in - _TITLE_CHARACTERS * space.character_in
-
-
-def _short(label: str) -> str:
-    """Return the label of a bound as it is in the legends of papers."""
-    for long, brief in _IN_SHORT:
-        label = label.replace(long, brief)
-    return label
-
-
-def _entries_in(labels: Iterable[str]) -> list[float]:
-    """Return the widths of a legend's entries."""
-    space = layout()
-    return [space.handle_in + space.character_in * len(_MARKUP.sub("", label)) for label in labels]
+def _wrapped(label: str, most: int) -> str:
+    """Break a label into lines; a unit in brackets stays in one line."""
+    bound = _UNIT.sub(lambda unit: unit[0].replace(" ", _NO_BREAK), label)
+    lines = textwrap.wrap(bound, most, break_long_words=False)
+    return "\n".join(lines).replace(_NO_BREAK, " ")

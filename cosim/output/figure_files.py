@@ -2,18 +2,12 @@
 
 import base64
 import io
-import logging
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter
 
 from cosim.output.figure_description import FigureDescription
 from cosim.output.figure_drawing import draw
@@ -22,27 +16,15 @@ from cosim.output.figure_style import GRID, INK, PAPER, figure_width, settings
 from noack.core.errors import CallerError
 from noack.core.file_access import write_whole
 
-_UNDATED: dict[str, dict[str, str | None]] = {
-    "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
-    "png": {"Software": None},
-    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+_UNDATED: dict[FigureFormat, dict[str, str | None]] = {
+    FigureFormat.SVG: {"Date": None, "Creator": None, "Format": None, "Type": None},
+    FigureFormat.PNG: {"Software": None},
+    FigureFormat.PDF: {"Creator": None, "Producer": None, "CreationDate": None},
 }
 _HEAVY_CHARACTERS = 400_000
 _REFERENCE = re.compile(r"(?<=#)[^)]+")
 _TAIL = re.compile(r"(\.\d\d)\d+")
 _BY_PAGE = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
-_PAPER_SETTINGS: dict[Any, Any] = {
-    "font.family": ["cmr10", "DejaVu Serif"],  # the second one has what the first one lacks
-    "mathtext.fontset": "cm",
-    "pdf.fonttype": 42,  # publishers refuse fonts of type 3
-}
-_SCREEN_FONTS = {"font.family": "sans-serif", "mathtext.fontset": "dejavusans"}
-_DOLLAR = re.compile(r"(?<!\\)\$")
-_BOLD = ["cmb10", "DejaVu Serif"]
-_ELSEWHERE = str.maketrans({
-    "_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''",
-})  # fmt: skip
-"""Characters at whose places Computer Modern has others; its mathematical fonts have them."""
 
 FIGURE_SUFFIXES = tuple(f".{kind}" for kind in FigureFormat)
 
@@ -62,8 +44,7 @@ def save_figure(figure: FigureDescription, path: Path, width: str | float | None
     if path.suffix not in FIGURE_SUFFIXES:
         raise CallerError(f"{path}: a figure is saved as {', '.join(FIGURE_SUFFIXES)}")
     kind = FigureFormat(path.suffix.removeprefix("."))
-    with figure_width(figure_width_in(kind, width)):
-        write_whole(path, file_content(draw(figure), kind))
+    write_whole(path, file_content(figure, kind, figure_width_in(kind, width)))
 
 
 def save_figures(
@@ -88,36 +69,29 @@ def save_figures(
     return written
 
 
-def file_content(figure: Figure, kind: FigureFormat) -> bytes:
-    """Return a figure of matplotlib as the content of a file; a PDF has the fonts of LaTeX."""
-    fonts = _paper_fonts(figure) if kind is FigureFormat.PDF else nullcontext()
-    with settings(), fonts:
-        return _saved(figure, kind)
+def file_content(figure: FigureDescription, kind: FigureFormat, width_in: float) -> bytes:
+    """Return a figure as the content of a file; a PDF has the fonts of LaTeX."""
+    with figure_width(width_in, latex=kind is FigureFormat.PDF):
+        return _saved(draw(figure), kind)
 
 
-def _saved(figure: Figure, kind: str) -> bytes:
+def _saved(drawn: Figure, kind: FigureFormat) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, metadata=_UNDATED[kind])
+    with settings():
+        drawn.savefig(buffer, format=kind, metadata=_UNDATED[kind])
     return buffer.getvalue()
 
 
 def inline(figure: FigureDescription) -> str:
-    """Return a figure as HTML: SVG with the page's colours, or PNG if the SVG would be large."""
-    return markup_of(draw(figure), figure.name, figure.description or figure.caption)
+    """Return a figure as HTML: SVG with the page's colours, or PNG if the SVG would be large.
 
-
-def markup_of(drawn: Figure, name: str, description: str) -> str:
-    """Return a figure of matplotlib as HTML.
-
-    Args:
-        drawn: the figure.
-        name: a word, which makes the figure's ids unique on the page.
-        description: text alternative of the figure.
+    The figure's name, a word, makes its ids unique on the page.
     """
-    text = _page_svg(file_content(drawn, FigureFormat.SVG), name, description)
+    drawn, description = draw(figure), figure.description or figure.caption
+    text = _page_svg(_saved(drawn, FigureFormat.SVG), figure.name, description)
     if len(text) <= _HEAVY_CHARACTERS:
         return text
-    picture = base64.b64encode(file_content(drawn, FigureFormat.PNG)).decode()
+    picture = base64.b64encode(_saved(drawn, FigureFormat.PNG)).decode()
     image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
     return ET.tostring(image, encoding="unicode")
 
@@ -155,63 +129,3 @@ def _page_svg(drawn: bytes, name: str, description: str) -> str:
     root.attrib.clear()
     root.attrib.update({"viewBox": view, "role": "img", "aria-label": description})
     return ET.tostring(root, encoding="unicode")
-
-
-# The fonts of LaTeX
-
-
-@contextmanager
-def _paper_fonts(figure: Figure) -> Iterator[None]:
-    """Give a figure the fonts of LaTeX within the context, in which it is saved."""
-    log = logging.getLogger("fontTools")  # warns of the dates in these fonts
-    level = log.level
-    with settings(_PAPER_SETTINGS), characters_of_paper_fonts(figure):
-        log.setLevel(logging.ERROR)
-        _set_fonts(figure, _PAPER_SETTINGS)
-        try:
-            yield
-        finally:
-            _set_fonts(figure, _SCREEN_FONTS)
-            log.setLevel(level)
-
-
-@contextmanager
-def characters_of_paper_fonts(figure: Figure) -> Iterator[None]:
-    """Write the characters that Computer Modern lacks as mathematics within the context."""
-    texts = [(text, text.get_text()) for text in figure.findobj(Text) if isinstance(text, Text)]
-    formatters = [
-        formatter
-        for axes in figure.axes
-        for axis in (axes.xaxis, axes.yaxis)
-        if isinstance(formatter := axis.get_major_formatter(), FuncFormatter)
-    ]
-    labels = [(formatter, formatter.func) for formatter in formatters]
-    for text, content in texts:
-        text.set_text(_with_mathematics(content))
-    for formatter, write in labels:
-        formatter.func = partial(_label_with_mathematics, write)
-    try:
-        yield
-    finally:
-        for text, content in texts:
-            text.set_text(content)
-        for formatter, write in labels:
-            formatter.func = write
-
-
-def _label_with_mathematics(write: Callable[..., str], *tick: Any) -> str:
-    return _with_mathematics(write(*tick))
-
-
-def _with_mathematics(text: str) -> str:
-    """Replace characters outside the mathematics of a text, which is between dollars."""
-    parts = _DOLLAR.split(text)
-    return "$".join(part if i % 2 else part.translate(_ELSEWHERE) for i, part in enumerate(parts))
-
-
-def _set_fonts(figure: Figure, wanted: Mapping[Any, Any]) -> None:
-    """Set the fonts of all texts; matplotlib reads the settings when it makes a text only."""
-    for text in figure.findobj(Text):
-        is_bold = wanted is _PAPER_SETTINGS and text.get_fontweight() == "bold"
-        text.set_fontfamily(_BOLD if is_bold else wanted["font.family"])
-        text.set_math_fontfamily(wanted["mathtext.fontset"])

@@ -5,14 +5,15 @@ texts must keep a size that one can read: a figure is laid out for its width, no
 This module does not use pyplot, and does not change matplotlib's global settings permanently.
 """
 
-import functools
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, NamedTuple, ParamSpec
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -20,54 +21,18 @@ from matplotlib.figure import Figure
 from cosim.output.figure_format import SCREEN_IN
 from cosim.output.palette import Colour
 
-# If matplotlib cannot write its cache, it warns in every run; the warning is of no use here.
-logging.getLogger("matplotlib").setLevel(logging.ERROR)
+# Warnings of no use here: that matplotlib cannot write its cache, and of the dates in fonts.
+for library in ("matplotlib", "fontTools"):
+    logging.getLogger(library).setLevel(logging.ERROR)
 
-P = ParamSpec("P")
 Rgb = tuple[float, float, float]
 
 INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
-"""Text and frames, grid lines, background; a page replaces them in dark mode."""
+"""Text and frames, grid lines, background, as in the style files; a page replaces them."""
 
-_PAPER_DPI = 600  # what publishers require of line art
 _EM_PER_CHARACTER = 0.6
-_POINTS_PER_IN = 72
-_SETTINGS: dict[Any, Any] = {
-    "axes.axisbelow": True,
-    "axes.edgecolor": INK,
-    "axes.formatter.limits": (-4, 5),
-    "axes.formatter.use_mathtext": True,
-    "axes.facecolor": PAPER,
-    "axes.grid": True,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.8,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlecolor": INK,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.titley": 1.0,
-    "figure.dpi": 100,
-    "figure.facecolor": PAPER,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "grid.color": GRID,
-    "grid.linewidth": 0.7,
-    "legend.borderaxespad": 0.3,
-    "legend.borderpad": 0.0,
-    "legend.columnspacing": 1.4,
-    "legend.frameon": False,
-    "legend.labelcolor": INK,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 5,
-    "mathtext.fontset": "dejavusans",
-    "savefig.dpi": 120,  # 1200 pixels wide
-    "svg.fonttype": "path",
-    "svg.hashsalt": "noack",
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-}
+POINTS_PER_IN = 72
+_STYLES = Path(__file__).with_name("styles")
 
 
 class FigureLayout(NamedTuple):
@@ -85,10 +50,6 @@ class FigureLayout(NamedTuple):
     legend_row_in: float = 0.19
     handle_in: float = 0.6
     """Width of an entry of a legend without its text."""
-    text_pt: float = 9.0
-    """Size of ticks and legends."""
-    label_pt: float = 10.0
-    title_pt: float = 10.5
     scale: float = 1.0
     """Factor of the heights of axes."""
     beside_scale: float = 1.0
@@ -97,42 +58,27 @@ class FigureLayout(NamedTuple):
     """Factor of the widths of lines and of the sizes of markers."""
     beside_title: bool = True
     """Whether there is room for a legend beside the title; else it is below the title."""
+    latex: bool = False
+    """Whether texts have the fonts of LaTeX."""
 
     @property
     def character_in(self) -> float:
-        """Mean width of a character of a legend."""
-        return _EM_PER_CHARACTER * self.text_pt / _POINTS_PER_IN
+        """Mean width of a character of a legend, within :func:`settings`."""
+        return _EM_PER_CHARACTER * float(mpl.rcParams["legend.fontsize"]) / POINTS_PER_IN
 
     @property
     def is_paper(self) -> bool:
         """Whether the figure is narrower than on a screen."""
         return self.width_in < SCREEN_IN
 
-    def settings(self) -> dict[Any, Any]:
-        """Return matplotlib's settings for these sizes."""
-        sizes = {
-            "axes.labelsize": self.label_pt,
-            "axes.titlesize": self.title_pt,
-            "font.size": self.label_pt,
-            "legend.fontsize": self.text_pt,
-            "xtick.labelsize": self.text_pt,
-            "ytick.labelsize": self.text_pt,
-        }
-        if not self.is_paper:
-            return sizes
-        return sizes | {
-            "axes.labelpad": 3.0,
-            "axes.linewidth": 0.6,
-            "axes.titlepad": 4.0,
-            "grid.linewidth": 0.5,
-            "legend.columnspacing": 1.0,
-            "legend.handlelength": 1.7,
-            "legend.handletextpad": 0.5,
-            "legend.labelspacing": 0.3,
-            "savefig.dpi": _PAPER_DPI,
-            "xtick.major.pad": 2.5,
-            "ytick.major.pad": 2.5,
-        }
+    @property
+    def styles(self) -> Iterator[str]:
+        """The names of its style files."""
+        yield "screen"
+        if self.is_paper:
+            yield "paper"
+        if self.latex:
+            yield "latex"
 
 
 _SCREEN = FigureLayout(SCREEN_IN)
@@ -147,10 +93,11 @@ def layout() -> FigureLayout:
 
 
 @contextmanager
-def figure_width(width_in: float) -> Iterator[None]:
-    """Draw and save figures of this width within the context."""
+def figure_width(width_in: float, *, latex: bool = False) -> Iterator[None]:
+    """Draw and save figures of this width, perhaps with the fonts of LaTeX, within the context."""
     is_paper = width_in < SCREEN_IN
-    token = _WIDTH.set(_of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in))
+    wanted = _of_paper(width_in) if is_paper else _SCREEN._replace(width_in=width_in)
+    token = _WIDTH.set(wanted._replace(latex=latex))
     try:
         yield
     finally:
@@ -161,7 +108,7 @@ def _of_paper(width_in: float) -> FigureLayout:
     """Return the layout of a figure in a paper, with texts of 8 points."""
     return FigureLayout(
         width_in, left_in=0.76, right_in=0.17, below_in=0.42, above_in=0.24, gap_in=0.16,
-        legend_row_in=0.155, handle_in=0.4, text_pt=8.0, label_pt=8.0, title_pt=8.0,
+        legend_row_in=0.155, handle_in=0.4,
         scale=min(max(width_in / SCREEN_IN, _LEAST_SCALE), 1.0), line_scale=0.65,
         beside_scale=max(width_in / SCREEN_IN, _LEAST_BESIDE),
         beside_title=width_in >= _ROOM_BESIDE_TITLE_IN,
@@ -169,14 +116,20 @@ def _of_paper(width_in: float) -> FigureLayout:
 
 
 @contextmanager
-def settings(extra: Mapping[Any, Any] | None = None) -> Iterator[None]:
-    """Apply only these settings within the context, regardless of the user's matplotlibrc."""
+def settings() -> Iterator[None]:
+    """Apply the layout's style files only, not the user's matplotlibrc, within the context."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
-        mpl.rcParams.update(_SETTINGS | layout().settings() | dict(extra or {}))
+        for name in layout().styles:
+            mpl.rcParams.update(_style(name))
         # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
+
+
+@cache
+def _style(name: str) -> mpl.RcParams:
+    return mpl.rc_params_from_file(_STYLES / f"{name}.mplstyle", use_default_template=False)
 
 
 class NotebookFigure(Figure):
@@ -187,17 +140,6 @@ class NotebookFigure(Figure):
         with settings():
             self.savefig(buffer, format="png")
         return buffer.getvalue()
-
-
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorate a function that draws a figure: it draws with these settings."""
-
-    @functools.wraps(draw)
-    def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
-        with settings():
-            return draw(*arguments, **options)
-
-    return drawn
 
 
 def rgb(colour: Colour) -> Rgb:

@@ -21,16 +21,14 @@ from cosim.output.figure_description import FigureDescription
 from cosim.output.page_kit import templates, value_text, words
 from cosim.output.run_figures import envelopes, network_figures, run_figures
 from cosim.output.run_tables import (
-    CAPTION,
-    HEADINGS,
-    TIMING_HEADINGS,
+    LOOPS_CAPTION,
     badness,
     key_numbers,
-    loop_row,
+    loops_table,
     mode_words,
     network_rows,
     shares_network,
-    timing_rows,
+    timing_table,
 )
 from cosim.output.run_verdict import BAD, GOOD, NEUTRAL, remarks, verdict
 from cosim.record.run_directory import (
@@ -171,9 +169,9 @@ def _loops(report: Report) -> Content | None:
         return None
     loops = sorted(report.summary.loops, key=badness, reverse=True)
     return {
-        "caption": CAPTION,
-        "headings": HEADINGS,
-        "loops": [(report.links.get(loop.name), loop_row(loop)) for loop in loops],
+        "caption": LOOPS_CAPTION,
+        "table": loops_table(loops, ""),
+        "links": report.links,
     }
 
 
@@ -216,10 +214,8 @@ def _assumptions(report: Report) -> Content | None:
 @section
 def _timing(report: Report) -> Content | None:
     figures = [one for one in report.figures if one.name in TIMING_FIGURES]
-    rows = [*timing_rows(report.loop)]
-    if not (rows or figures):
-        return None
-    return {"headings": TIMING_HEADINGS, "rows": rows, "figures": figures}
+    table = timing_table(report.loop)
+    return {"table": table, "figures": figures} if table.rows or figures else None
 
 
 @section

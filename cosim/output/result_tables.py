@@ -7,11 +7,13 @@ heads. The texts compile with pdfLaTeX, too.
 import csv
 import io
 import re
+import tomllib
 import unicodedata
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from rich.box import HEAVY_HEAD, SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -31,31 +33,13 @@ _BREAK = r" \\ "
 _WIDE = 36
 """Characters from which on a column breaks its lines."""
 
-
-_SYMBOLS = {
-    "−": "-", "‖": r"\|", "±": r"\pm", "×": r"\times", "·": r"\cdot", "≤": r"\le", "≥": r"\ge",
-    "≈": r"\approx", "≠": r"\ne", "→": r"\rightarrow", "∞": r"\infty", "∈": r"\in", "√": r"\surd",
-    "⟨": r"\langle", "⟩": r"\rangle", "∫": r"\int", "′": "'", "°": r"^{\circ}", "∑": r"\Sigma",
-    "α": r"\alpha", "β": r"\beta", "γ": r"\gamma", "δ": r"\delta", "ε": r"\varepsilon",
-    "ζ": r"\zeta", "η": r"\eta", "θ": r"\theta", "κ": r"\kappa", "λ": r"\lambda", "μ": r"\mu",
-    "ν": r"\nu", "ξ": r"\xi", "π": r"\pi", "ρ": r"\rho", "σ": r"\sigma", "τ": r"\tau",
-    "φ": r"\varphi", "χ": r"\chi", "ψ": r"\psi", "ω": r"\omega", "Γ": r"\Gamma", "Δ": r"\Delta",
-    "Θ": r"\Theta", "Λ": r"\Lambda", "Ξ": r"\Xi", "Π": r"\Pi", "Σ": r"\Sigma", "Φ": r"\Phi",
-    "Ψ": r"\Psi", "Ω": r"\Omega",
-    **{digit: f"_{{{value}}}" for value, digit in enumerate("₀₁₂₃₄₅₆₇₈₉")},
-    **{digit: f"^{{{value}}}" for value, digit in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")},
-    "⁻": "^{-}", "⁺": "^{+}", "ᵀ": r"^{\mathsf{T}}",
-}  # fmt: skip
-"""Characters that are mathematics in LaTeX."""
-_WORDS = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "#": r"\#", "$": r"\$", "%": r"\%",
-    "&": r"\&", "_": r"\_", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}",
-    "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''", "-": "{-}",
-    "–": "--", "—": "---", "…": r"\ldots{}", "’": "'", "‘": "`", "“": "``", "”": "''",
-    "µ": r"\textmu{}", "\u00a0": "~", "\u202f": r"\,", "\n": " ",
-}  # fmt: skip
-_ACCENTS = {"\u0302": r"\hat", "\u0304": r"\bar", "\u0332": r"\underline", "\u0303": r"\tilde",
-            "\u0307": r"\dot"}  # fmt: skip
+_TABLE: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_name("latex.toml").read_text(encoding="utf-8")
+)
+_SYMBOLS, _WORDS, _ACCENTS = _TABLE["symbols"], _TABLE["words"], _TABLE["accents"]
+"""How LaTeX writes characters: as mathematics, outside it, and combining ones."""
+_WITH_ACCENTS = re.compile(r".[\u0300-\u036f]*", re.DOTALL)
+"""A character with the combining ones that follow it."""
 _LATIN = range(0xC0, 0x180)  # letters that LaTeX's own UTF-8 input knows
 _TYPESET = re.compile(
     r"(?<![\w.])(?P<mantissa>[-−]?\d+(?:\.\d+)?)e(?P<power>[-+]?\d{1,3})(?!\w)"
@@ -76,7 +60,12 @@ class ResultTable(NamedTuple):
 
 
 def terminal_table(
-    table: ResultTable, *, left: Collection[int] = (0,), styles: Mapping[str, str] | None = None
+    table: ResultTable,
+    *,
+    left: Collection[int] = (0,),
+    styles: Mapping[str, str] | None = None,
+    note: str | None = None,
+    dense: bool = False,
 ) -> Table:
     """Return a table for a terminal.
 
@@ -84,10 +73,18 @@ def terminal_table(
         table: the table.
         left: numbers of the columns that begin at the left; the others end at the right.
         styles: styles of texts in the last column, by their first words.
+        note: a text below the table.
+        dense: save width, and break no words.
     """
-    shown = Table(title=escape(table.caption) if table.caption else None)
+    shown = Table(
+        title=escape(table.caption) if table.caption else None, caption=note,
+        box=SIMPLE_HEAD if dense else HEAVY_HEAD, collapse_padding=dense, pad_edge=not dense,
+    )  # fmt: skip
     for i, heading in enumerate(table.headings):
-        shown.add_column(escape(heading), justify="left" if i in left else "right")
+        words = " ".join([heading, *(row[i] for row in table.rows)]).split()
+        least = max(map(len, words)) if dense else None
+        shown.add_column(escape(heading), justify="left" if i in left else "right",
+                         min_width=least)  # fmt: skip
     for *cells, last in table.rows:
         style = next((one for word, one in (styles or {}).items() if last.startswith(word)), "")
         shown.add_row(*map(escape, cells), Text(last, style))
@@ -248,26 +245,15 @@ def _closing(text: str, begin: int) -> int:
 
 
 def _plain(text: str) -> str:
-    return "".join(map(_character, _with_accents(text)))
-
-
-def _with_accents(text: str) -> list[str]:
-    """Return the characters, each with the combining one that follows it."""
-    found: list[str] = []
-    for one in text:
-        if found and unicodedata.combining(one):
-            found[-1] += one
-        else:
-            found.append(one)
-    return found
+    return "".join(map(_character, _WITH_ACCENTS.findall(text)))
 
 
 def _character(one: str) -> str:
+    """Return a character, with the combining ones that follow it, for LaTeX."""
     base, accents = one[0], one[1:]
     if accents:
         text = _SYMBOLS.get(base, base if base.isascii() and base.isalnum() else "")
-        known = all(accent in _ACCENTS for accent in accents)
-        if not (known and text):
+        if not text or set(accents) - _ACCENTS.keys():
             return _character(unicodedata.normalize("NFC", one)[0])
         for accent in accents:
             text = f"{_ACCENTS[accent]}{{{text}}}"
@@ -278,6 +264,5 @@ def _character(one: str) -> str:
         return _WORDS[base]
     if ord(base) > _LATIN.stop and len(parts := unicodedata.normalize("NFD", base)) > 1:
         return _character(parts)
-    if (base.isascii() and base.isprintable()) or ord(base) in _LATIN:
-        return base
-    return "?"
+    is_known = (base.isascii() and base.isprintable()) or ord(base) in _LATIN
+    return base if is_known else "?"

@@ -21,7 +21,6 @@ from cosim.output import palette, signal_figures
 from cosim.output.figure_description import (
     Axis,
     Band,
-    Bound,
     BoundKind,
     ColourScale,
     FigureDescription,
@@ -30,6 +29,7 @@ from cosim.output.figure_description import (
     Line,
     Panel,
     Row,
+    bound_lines,
     plain,
     time_axis,
 )
@@ -100,12 +100,12 @@ def envelopes(record: RunRecord) -> Sequence[Envelope]:
         return []
 
 
-def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
-    return [
-        Bound(label=label, x=t_s, y=values, kind=kind)
+def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Line]:
+    return bound_lines(
+        (label, t_s, values, kind)
         for label, what, t_s, values, kind in envelopes
         if what == quantity
-    ]
+    )
 
 
 class _Thinned(NamedTuple):
@@ -196,7 +196,7 @@ def _known(scenario: Scenario) -> str:
     return f"x̂ is the estimate of the observer, from {outputs}. "
 
 
-def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> FigureDescription:
+def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Line]) -> FigureDescription:
     t_s = _seconds(joined.t_ns)
     return signal_figures.error_figure(
         t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
@@ -213,7 +213,7 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> Figur
     )
 
 
-def _state_norm(record: RunRecord, bounds: list[Bound]) -> FigureDescription:
+def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
     t_s, x_norm = _state_norms(record)
     return signal_figures.state_norm_figure(t_s, x_norm, bounds).captioned(
         "Norm of the plant's state." + _dashed(bounds),
@@ -247,7 +247,7 @@ def _input(record: RunRecord) -> FigureDescription:
     )
 
 
-def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> FigureDescription:
+def _inter_event(record: RunRecord, lower_bounds: list[Line]) -> FigureDescription:
     event_s = _seconds(record.events()["t_ns"])
     return signal_figures.inter_event_figure(
         event_s, lower_bounds, record.scenario.horizon_s
@@ -290,7 +290,7 @@ def _lateness(record: RunRecord) -> FigureDescription:
     scenario = record.scenario
     period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
     late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
-    maxima = {role: sketch.quantile(1.0) for role, sketch in late_us.items()}
+    maxima = {role: sketch.quantiles(1.0)[0] for role, sketch in late_us.items()}
     longest = ", ".join(
         f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
     )
@@ -343,7 +343,7 @@ def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDesc
     )
 
 
-def _dashed(curves: Sequence[Bound]) -> str:
+def _dashed(curves: Sequence[Line]) -> str:
     return " Dashed: claimed bounds." if curves else ""
 
 

@@ -15,10 +15,7 @@ from cosim.analysis.summary_model import (
     ChangePart,
     Claim,
     DeadlinesPart,
-    DisturbancePart,
-    EstimationPart,
     FidelityPart,
-    FlowPart,
     LoopSummary,
     NoFidelityPart,
     Quantiles,
@@ -35,34 +32,37 @@ from noack.core.number_format import NONE, duration, number, percent, ratio, sec
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
 Claims = Sequence[Claim]
-TIMING_HEADINGS = ("p50", "p99", "p99.9", "max", "count", "missed")
-HEADINGS = (
+_TIMING_HEADINGS = ("quantity", "p50", "p99", "p99.9", "max", "count", "missed")
+_LOOP_HEADINGS = (
     "loop", "sent", "lost", "burst", "forced", "share, %", "delay, s", "‖e_c‖", "claims held",
 )  # fmt: skip
-"""Of the table of the loops."""
-CAPTION = (
+LOOPS_CAPTION = (
     "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
 _FEW = 3
+_SHORT = (
+    "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
+    "shortest inter-event", "median ", "‖x‖", "maximum ‖e_s‖", "sensor-to-controller",
+    "deadlines missed", "most deadlines missed", "largest bound of a clock", "replay",
+    "difference to the ideal loop, RMS",
+)  # fmt: skip
+"""How the most important numbers of a loop begin, which a terminal of 80 columns shows."""
 
 
 def summary_tables(summary: RunSummary) -> Iterator[ResultTable]:
     """Yield the tables of a run: network and loops, or those of its only loop."""
+    title = run_title(summary)
     if shares_network(summary):
-        title = f"{summary.scenario}, M − 1 = {summary.mansd}"
         yield ResultTable("network", f"network of {title}", KEY_VALUE, network_rows(summary))
-        rows = [loop_row(loop) for loop in summary.loops]
-        yield ResultTable("loops", f"loops of {title}", HEADINGS, rows)
+        yield loops_table(summary.loops, f"loops of {title}")
         return
-    (loop,), title = summary.loops, run_title(summary)
+    (loop,) = summary.loops
     yield ResultTable("numbers", title, KEY_VALUE, key_numbers(summary))
-    if claims := loop.claims:
-        headings, rows = claim_headings(claims), [*claim_rows(claims)]
-        yield ResultTable("claims", f"claims: {title}", headings, rows)
-    if loop.lateness_us:
-        caption = f"timing in µs of wall time: {title}"
-        yield ResultTable("timing", caption, ("", *TIMING_HEADINGS), [*timing_rows(loop)])
+    if loop.claims:
+        yield _claims_table(loop.claims, f"claims: {title}")
+    if loop.lateness_us:  # none in virtual time
+        yield timing_table(loop)
 
 
 def shares_network(summary: RunSummary) -> bool:
@@ -102,36 +102,23 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
 
 
 def run_title(summary: RunSummary) -> str:
-    """Return the title of the tables of one loop: scenario, mode and cap."""
-    (loop,) = summary.loops
+    """Return the title of the tables of a run: scenario, mode of a single loop, and cap."""
+    mode = "" if shares_network(summary) else summary.loops[0].mode
     kind = "" if summary.kind == "live" else summary.kind
-    return title_of(summary.scenario, loop.mode, summary.mansd, summary.constraints, kind)
+    return title_of(summary.scenario, mode, summary.mansd, summary.constraints, kind)
 
 
 def title_of(
     scenario: str, mode: str, mansd: int, constraints: Sequence[str] = (), kind: str = ""
 ) -> str:
-    """Return the title of the tables of a run of one loop; ``kind`` is empty for a live run."""
-    further = "".join(f", {one}" for one in (*constraints, kind) if one)
-    return f"{scenario}, {mode_words(mode)}, M − 1 = {mansd}{further}"
+    """Return the title of the tables of a run; ``kind`` is empty for a live run."""
+    words = (scenario, mode and mode_words(mode), f"M − 1 = {mansd}", *constraints, kind)
+    return ", ".join(filter(None, words))
 
 
 def short_numbers(summary: RunSummary) -> Numbers:
     """Return the most important numbers of one loop, for 80 columns."""
-    (loop,) = summary.loops
-    compared = isinstance(loop.fidelity, FidelityPart)
-    return (
-        lost_row(loop.drops, loop.deliveries),
-        *([_lost_of("actuations", loop.actuations)] if loop.actuations is not None else ()),
-        longest_burst(summary.mansd, summary.constraints, loop.longest_loss_burst),
-        _forced(loop),
-        *_intervals(loop),
-        *_norms(loop),
-        *_lateness(loop),
-        *_other_clocks(loop),
-        *_replay_rows(loop.replay),
-        *([next(fidelity_rows(loop.fidelity))] if compared else ()),
-    )
+    return tuple(row for row in key_numbers(summary) if row[0].startswith(_SHORT))
 
 
 def key_numbers(summary: RunSummary) -> Numbers:
@@ -141,20 +128,24 @@ def key_numbers(summary: RunSummary) -> Numbers:
         ("transmissions", str(loop.events)),
         ("deliveries", str(loop.deliveries)),
         *_losses(summary, loop),
-        *_intervals(loop),
-        *_norms(loop),
+        *interval_rows(
+            loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s
+        ),
+        ("‖x‖ at the start", number(loop.initial_state_norm)),
+        ("‖x‖ at the end", number(loop.final_state_norm)),
+        ("maximum ‖e_s‖, ‖e_c‖", f"{number(loop.sup_e_s_norm)}, {number(loop.sup_e_c_norm)}"),
+        *_lateness(loop),
         *_record(loop),
         *_watchdog(loop.watchdog),
-        *(linearisation_rows(found) if (found := loop.linearisation) else ()),
-        *_estimation(loop.estimation),
-        *_disturbances(loop.disturbances),
-        *_replay_rows(loop.replay),
+        *(linearisation_rows(loop.linearisation) if loop.linearisation else ()),
+        *_estimation(loop),
+        *_replay(loop.replay),
         *fidelity_rows(loop.fidelity),
     )
 
 
 def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]:
-    yield _forced(loop)
+    yield "deliveries forced by the guarantee", str(loop.forced_deliveries)
     yield lost_row(loop.drops, loop.deliveries)
     if (rate := loop.loss_expected) is not None:
         yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
@@ -166,17 +157,13 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
     for name, sent in flows.items():
         if sent is not None:
             yield name, str(sent.sent)
-            yield _lost_of(name, sent)
+            yield f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
     yield longest_burst(summary.mansd, summary.constraints, loop.longest_loss_burst)
-    violated = [one.cause for one in loop.assumption_violations]
+    violated = [violation.cause for violation in loop.assumption_violations]
     yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
     for constraint in summary.constraints:
         yield f"violations of {constraint}", str(violated.count(constraint))
-
-
-def _lost_of(name: str, sent: FlowPart) -> tuple[str, str]:
-    return f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
 
 
 def lost_row(lost: int, delivered: int) -> tuple[str, str]:
@@ -193,16 +180,6 @@ def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[s
     return f"longest loss burst (cap M − 1 = {cap})", str(longest)
 
 
-def _forced(loop: LoopSummary) -> tuple[str, str]:
-    return "deliveries forced by the guarantee", str(loop.forced_deliveries)
-
-
-def _intervals(loop: LoopSummary) -> Numbers:
-    return interval_rows(
-        loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s
-    )
-
-
 def interval_rows(
     shortest_s: float | None, median_s: float | None, delivered_s: float | None
 ) -> Numbers:
@@ -214,36 +191,17 @@ def interval_rows(
     )
 
 
-def _norms(loop: LoopSummary) -> Iterator[tuple[str, str]]:
-    yield "‖x‖ at the start", number(loop.initial_state_norm)
-    yield "‖x‖ at the end", number(loop.final_state_norm)
-    errors = (loop.sup_e_s_norm, loop.sup_e_c_norm)
-    yield "maximum ‖e_s‖, ‖e_c‖", ", ".join(map(number, errors))
-
-
 def _record(loop: LoopSummary) -> Iterator[tuple[str, str]]:
     yield "numerical check of x_c − x_s (I1)", number(loop.identity_residual_relative)
     if (until_s := loop.judged_until_s) is not None:
         yield "claims checked until", seconds(until_s)
     yield "missing samples", str(loop.missing_samples)
     yield "lost elsewhere (kernel)", str(loop.unintended_losses)
-    yield from _clocks(loop)
+    if loop.conditions is not None and (error_s := loop.conditions.clock_error_s):
+        yield "largest bound of a clock's error", duration(error_s)
     for one in loop.restarts:
         yield f"{one.process} was restarted", away(one)
     yield from changes_in(loop.changes)
-
-
-def _clocks(loop: LoopSummary) -> Iterator[tuple[str, str]]:
-    """Yield the largest bound of a clock's error, if it is recorded."""
-    error_s = None if loop.conditions is None else loop.conditions.clock_error_s
-    if error_s is not None:
-        yield "largest bound of a clock's error", duration(error_s)
-
-
-def _other_clocks(loop: LoopSummary) -> Iterator[tuple[str, str]]:
-    """Yield the same of a run on hosts with different clocks."""
-    if loop.conditions is not None and loop.conditions.clock_error_s:
-        yield from _clocks(loop)
 
 
 def _lateness(loop: LoopSummary) -> Iterator[tuple[str, str]]:
@@ -290,21 +248,16 @@ def _watchdog(found: WatchdogPart) -> Iterator[tuple[str, str]]:
         yield "  policy applied", found.policy
 
 
-def _estimation(found: EstimationPart | None) -> Iterator[tuple[str, str]]:
-    if found is not None:
+def _estimation(loop: LoopSummary) -> Iterator[tuple[str, str]]:
+    if (found := loop.estimation) is not None:
         what = f"estimated ({found.observer})" if found.observer else "measured with noise"
-        errors = (found.max, found.sup_e_c_norm)
-        yield (
-            f"state {what}: RMS ‖x̂ − x‖ in the second half", number(found.rms_second_half)
-        )  # fmt: skip
+        rms = number(found.rms_second_half)
+        yield f"state {what}: RMS ‖x̂ − x‖ in the second half", rms
         yield "  predicted for an exact model", number(found.expected_rms)
-        yield "maximum ‖x̂ − x‖, ‖x_c − x‖", ", ".join(map(number, errors))
-
-
-def _disturbances(found: Sequence[DisturbancePart]) -> Iterator[tuple[str, str]]:
-    for one in found:
-        sizes = f"{number(one.rms)}, {number(one.max)}"
-        yield f"disturbance at the {one.at}: RMS, maximum", sizes
+        yield "maximum ‖x̂ − x‖, ‖x_c − x‖", f"{number(found.max)}, {number(found.sup_e_c_norm)}"
+    for disturbance in loop.disturbances:
+        sizes = f"{number(disturbance.rms)}, {number(disturbance.max)}"
+        yield f"disturbance at the {disturbance.at}: RMS, maximum", sizes
 
 
 def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tuple[str, str]]:
@@ -324,26 +277,21 @@ def fidelity_rows(fidelity: FidelityPart | NoFidelityPart | None) -> Iterator[tu
     yield "  residual, RMS", f"{100 * fidelity.explained_relative:.2g} % of the difference"
 
 
-def claim_headings(claims: Claims) -> tuple[str, ...]:
-    """Return the headings of the table of claims; the interval only if claims have one."""
-    interval = ["interval"] if any(map(interval_text, claims)) else []
-    return "source", "claim", *interval, "share used", "verdict"
-
-
-def claim_rows(claims: Claims) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of the table of claims."""
-    has_interval = "interval" in claim_headings(claims)
-    for claim in claims:
+def _claims_table(claims: Claims, title: str) -> ResultTable:
+    """Return the table of claims; it has their intervals only if some are not the whole run."""
+    intervals = [[interval_text(claim)] for claim in claims]
+    has_interval = any(interval != [""] for interval in intervals)
+    headings = ("source", "claim", *(["interval"] if has_interval else []), "share used", "verdict")
+    rows = []
+    for claim, interval in zip(claims, intervals, strict=True):
         since = "" if claim.since_s is None else f" since {claim.since_s:.3f} s"
-        yield (
-            claim.source, claim.bound,
-            *([interval_text(claim)] if has_interval else []),
-            NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %",
-            claim.verdict + since,
-        )  # fmt: skip
+        share = NONE if claim.ratio is None else f"{100 * claim.ratio:.3g} %"
+        rows.append((claim.source, claim.bound, *(interval if has_interval else ()), share,
+                     claim.verdict + since))  # fmt: skip
+    return ResultTable("claims", title, headings, rows)
 
 
-def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
+def _replay(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     if verdict is None:
         return
     word = "not possible"
@@ -354,18 +302,21 @@ def _replay_rows(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     yield "replay", word if verdict.complete else f"{word} (record incomplete)"
 
 
-def timing_rows(loop: LoopSummary) -> Iterator[tuple[str, ...]]:
-    """Yield the lateness of each process, and the latency; their columns: TIMING_HEADINGS."""
-    for role, late in loop.lateness_us.items():
-        counts = str(late.steps), str(late.late_steps)
-        yield f"{role} lateness", *map(whole, _quantiles(late)), *counts
+def timing_table(loop: LoopSummary) -> ResultTable:
+    """Return the table of the lateness of each process, and of the latency."""
+    rows = [
+        (f"{role} lateness", *_quantiles(late), str(late.steps), str(late.late_steps))
+        for role, late in loop.lateness_us.items()
+    ]
     if latency := loop.latency_us:
-        quantiles = map(whole, _quantiles(latency))
-        yield "sensor-to-controller latency", *quantiles, str(latency.updates), ""
+        name = "sensor-to-controller latency"
+        rows.append((name, *_quantiles(latency), str(latency.updates), ""))
+    caption = "lateness of each process, and latency, in µs of wall time (missed: deadlines missed)"
+    return ResultTable("timing", caption, _TIMING_HEADINGS, rows)
 
 
-def _quantiles(found: Quantiles) -> tuple[float | None, ...]:
-    return found.p50, found.p99, found.p999, found.max
+def _quantiles(found: Quantiles) -> tuple[str, ...]:
+    return tuple(map(whole, (found.p50, found.p99, found.p999, found.max)))
 
 
 # The network and all loops
@@ -436,8 +387,13 @@ def _missed(deadlines: Mapping[str, DeadlinesPart]) -> str:
     return ", ".join(missed) or "none"
 
 
+def loops_table(loops: Sequence[LoopSummary], title: str) -> ResultTable:
+    """Return the table of the loops; :data:`LOOPS_CAPTION` explains its columns."""
+    return ResultTable("loops", title, _LOOP_HEADINGS, [*map(loop_row, loops)])
+
+
 def loop_row(loop: LoopSummary) -> tuple[str, ...]:
-    """Return what the table of the loops says of one, under ``HEADINGS``."""
+    """Return what the table of the loops says of one, in its columns."""
     claims = _verdicts(loop)
     held = f"{claims['held']} of {sum(claims.values())}"
     worse = [f"{claims['violated']} violated"] if claims["violated"] else []

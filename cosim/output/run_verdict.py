@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -30,22 +29,16 @@ from cosim.analysis.summary_model import (
 )
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from cosim.output.run_tables import (
-    CAPTION,
-    HEADINGS,
-    TIMING_HEADINGS,
-    Numbers,
+    LOOPS_CAPTION,
     away,
     badness,
     changes_in,
-    claim_headings,
-    claim_rows,
-    key_numbers,
-    loop_row,
+    loops_table,
     network_rows,
     run_title,
     shares_network,
     short_numbers,
-    timing_rows,
+    summary_tables,
 )
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
 from noack.core.errors import ExitStatus
@@ -81,17 +74,25 @@ class VerdictLine(NamedTuple):
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
     """Return how the run ended, the transmissions of its loops, and their claims."""
     loops = summary.loops
-    events, delivered = (
-        sum(getattr(one, key) for one in loops) for key in ("events", "deliveries")
-    )
+    events, delivered = sum(one.events for one in loops), sum(one.deliveries for one in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
     return (
         ending_line(summary.exit, summary.reached_s, summary.horizon_s),
         transmission_line(events, delivered, ideal),
-        _claims([claim for one in loops for claim in one.claims]),
+        _claims([claim for one in loops for claim in one.claims], _first_violation(summary)),
     )
+
+
+def _first_violation(summary: RunSummary) -> tuple[str, float] | None:
+    """Return the first reason of the void claims of a single loop, and since when it holds."""
+    if shares_network(summary):
+        return None
+    (loop,) = summary.loops
+    why = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
+    found = (one for one in loop.assumption_violations if one.what == why and one.cause in CAUSES)
+    return next(((one.what, one.t_s) for one in found), None)
 
 
 def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
@@ -112,8 +113,8 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(claims: Sequence[Claim]) -> VerdictLine:
-    """Count the claims by verdict, each with its first reason."""
+def _claims(claims: Sequence[Claim], violation: tuple[str, float] | None) -> VerdictLine:
+    """Count the claims by verdict, each with its first reason; of void ones since when."""
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
     counts = Counter(str(claim.verdict) for claim in claims)
@@ -121,7 +122,8 @@ def _claims(claims: Sequence[Claim]) -> VerdictLine:
     for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
         if counts[name]:
             style = colour if style == GOOD else style
-            parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
+            since = f" from {violation[1]:.3f} s on" if violation and name == "void" else ""
+            parts.append(f"{counts[name]} {name}{since}{_reason(claims, name)}")
     return VerdictLine(", ".join(parts), style)
 
 
@@ -148,15 +150,14 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    violations = loop.assumption_violations
+    stated = _first_violation(summary)  # by the verdict
+    violations = [one for one in loop.assumption_violations if (one.what, one.t_s) != stated]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
         severe = one.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
-    if len(violations) > _MOST_VIOLATIONS:
-        yield Remark(
-            f"{len(violations) - _MOST_VIOLATIONS} more violations of this kind", severe=True
-        )
+    if (more := len(violations) - _MOST_VIOLATIONS) > 0:
+        yield Remark(f"{more} more violations of this kind", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))
@@ -243,52 +244,35 @@ def _print_loop(console: Console, summary: RunSummary, *, verbose: bool) -> None
         console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
 
 
-def print_numbers(console: Console, title: str, rows: Numbers) -> None:
+def print_numbers(console: Console, title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print quantities and their values."""
     console.print(terminal_table(ResultTable("numbers", title, KEY_VALUE, rows)))
 
 
 def _print_details(console: Console, summary: RunSummary) -> None:
     """Print everything that the summary of one loop has: numbers, timing, assumptions, claims."""
-    (loop,) = summary.loops
-    print_numbers(console, run_title(summary), key_numbers(summary))
-    if loop.lateness_us:  # none in virtual time
-        caption = "timing in µs of wall time (missed: deadlines missed)"
-        rows = [*timing_rows(loop)]
-        console.print(terminal_table(ResultTable("timing", caption, ("", *TIMING_HEADINGS), rows)))
+    (loop,), tables = summary.loops, {table.name: table for table in summary_tables(summary)}
+    console.print(terminal_table(tables["numbers"]))
+    if "timing" in tables:
+        console.print(terminal_table(tables["timing"]))
         _print_realtime(console, loop.realtime)
     console.print("the paper's assumptions for this scenario:")
     print_assumptions(console, loop.assumptions)
-    _print_claims(console, loop.claims)
+    if "claims" in tables:
+        _print_claims(console, tables["claims"], loop.claims)
 
 
 def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> None:
     """Print the network and the loops; without ``verbose`` the worst only."""
     for line in _void_lines(summary.loops):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    kind = "" if summary.kind == "live" else f", {summary.kind}"
-    further = "".join(f", {constraint}" for constraint in summary.constraints)
-    title = f"network of {summary.scenario}, M − 1 = {summary.mansd}{further}{kind}"
-    print_numbers(console, title, tuple(network_rows(summary)))
-    loops = sorted(summary.loops, key=badness, reverse=True)
-    shown = loops if verbose else loops[:_MOST_LOOPS]
-    if len(shown) == len(loops):
-        shown = summary.loops
-    table = Table(
-        title=f"{len(loops)} loops" + (", the worst first" if len(shown) < len(loops) else ""),
-        caption=CAPTION, box=SIMPLE_HEAD,
-        collapse_padding=True, pad_edge=False,
-    )  # fmt: skip
-    rows = [loop_row(loop) for loop in shown]
-    for i, heading in enumerate(HEADINGS):
-        cells = [heading, *(row[i] for row in rows)]
-        # Headings and claims may break between words; names and numbers have no spaces.
-        least = max(len(word) for cell in cells for word in cell.split())
-        table.add_column(heading, justify="right" if i else "left", min_width=least)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console.print(table)
-    if more := len(loops) - len(shown):
+    print_numbers(console, f"network of {run_title(summary)}", network_rows(summary))
+    loops, title = summary.loops, f"{len(summary.loops)} loops"
+    if not verbose and len(loops) > _MOST_LOOPS:
+        loops = sorted(loops, key=badness, reverse=True)[:_MOST_LOOPS]
+        title += ", the worst first"
+    console.print(terminal_table(loops_table(loops, title), note=LOOPS_CAPTION, dense=True))
+    if more := len(summary.loops) - len(loops):
         console.print(f"and {more} more loops: --verbose shows all")
 
 
@@ -307,13 +291,9 @@ def _void_lines(loops: Sequence[LoopSummary]) -> list[str]:
     return lines
 
 
-def _print_claims(console: Console, claims: Sequence[Claim]) -> None:
+def _print_claims(console: Console, table: ResultTable, claims: Sequence[Claim]) -> None:
     """Print the claims about a loop and their verdicts."""
-    if not claims:
-        return
-    headings, rows = claim_headings(claims), [*claim_rows(claims)]
-    table = ResultTable("claims", "claims checked against this run", headings, rows)
-    left = [i for i, heading in enumerate(headings) if heading != "share used"]
+    left = [i for i, heading in enumerate(table.headings) if heading != "share used"]
     console.print(terminal_table(table, left=left, styles=_CLAIM_STYLES))
     if any(claim.ratio is not None for claim in claims):
         console.print(

@@ -20,7 +20,6 @@ from cosim.output.figure_description import (
     TIME,
     Axis,
     Bars,
-    Bound,
     FigureDescription,
     Item,
     Line,
@@ -157,7 +156,7 @@ def _receptions(t_s: Reals, interval_s: Reals, forced: Flags, dropped_s: Reals) 
 
 
 def error_figure(
-    t_s: Reals, e_s_norm: Reals, threshold: Reals, e_c_norm: Reals, bounds: Sequence[Bound] = ()
+    t_s: Reals, e_s_norm: Reals, threshold: Reals, e_c_norm: Reals, bounds: Sequence[Line] = ()
 ) -> FigureDescription:
     """‖e_s‖ with its threshold, and ‖e_c‖ with its bounds, on a logarithmic axis.
 
@@ -176,7 +175,7 @@ def error_figure(
     return _norms("errors", "Error norms", lines, bounds, 2.7)
 
 
-def state_norm_figure(t_s: Reals, x_norm: Reals, bounds: Sequence[Bound] = ()) -> FigureDescription:
+def state_norm_figure(t_s: Reals, x_norm: Reals, bounds: Sequence[Line] = ()) -> FigureDescription:
     """‖x‖, (k,) at times (k,), with its bounds, on a logarithmic axis."""
     line = Line(x=t_s, y=x_norm, label=r"$\|x\|$ plant", colour=PLANT, width=2.4)
     return _norms("state-norm", "Norm of the state", [line], bounds, 2.1)
@@ -194,7 +193,7 @@ def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
 
 
 def _norms(
-    name: str, title: str, lines: Sequence[Line], bounds: Sequence[Bound], height_in: float,
+    name: str, title: str, lines: Sequence[Line], bounds: Sequence[Line], height_in: float,
 ) -> FigureDescription:  # fmt: skip
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
     measured = np.concatenate([line.y for line in lines])
@@ -227,7 +226,7 @@ def input_figure(
 
 
 def inter_event_figure(
-    broadcast_s: Reals, bounds: Sequence[Bound] = (), until_s: float | None = None
+    broadcast_s: Reals, bounds: Sequence[Line] = (), until_s: float | None = None
 ) -> FigureDescription:
     """Inter-event times t_i − t_{i−1} over time, with a histogram.
 
@@ -237,8 +236,8 @@ def inter_event_figure(
         until_s: end of the time axis; by default the last event.
     """
     y = Axis(label="inter-event time [s]", logarithmic=True)
-    items: list[Item] = [*bounds, _dots(broadcast_s[1:], np.diff(broadcast_s), SENSOR)]
-    return _over_time("inter-event", "Inter-event times", items, y, until_s)
+    dots = _dots(broadcast_s[1:], np.diff(broadcast_s), SENSOR)
+    return _over_time("inter-event", "Inter-event times", dots, y, until_s, bounds)
 
 
 def latency_figure(
@@ -252,8 +251,8 @@ def latency_figure(
         until_s: end of the time axis; by default the last event.
     """
     y = Axis(label="latency [wall µs]", logarithmic=True)
-    items: list[Item] = [_dots(t_s, latency_us, CONTROLLER)]
-    return _over_time("latency", "Sensor-to-controller latency", items, y, until_s)
+    dots = _dots(t_s, latency_us, CONTROLLER)
+    return _over_time("latency", "Sensor-to-controller latency", dots, y, until_s)
 
 
 def _dots(t_s: Reals, values: Reals, colour: Colour) -> Marks:
@@ -261,17 +260,21 @@ def _dots(t_s: Reals, values: Reals, colour: Colour) -> Marks:
 
 
 def _over_time(
-    name: str, title: str, items: Sequence[Item], y: Axis, until_s: float | None,
+    name: str, title: str, dots: Marks, y: Axis, until_s: float | None,
+    bounds: Sequence[Line] = (),
 ) -> FigureDescription:  # fmt: skip
     """Describe values over time, and their histogram on the same logarithmic axis."""
-    dots = items[-1]
-    assert isinstance(dots, Marks)
     edges, counts = histogram(dots.y)
     bars = Bars(edges=edges, heights=counts, colour=dots.colour, share=0.9, horizontal=True)
     ends = (None, None) if until_s is None else (0.0, float(dots.x.max(initial=until_s)))
+    least = [
+        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash)
+        for line in bounds if len(line.y)
+    ]  # fmt: skip
+    counted = Axis(label="count", whole=True)
     panel = Panel(
-        title=title, items=items, x=Axis(label=TIME, ends=ends), y=y,
-        beside=Panel(items=[bars], x=Axis(label="count", whole=True), y=Axis(logarithmic=True)),
+        title=title, items=[*bounds, dots], x=Axis(label=TIME, ends=ends), y=y,
+        beside=Panel(items=[bars, *least], x=counted, y=Axis(logarithmic=True)),
     )  # fmt: skip
     return one_panel(name, panel, 2.1)
 

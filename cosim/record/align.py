@@ -12,7 +12,8 @@ At each measurement time t:
 If a controller dies, there is no x_c until the restarted controller has its first update.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -224,6 +225,16 @@ class AlignedPart(NamedTuple):
 
 def aligned_parts(record: RunRecord) -> Iterator[AlignedPart]:
     """Align a run part by part; a run without measurements has one empty part."""
+    yield from _short_run(record) if record.is_short else _aligned(record)
+
+
+@lru_cache(maxsize=1)
+def _short_run(record: RunRecord) -> Sequence[AlignedPart]:
+    """Return the parts of a run that is read several times in turn."""
+    return tuple(_aligned(record))
+
+
+def _aligned(record: RunRecord) -> Iterator[AlignedPart]:
     scenario, loop, flow = record.scenario, record.loop, model_flow_of(record)
     acknowledged = scenario.protocol.acknowledges
     track = initial_track(scenario)

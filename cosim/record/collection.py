@@ -198,7 +198,7 @@ def _checked_chunks(
     for chunk in _chunks(path, name):
         if table == KEPT_REPORT:
             try:
-                report = parse_message(ProcessReport, chunk.rows)
+                report = parse_message(ProcessReport, chunk.rows).fields()
             except PeerError as error:
                 raise PeerError(f"{name}: {error}") from None
             found = (report.get("process"), report.get("generation", 0), report.get("instance"))

@@ -7,7 +7,7 @@ restarts; :func:`lives_of` finds out which of its rows are recorded, and when it
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.record.record_source import RecordSource, Rows, Slice
 from cosim.record.run_directory import REPORTS_FILE, read_object
+from noack.config.resolution import is_of_network
 from noack.core.errors import PeerError
 from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import GENERATION
@@ -33,7 +34,7 @@ def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, 
     Raises:
         PeerError: the text is no report, or has no entry for a table of the process.
     """
-    report = parse_message(ProcessReport, text)
+    report = parse_message(ProcessReport, text).fields()
     if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
         raise PeerError("the report lacks the number of rows of a table")
     return report
@@ -66,7 +67,7 @@ def add_kept_reports(run_dir: Path) -> None:
     kept = []
     for _, text in read_chunks(run_dir / SPOOL, KEPT_REPORT):
         with contextlib.suppress(PeerError):  # damaged
-            report = parse_message(ProcessReport, text)
+            report = parse_message(ProcessReport, text).fields()
             if report.get("process") in LOOP_ROLES and report.get("instance") not in instances:
                 kept.append({"generation": 0} | report)
     if kept:
@@ -87,19 +88,29 @@ def report_entries(run_dir: Path) -> Entries:
         return []
 
 
-def entries_of_loop(entries: Entries, number: int) -> Entries:
-    """Return the reports as of one loop: with its own rows, and its own counters of datagrams."""
+def entries_of_loop(
+    entries: Entries, number: int, others: Callable[[int, str, int], int]
+) -> Entries:
+    """Return the reports as of one loop: with its own rows, and its own counters of datagrams.
+
+    ``others(number, table, generation)`` returns how many rows of a table of the network are of
+    other loops. Rows of the network that are missing in the record are missing in every loop.
+    """
     found = []
     for role, report in entries:
         with contextlib.suppress(LookupError, TypeError, ValueError, AttributeError):  # damaged
-            found.append((role, _of_loop(report, number)))
+            found.append((role, _of_loop(report, number, others)))
     return found
 
 
-def _of_loop(report: dict[str, Any], number: int) -> dict[str, Any]:
+def _of_loop(
+    report: dict[str, Any], number: int, others: Callable[[int, str, int], int]
+) -> dict[str, Any]:
     written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
+    for table in filter(is_of_network, written):
+        written[table] -= others(number, table, report.get("generation", 0))
     channel = dict(report["channel"])
     of_loops = channel.pop("loops", [])
     rejected = Counter[str](channel.get("rejected"))
@@ -137,17 +148,20 @@ def joint_reports(
 
 
 def valid_reports(
-    entries: Entries, source: RecordSource
+    entries: Entries, source: RecordSource, tables: Iterable[str]
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
-    """Return the reports of the last process of each role, and those of earlier processes."""
+    """Return the reports of the last process of each role, and those of earlier processes.
+
+    They have the numbers of rows of all ``tables`` that the process fills.
+    """
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []
     for role, entry in entries:
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
-            report = report_of(role, json.dumps(entry), source.types)
-            owned = [table for table in source.types if OWNER[table] == role]
+            report = report_of(role, json.dumps(entry), tables)
+            owned = [table for table in tables if OWNER[table] == role]
             if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
                 earlier.append(report | {"process": role})
             else:
@@ -158,56 +172,31 @@ def valid_reports(
 LIFE_COLUMNS = ("input", "now_ns")
 
 
-class RowCounts(NamedTuple):
-    """The recorded rows of one generation of a process."""
+class Life(NamedTuple):
+    """One generation of a process."""
 
     generation: int
     rows: Mapping[str, int]
     """Number of recorded rows by table."""
     report: Mapping[str, Any] | None
-
-
-class Life(NamedTuple):
-    """One generation of a process."""
-
-    counts: RowCounts
-    first_ns: int | None
+    """The final report; None if it wrote none."""
+    first_ns: int | None = None
     """Time of the first row; None without rows."""
-    last_ns: int | None
-    hole_ns: int | None
+    last_ns: int | None = None
+    hole_ns: int | None = None
     """Time of the last input before a gap in the rows; None if there is no known gap. Rows that are
     missing at the end of a process without a report are unknown."""
-    missing_inputs: int
+    missing_inputs: int = 0
     """Number of inputs without a row, before the last recorded input."""
 
-    @property
-    def generation(self) -> int:
-        """Its number."""
-        return self.counts.generation
 
-    @property
-    def rows(self) -> Mapping[str, int]:
-        """Number of recorded rows by table."""
-        return self.counts.rows
+def places_of_lives(rows: Rows, begun: Sequence[int]) -> NDArray[np.intp]:
+    """Return the place of each row's generation among those that began, ascending, (k,).
 
-    @property
-    def report(self) -> Mapping[str, Any] | None:
-        """The final report; None if it wrote none."""
-        return self.counts.report
-
-
-class LifeNumbers(NamedTuple):
-    """The numbers of the recorded generations of a process, ascending."""
-
-    begun: Sequence[int]
-
-    def places(self, rows: Rows) -> NDArray[np.intp]:
-        """Return the place of each row's generation, (k,).
-
-        A row with an unexpected number belongs to the generation before.
-        """
-        of = rows["input"] // GENERATION
-        return (np.searchsorted(np.array(self.begun), of, side="right") - 1).clip(min=0)
+    A row with an unexpected number belongs to the generation before.
+    """
+    numbers = rows["input"] // GENERATION
+    return (np.searchsorted(np.array(begun), numbers, side="right") - 1).clip(min=0)
 
 
 def generations(source: RecordSource, tables: Sequence[str]) -> list[int]:
@@ -273,25 +262,31 @@ class _Counts:
 def lives_of(
     parts: Iterable[Slice],
     tables: Sequence[str],
-    numbers: LifeNumbers,
+    begun: Sequence[int],
     reports: Mapping[int, Mapping[str, Any]],
 ) -> list[Life]:
     """Return the generations of one process from the parts of its tables, with ``LIFE_COLUMNS``.
 
-    ``reports`` are by generation.
+    ``begun`` has their numbers, ascending; ``reports`` are by generation.
     """
-    counts = [_Counts(generation, tables) for generation in numbers.begun]
+    counts = [_Counts(generation, tables) for generation in begun]
     for part in parts:
-        if len(counts) == 1:
-            counts[0].add(part)
-            continue
-        places = {table: numbers.places(rows) for table, rows in part.items()}
-        for i, count in enumerate(counts):
-            count.add({table: rows.compress(places[table] == i) for table, rows in part.items()})
+        for count, own in zip(counts, split_by_life(part, begun), strict=True):
+            count.add(own)
     return [
         Life(
-            RowCounts(generation, one.rows, reports.get(generation)),
+            generation, one.rows, reports.get(generation),
             one.first_ns, one.last_ns, one.hole_ns, one.missing_inputs,
         )
-        for generation, one in zip(numbers.begun, counts, strict=True)
+        for generation, one in zip(begun, counts, strict=True)
     ]  # fmt: skip
+
+
+def split_by_life(part: Slice, begun: Sequence[int]) -> Iterator[Slice]:
+    """Yield the rows of each generation of a process, from rows of its tables."""
+    if len(begun) == 1:
+        yield part
+        return
+    places = {table: places_of_lives(rows, begun) for table, rows in part.items()}
+    for i in range(len(begun)):
+        yield {table: rows.compress(places[table] == i) for table, rows in part.items()}

@@ -8,7 +8,7 @@ phase; its flows are numbered as if the loop were alone; and its inputs are numb
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ Slice = Mapping[str, Rows]
 """Consecutive rows of several tables, up to the same time."""
 
 BATCH_ROWS = 16_384
-"""Largest number of rows of a table that are read at a time."""
+"""A table with at most so many rows is read as a whole; of a longer one, so many at a time."""
 
 
 def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
@@ -47,14 +47,17 @@ def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
 
 
 class RecordSource(ABC):
-    """The tables of a record, with their row types."""
+    """The tables of a record, with their row types; a table that is read as a whole is kept."""
 
     def __init__(self, types: Mapping[str, np.dtype[np.void]]) -> None:
         self.types = types
+        self._whole: dict[str, Rows] = {}
 
-    @abstractmethod
     def whole(self, table: str) -> Rows:
         """Return all rows of a table."""
+        if table not in self._whole:
+            self._whole[table] = joined([*self._read(table, ())], self.types[table])
+        return self._whole[table]
 
     @abstractmethod
     def count(self, table: str) -> int:
@@ -65,33 +68,35 @@ class RecordSource(ABC):
         highest = (rows["input"].max(initial=-1) for rows in self.batches(table, ("input",)))
         return int(max(highest, default=-1))
 
-    @abstractmethod
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
         """Yield the rows of a table in order, with all columns or only some."""
+        if table not in self._whole and self.count(table) > BATCH_ROWS:
+            yield from self._read(table, columns)
+            return
+        rows = self.whole(table)
+        if columns:
+            rows = rows[[name for name in rows.dtype.names or () if name in columns]]
+        for first in range(0, len(rows), BATCH_ROWS):
+            yield rows[first : first + BATCH_ROWS]
+
+    @abstractmethod
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        """Yield the rows of a table in order; it may have other columns, too, if some are given."""
 
 
 class RowsInMemory(RecordSource):
     """Tables that are in memory."""
 
     def __init__(self, rows: Mapping[str, Rows]) -> None:
-        super().__init__({table: found.dtype for table, found in rows.items()})
-        self._rows = rows
-
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        return self._rows[table]
+        super().__init__({table: own.dtype for table, own in rows.items()})
+        self._whole = dict(rows)
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        return len(self._rows[table])
+        return len(self._whole[table])
 
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order."""
-        rows = self._rows[table]
-        if columns:
-            rows = rows[[name for name in rows.dtype.names or () if name in columns]]
-        for first in range(0, len(rows), BATCH_ROWS):
-            yield rows[first : first + BATCH_ROWS]
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        yield self._whole[table]
 
 
 class DerivedRows(RecordSource):
@@ -102,16 +107,11 @@ class DerivedRows(RecordSource):
         self._source = source
         self._derive = derive
 
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        return self._derive(table, self._source.whole(table))
-
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        return sum(map(len, self.batches(table)))
+        return sum(map(len, self._read(table, ())))
 
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order."""
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         for rows in self._source.batches(table):
             yield self._derive(table, rows)
 
@@ -229,9 +229,8 @@ def rows_by_loop(
     if table in CLOCK_TABLES:
         yield from enumerate(_shifted(rows, phase_ns) for phase_ns in phases_ns)
         return
-    shared, numbers = is_of_network(table), np.zeros(len(rows), np.int64)
-    has_flow = shared and "flow" in (rows.dtype.names or ())
-    if has_flow:
+    numbers = np.zeros(len(rows), np.int64)
+    if "flow" in (rows.dtype.names or ()):
         numbers = rows["flow"] % len(phases_ns)
     elif has_loop(table):
         numbers = rows[LOOP].astype(np.int64)
@@ -241,10 +240,8 @@ def rows_by_loop(
         if number >= len(phases_ns):  # damaged
             continue
         chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
-        if shared:
-            _shift(chosen, phases_ns[number])
-            if has_flow:
-                chosen["flow"] //= len(phases_ns)
+        if is_of_network(table):
+            chosen = _of_loop(chosen, number, phases_ns)
         yield number, without_loop(chosen, types[number][table])
 
 
@@ -252,71 +249,85 @@ class NetworkRows:
     """The rows of each loop in the tables of the network.
 
     Args:
-        rows: all rows of the tables of the network.
+        source: the rows of all loops.
         phases_ns: when each loop begins.
     """
 
-    def __init__(self, rows: Mapping[str, Rows], phases_ns: Sequence[int]) -> None:
-        self._rows = {table: rows[table] for table in network_tables()}
-        self._phases_ns = phases_ns
-        loops = {
-            table: found["flow"] % len(phases_ns)
-            for table, found in self._rows.items()
-            if table != NETEM_SETTING  # a change of settings concerns every loop
-        }
-        self._inputs = np.sort(np.concatenate([found["input"] for found in self._rows.values()]))
-        self._ends = {
-            table: np.append(0, np.cumsum(np.bincount(loop[loop >= 0], minlength=len(phases_ns))))
-            for table, loop in loops.items()
-        }
-        self._orders = {table: np.argsort(loop, kind="stable") for table, loop in loops.items()}
+    def __init__(self, source: RecordSource, phases_ns: Sequence[int]) -> None:
+        self._source, self._phases_ns = source, phases_ns
+        self._inputs: dict[str, NDArray[np.int64]] = {}
+        self._places: dict[str, list[NDArray[np.int32]]] = {}
+        """The places of the rows of each loop in a table."""
+        for table in network_tables():
+            batches = [*source.batches(table, ("input", "flow"))]
+            inputs = [rows["input"] for rows in batches]
+            self._inputs[table] = np.concatenate([np.zeros(0, np.int64), *inputs])
+            if table == NETEM_SETTING:  # a change of settings concerns every loop
+                everywhere = np.arange(len(self._inputs[table]), dtype=np.int32)
+                self._places[table] = [everywhere] * len(phases_ns)
+                continue
+            flows = [rows["flow"] for rows in batches]
+            loops = np.concatenate([np.zeros(0, np.int64), *flows]) % len(phases_ns)
+            ends = np.cumsum(np.bincount(loops, minlength=len(phases_ns)))
+            order = np.argsort(loops, kind="stable").astype(np.int32)
+            self._places[table] = np.split(order, ends[:-1])
+        self._in_order = np.sort(np.concatenate([*self._inputs.values()]))
         self._counts: dict[tuple[str, int], int] = {}
 
     def counts(self) -> dict[str, NDArray[np.int64]]:
         """Return the number of rows of each loop by table, shape (loops,)."""
-        loops = len(self._phases_ns)
-        return {
-            table: np.diff(self._ends[table]) if table in self._ends else np.full(loops, len(rows))
-            for table, rows in self._rows.items()
-        }
+        return {table: np.array(list(map(len, places))) for table, places in self._places.items()}
 
-    def of_loop(self, number: int) -> dict[str, Rows]:
-        """Return the rows of a loop."""
-        own = {}
-        for table, found in self._rows.items():
-            chosen: Any = slice(None)
-            if table in self._orders:
-                first, last = self._ends[table][number : number + 2]
-                chosen = self._orders[table][first:last]
-            own[table] = found.take(chosen) if table in self._orders else found.copy()
-        _renumber(own, self._inputs)
-        for table, found in own.items():
-            _shift(found, self._phases_ns[number])
-            if table in self._orders:
-                found["flow"] //= len(self._phases_ns)
-        return own
+    def count(self, table: str, number: int) -> int:
+        """Return the number of rows of a loop in a table."""
+        return len(self._places[table][number])
 
-    def count(self, table: str, generation: int) -> int:
-        """Return the number of rows of a table and a generation of the emulator, of all loops."""
-        key = table, generation
+    def of_loop(self, table: str, number: int) -> Iterator[Rows]:
+        """Yield the rows of a loop in order."""
+        places, first = self._places[table][number], 0
+        own = (self._inputs[one][self._places[one][number]] for one in self._inputs)
+        mine = np.sort(np.concatenate([*own]))
+        for rows in self._source.batches(table):
+            begin, end = np.searchsorted(places, (first, first + len(rows)))
+            chosen = rows.take(places[begin:end] - first)
+            chosen["input"] -= self._numbered_before(chosen["input"], mine)
+            yield _of_loop(chosen, number, self._phases_ns)
+            first += len(rows)
+
+    def _numbered_before(
+        self, numbers: NDArray[np.int64], mine: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Return how many inputs of other loops precede those of a loop, in their generation.
+
+        ``mine`` has all numbers of the loop, ascending. Rows that are missing count as the loop's.
+        """
+        begin = numbers // GENERATION * GENERATION
+        of_all, own = (
+            np.searchsorted(counted, numbers) - np.searchsorted(counted, begin)
+            for counted in (self._in_order, mine)
+        )
+        return np.asarray(of_all - own)
+
+    def count_of_others(self, number: int, table: str, generation: int) -> int:
+        """Return how many rows of a generation of the emulator are of other loops than a loop."""
+        inputs, key = self._inputs[table], (table, generation)
         if key not in self._counts:
-            self._counts[key] = count_of(self._rows[table], generation)
-        return self._counts[key]
+            self._counts[key] = _count_of(inputs, generation)
+        return self._counts[key] - _count_of(inputs[self._places[table][number]], generation)
 
 
-def count_of(rows: Rows, generation: int) -> int:
-    """Return the number of rows of a generation of their process."""
-    return int((rows["input"] // GENERATION == generation).sum())
+def _count_of(inputs: NDArray[np.int64], generation: int) -> int:
+    return int((inputs // GENERATION == generation).sum())
 
 
 class LoopTables(RecordSource):
-    """The tables of a loop in the record of a run; a table that is read as a whole is kept.
+    """The tables of a loop in the record of a run.
 
     Args:
         number: the number of the loop.
         types: the types of its rows.
         stored: the tables of the run.
-        network: the loop's rows of the network.
+        network: the rows of the network.
         phase_ns: when the loop begins.
     """
 
@@ -325,65 +336,40 @@ class LoopTables(RecordSource):
         number: int,
         types: Mapping[str, np.dtype[np.void]],
         stored: "StoredTables",
-        network: RecordSource,
+        network: NetworkRows,
         phase_ns: int = 0,
     ) -> None:
         super().__init__(types)
         self._number, self._stored, self._network = number, stored, network
         self._phase_ns = phase_ns
-        self._whole: dict[str, Rows] = {}
         self._counts: dict[str, int] = {}
-
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        if is_of_network(table):
-            return self._network.whole(table)
-        if table not in self._whole:
-            self._whole[table] = joined([*self._read(table, ())], self.types[table])
-        return self._whole[table]
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        if is_of_network(table):
-            return self._network.count(table)
         if table not in self._counts:
-            self._counts[table] = self._stored.count_of_loop(table, self._number)
+            source = self._network.count if is_of_network(table) else self._stored.count_of_loop
+            self._counts[table] = source(table, self._number)
         return self._counts[table]
 
     def highest_input(self, table: str) -> int:
         """Return the highest number of an input of any loop in a table; −1 without rows."""
-        source = self._network if is_of_network(table) else self._stored
-        return source.highest_input(table)
-
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order; a short one is kept."""
-        if is_of_network(table):
-            yield from self._network.batches(table, columns)
-        elif table in self._whole or self.count(table) <= BATCH_ROWS:
-            self.whole(table)
-            yield from RowsInMemory(self._whole).batches(table, columns)
-        else:
-            yield from self._read(table, columns)
+        return self._stored.highest_input(table)
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
-        of_loop = self._stored.of_loop
-        for rows in of_loop(table, self._number, with_columns(self.types[table], columns)):
+        if is_of_network(table):
+            yield from self._network.of_loop(table, self._number)
+            return
+        dtype = with_columns(self.types[table], columns)
+        for rows in self._stored.of_loop(table, self._number, dtype):
             yield _shifted(rows, self._phase_ns) if table in CLOCK_TABLES else rows
 
 
-def _renumber(own: Mapping[str, Rows], inputs: NDArray[np.int64]) -> None:
-    """Number a loop's inputs in turn, within each generation of the emulator.
-
-    ``inputs`` has the numbers of all loops, ascending. The rows of other loops are left out of the
-    count; rows that are missing are not.
-    """
-    mine = np.sort(np.concatenate([found["input"] for found in own.values()]))
-    for found in own.values():
-        numbers = found["input"].copy()
-        begin = numbers // GENERATION * GENERATION
-        for counted, sign in ((inputs, -1), (mine, 1)):
-            before = np.searchsorted(counted, numbers) - np.searchsorted(counted, begin)
-            found["input"] += sign * before
+def _of_loop(rows: Rows, number: int, phases_ns: Sequence[int]) -> Rows:
+    """Change rows of the network, all of one loop, into those of this loop."""
+    _shift(rows, phases_ns[number])
+    if "flow" in (rows.dtype.names or ()):
+        rows["flow"] //= len(phases_ns)
+    return rows
 
 
 def _shifted(rows: Rows, phase_ns: int) -> Rows:

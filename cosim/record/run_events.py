@@ -17,6 +17,7 @@ does not meet the criterion.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -185,6 +186,7 @@ class PacketOutcome(NamedTuple):
         return np.asarray(lost[width:] - lost[: len(lost) - width])
 
 
+@lru_cache(maxsize=4)
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
     released = _released(record, flow)

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from cosim.record.processes import (
     LIFE_COLUMNS,
     Life,
-    LifeNumbers,
-    RowCounts,
     entries_of_loop,
     generations,
     joint_reports,
@@ -32,7 +30,6 @@ from cosim.record.record_source import (
     RecordSource,
     RowsInMemory,
     Slice,
-    count_of,
     joined,
     packed,
     slices,
@@ -47,6 +44,7 @@ from noack.config.resolution import (
     loop_of,
     network_tables,
     resolve,
+    resolved_loops,
     run_tables,
     tables_of,
 )
@@ -55,10 +53,10 @@ from noack.config.scenario import (
     loop_names,
     loop_scenario,
     loop_sections,
-    loops_of,
     phases_ns,
 )
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
 from noack.protocol.machine_interface import RESTART
@@ -86,6 +84,14 @@ _COLUMNS = 6_000
 """Columns of a whole run: short runs are not reduced, and figures have far fewer columns."""
 
 
+NETWORK_ROLES = ("netem",)
+
+
+def loop_roles(loops: int) -> Sequence[str]:
+    """Return the processes whose inputs are in the record of a loop, in a run of some loops."""
+    return LOOP_ROLES if loops == 1 else [role for role in LOOP_ROLES if role not in NETWORK_ROLES]
+
+
 class _Notice(LogLine):
     process: str
 
@@ -100,8 +106,9 @@ class RunRecord:
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
         earlier: the final reports of processes that were restarted later.
-        number: the number of the loop among those that share its network; None if it is alone.
-        is_network: whether it is the record of the network, for all loops.
+        number: the number of the loop; 0 for the network.
+        roles: the processes whose inputs are all in the record: those of a loop, with the emulator
+            if it serves no other loop; the emulator alone for the network.
     """
 
     def __init__(
@@ -112,18 +119,16 @@ class RunRecord:
         reports: Mapping[str, dict[str, Any]],
         kind: Kind = "live",
         earlier: Sequence[dict[str, Any]] = (),
-        number: int | None = None,
-        *,
-        is_network: bool = False,
+        number: int = 0,
+        roles: Sequence[str] = LOOP_ROLES,
     ) -> None:
-        self.scenario, self.is_network = scenario, is_network
-        self.number = number
+        self.scenario, self.number, self.roles = scenario, number, roles
         self.notices = notices
         self.reports = reports
         self.earlier = earlier
         self.kind: Kind = kind
         self.source = rows if isinstance(rows, RecordSource) else RowsInMemory(rows)
-        self.tables = network_tables() if is_network else tables_of(scenario)
+        self.tables = network_tables() if self.is_network else tables_of(scenario)
         self._lives: dict[str, list[Life]] = {}
 
     @cached_property
@@ -139,12 +144,18 @@ class RunRecord:
         """Return the number of rows of a table."""
         return self.source.count(table)
 
+    @cached_property
+    def is_short(self) -> bool:
+        """Whether the whole record is one part, which is kept in memory."""
+        return not any(self.count(table) > BATCH_ROWS for table in self.tables)
+
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
 
         They have all columns, or only some besides ``now_ns``.
 
-        A part holds at most ``BATCH_ROWS`` steps of the plant; a short run is one part.
+        A short run is one part. A part of a longer one has half of ``BATCH_ROWS`` steps: what is
+        computed from it is several times as large.
         """
         names, columns = tables or [*self.tables], (*columns, "now_ns") if columns else ()
         if any(self.count(table) > BATCH_ROWS for table in names):
@@ -168,6 +179,7 @@ class RunRecord:
         dtype = with_columns(self.tables[table], names)
         return joined([packed(rows, dtype) for rows in chosen], dtype)
 
+    @cached_method
     def events(self) -> Rows:
         """Return number, nominal and actual time of each event: ``event``, ``t_ns``, ``now_ns``."""
         return self.columns(
@@ -190,7 +202,7 @@ class RunRecord:
         rows = DerivedRows(self.source, derive)
         derived = RunRecord(
             scenario, rows, self.notices, self.reports, self.kind, self.earlier, self.number,
-            is_network=self.is_network,
+            self.roles,
         )  # fmt: skip
         derived.tables = self.tables  # they are those of the run that was recorded
         return derived
@@ -200,15 +212,23 @@ class RunRecord:
         if role not in self._lives:
             tables, reports = self.owned_by(role), self._reports_of(role)
             parts = self.slices(*tables, columns=LIFE_COLUMNS) if tables else ()
-            self._lives[role] = lives_of(parts, tables, self.life_numbers(role), reports)
+            self._lives[role] = lives_of(parts, tables, self.begun_lives(role), reports)
         return self._lives[role]
 
-    def row_counts(self, role: str) -> list[RowCounts]:
-        """The numbers of rows of each generation of a process, in order."""
-        if role in self._lives or len(self.life_numbers(role).begun) > 1:
-            return [one.counts for one in self.lives(role)]
+    @cached_method
+    def row_counts(self, role: str) -> list[Life]:
+        """The generations of a process in order, of which only rows and reports may be known."""
+        if role in self._lives or len(self.begun_lives(role)) > 1:
+            return self.lives(role)
         counts = {table: self.count(table) for table in self.owned_by(role)}
-        return [RowCounts(0, counts, self._reports_of(role).get(0))]
+        return [Life(0, counts, self._reports_of(role).get(0))]
+
+    def is_complete(self, role: str) -> bool:
+        """Whether the record has all rows that a process reported, of all its generations."""
+        return all(
+            one.report is not None and one.report["rows"].items() >= one.rows.items()
+            for one in self.row_counts(role)
+        )
 
     def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
         """The final reports of a process, by generation."""
@@ -216,10 +236,11 @@ class RunRecord:
         earlier = [report for report in self.earlier if report["process"] == role]
         return {report.get("generation", 0): report for report in (*newest, *earlier)}
 
-    def life_numbers(self, role: str) -> LifeNumbers:
-        """The numbers of the generations of a process."""
+    @cached_method
+    def begun_lives(self, role: str) -> list[int]:
+        """The numbers of the recorded generations of a process, ascending."""
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
-        return LifeNumbers(generations(self.source, self.owned_by(role)) if again else [0])
+        return generations(self.source, self.owned_by(role)) if again else [0]
 
     def owned_by(self, role: str) -> list[str]:
         """Return the tables with the inputs of a process's machine."""
@@ -228,18 +249,24 @@ class RunRecord:
 
     def restarted(self) -> str | None:
         """A role whose process was restarted; None if there is none."""
-        return next((role for role in LOOP_ROLES if len(self.life_numbers(role).begun) > 1), None)
+        return next((role for role in LOOP_ROLES if len(self.begun_lives(role)) > 1), None)
+
+    @property
+    def is_network(self) -> bool:
+        """Whether it is the record of the network, for all loops."""
+        return self.roles == NETWORK_ROLES
 
     @property
     def slice_columns(self) -> int:
         """Columns to which a figure may reduce a slice, so that the whole run has many enough."""
-        return max(_COLUMNS * BATCH_ROWS // max(self.count(PLANT_STEP), BATCH_ROWS), 1)
+        steps = self.count(PLANT_STEP)
+        return _COLUMNS if steps <= BATCH_ROWS else max(_COLUMNS * BATCH_ROWS // 2 // steps, 1)
 
     @property
     def _slice_ns(self) -> int:
         timing = self.scenario.timing
         period_ns: int = min(timing.plant_period_ns, timing.controller_period_ns)
-        return BATCH_ROWS * period_ns
+        return BATCH_ROWS // 2 * period_ns
 
 
 class RecordedRun:
@@ -258,6 +285,11 @@ class RecordedRun:
     def phases_ns(self) -> Sequence[int]:
         """When each loop begins, in the time of the run."""
         return phases_ns(self.scenario)
+
+    @cached_property
+    def scenarios(self) -> Sequence[Scenario]:
+        """The resolved scenario of each loop."""
+        return resolved_loops(self.scenario)
 
     @cached_property
     def names(self) -> list[str]:
@@ -296,8 +328,8 @@ class _StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 
     def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
-        self._network, self._stored = network, stored
-        self._loops, self._phases_ns = loops_of(network.scenario), phases_ns(network.scenario)
+        self._kind, self._stored = network.kind, stored
+        self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
         """The loop that was used last."""
@@ -313,47 +345,28 @@ class _StoredLoops(Sequence[RunRecord]):
         if isinstance(number, slice):
             return [self[one] for one in range(len(self))[number]]
         number = range(len(self))[number]
-        if self._newest is None or (self._newest.number or 0) != number:
+        if self._newest is None or self._newest.number != number:
             self._newest = self._record_of(number)
         return self._newest
 
     def _record_of(self, number: int) -> RunRecord:
-        loop = resolve(self._loops[number])
-        is_alone, rows = len(self) == 1, self._network.source
-        entries = entries_of_loop(self._entries, number)
-        if not is_alone:
-            own = self._shared.of_loop(number)
-            entries = [(role, self._of_network(one, own)) for role, one in entries]
-            rows = RowsInMemory(own)
-        phase_ns = self._phases_ns[number]
-        source = LoopTables(number, tables_of(loop), self._stored, rows, phase_ns)
-        reports, earlier = valid_reports(entries, source)
+        loop = self._loops[number]
+        entries = entries_of_loop(self._entries, number, self._shared.count_of_others)
+        source = LoopTables(
+            number, tables_of(loop), self._stored, self._shared, self._phases_ns[number]
+        )
+        reports, earlier = valid_reports(entries, source, source.types)
         notices = [
             {key: value for key, value in notice.items() if key != LOOP}
             for notice in self._notices
             if notice.get(LOOP, number) == number
         ]
-        number_of_loop = None if is_alone else number
-        kind = self._network.kind
-        return RunRecord(loop, source, notices, reports, kind, earlier, number_of_loop)
+        roles = loop_roles(len(self))
+        return RunRecord(loop, source, notices, reports, self._kind, earlier, number, roles)
 
     @cached_property
     def _shared(self) -> NetworkRows:
-        tables = {table: self._network[table] for table in self._network.tables}
-        return NetworkRows(tables, self._phases_ns)
-
-    def _of_network(self, report: Any, own: Mapping[str, Rows]) -> Any:
-        """Return a report about the rows of the network as one about those of a loop.
-
-        Rows of the network that are missing in the record are missing in every loop.
-        """
-        if not isinstance(report, dict) or not isinstance(report.get("rows"), dict):
-            return report  # damaged
-        generation, written = report.get("generation", 0), dict(report["rows"])
-        for table in written.keys() & own.keys():
-            others = self._shared.count(table, generation) - count_of(own[table], generation)
-            written[table] = written[table] - others if type(written[table]) is int else None
-        return report | {"rows": written}
+        return NetworkRows(self._stored, self._phases_ns)
 
 
 def load_run(run_dir: Path) -> RecordedRun:
@@ -375,14 +388,11 @@ def load_run(run_dir: Path) -> RecordedRun:
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
-    of_network = network_tables()
-    types = {table: one for table, one in run_tables(scenario).items() if table not in of_network}
-    stored, shared = (StoredTables(folder, one, most_rows) for one in (types, of_network))
-    reports, earlier = valid_reports(report_entries(run_dir), shared)
+    stored = StoredTables(folder, run_tables(scenario), most_rows)
+    reports, earlier = valid_reports(report_entries(run_dir), stored, network_tables())
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
-    network = RunRecord(
-        scenario, shared, notices, reports, kind_of(run_dir), earlier, is_network=True
-    )
+    kind = kind_of(run_dir)
+    network = RunRecord(scenario, stored, notices, reports, kind, earlier, roles=NETWORK_ROLES)
     return RecordedRun(network, _StoredLoops(run_dir, network, stored))
 
 
@@ -478,6 +488,6 @@ def read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
-        return [parse_message(_Notice, line) for line in lines]
+        return [parse_message(_Notice, line).fields() for line in lines]
     except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None

@@ -169,10 +169,10 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     Of many loops, as many are sorted at once as fit into memory; one loop is never in memory as a
     whole.
     """
-    from cosim.record.table_files import group_segments  # imports pyarrow
+    from cosim.record.table_files import TableFile  # imports pyarrow
 
     path = run_dir / RECORD / f"{table}.parquet"
-    segments = [*group_segments(path, dtype)] if path.is_file() else []
+    segments = [*TableFile(path, dtype).segments()] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
     if not has_loop(table):
         yield from merged(segments, dtype)
@@ -217,7 +217,7 @@ def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:
     for role in (*LOOP_ROLES, RECORDER):
         for line in stored_lines(spool, role):
             try:
-                notice = parse_message(LogLine, line) | {"process": role}
+                notice = parse_message(LogLine, line).fields() | {"process": role}
             except PeerError:  # damaged
                 continue
             if notice.get(LOOP, 0) not in range(loops):  # damaged

@@ -20,19 +20,22 @@ from cosim.record.record_source import (
     BATCH_ROWS,
     RecordSource,
     Rows,
-    RowsInMemory,
     joined,
     with_columns,
     without_loop,
 )
 from cosim.record.spool_conversion import Segment
+from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import new_file
 from noack.protocol.record_tables import LOOP, OWNER, entry_names
 from noack.protocol.wire_format import MAX_LOOPS
 
-_GROUP_ROWS = 2 * BATCH_ROWS
+_MOST_GROUP_ROWS = 2 * BATCH_ROWS
+"""Largest number of rows of a group that is read; earlier versions wrote so many."""
 _LEAST_GROUP_ROWS = 4096
+MOST_ROWS = 2**62
+"""More than any file has."""
 _ENCODINGS = {
     pa.int64(): "DELTA_BINARY_PACKED",
     pa.uint16(): "DELTA_BINARY_PACKED",
@@ -43,7 +46,7 @@ RowType = np.dtype[np.void]
 
 
 class StoredTables(RecordSource):
-    """The tables of a record in its folder; a table that is read as a whole is kept.
+    """The tables of a record in its folder.
 
     Args:
         folder: the folder.
@@ -52,47 +55,37 @@ class StoredTables(RecordSource):
             than fit into memory.
 
     Raises:
-        CallerError: a file cannot be read, has too many rows, or does not have all columns of its
-            type.
+        CallerError: as :class:`TableFile`.
     """
 
     def __init__(self, folder: Path, types: Mapping[str, RowType], most_rows: int) -> None:
         super().__init__(types)
-        self._folder, self._most_rows = folder, most_rows
-        self._whole: dict[str, Rows] = {}
-        self._groups: dict[str, list[_Group]] = {}
+        self._files = {
+            table: TableFile(folder / f"{table}.parquet", dtype, most_rows)
+            for table, dtype in types.items()
+        }
         self._newest: dict[str, tuple[int, Rows]] = {}
         """The group of several loops that was read last, by table."""
-        self._counts = {table: self._check(table) for table in types}
-
-    def whole(self, table: str) -> Rows:
-        """Read all rows of a table."""
-        if table not in self._whole:
-            dtype = self.types[table]
-            self._whole[table] = joined([*read_batches(self.path(table), dtype)], dtype)
-        return self._whole[table]
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
-        return self._counts[table]
+        return self._files[table].rows
 
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Read the rows of a table in order; a short one is kept."""
-        if table in self._whole or self._counts[table] <= BATCH_ROWS:
-            self.whole(table)
-            yield from RowsInMemory(self._whole).batches(table, columns)
-        else:
-            yield from read_batches(self.path(table), with_columns(self.types[table], columns))
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        yield from self._files[table].batches(with_columns(self.types[table], columns))
 
     def of_loop(self, table: str, number: int, dtype: RowType) -> Iterator[Rows]:
         """Read the rows of a loop in order, as rows of a type; of a table without loops, all."""
         if LOOP not in (self.types[table].names or ()):
             yield from self.batches(table, dtype.names or ())
             return
-        for place, group in enumerate(self._groups[table]):
-            if group.first == number == group.last:
-                yield from _read_batches(self.path(table), [place], dtype)
-            elif group.first <= number <= group.last:
+        groups = self._groups_with(table, number)
+        alone = [place for place, is_alone in groups.items() if is_alone]
+        own = self._files[table].batches(dtype, alone)
+        for place, is_alone in groups.items():
+            if is_alone:
+                yield next(own)
+            else:
                 rows = self._mixed(table, place)
                 yield without_loop(rows.compress(rows[LOOP] == number), dtype)
 
@@ -101,52 +94,36 @@ class StoredTables(RecordSource):
         if LOOP not in (self.types[table].names or ()):
             return self.count(table)
         return sum(
-            group.rows
-            if group.first == number == group.last
+            self._files[table].groups[place].rows
+            if is_alone
             else int((self._mixed(table, place)[LOOP] == number).sum())
-            for place, group in enumerate(self._groups[table])
-            if group.first <= number <= group.last
+            for place, is_alone in self._groups_with(table, number).items()
         )
+
+    def _groups_with(self, table: str, number: int) -> dict[int, bool]:
+        """Return the groups that may have rows of a loop: whether they have those of it alone."""
+        return {
+            place: group.first == group.last
+            for place, group in enumerate(self._files[table].groups)
+            if group.first <= number <= group.last
+        }
 
     def _mixed(self, table: str, place: int) -> Rows:
         """Read a group with rows of several loops; the loops are usually read in turn."""
         newest, rows = self._newest.get(table, (-1, None))
         if newest != place or rows is None:
-            rows = _read_group(self.path(table), place, self.types[table])
+            (rows,) = self._files[table].batches(groups=[place])
             self._newest[table] = place, rows
         return rows
 
+    @cached_method
     def highest_input(self, table: str) -> int:
         """Return the highest number of an input in a table; −1 without rows."""
-        groups = self._groups[table]
-        if any(group.highest_input is None for group in groups):
-            return super().highest_input(table)
-        return max((group.highest_input or 0 for group in groups), default=-1)
-
-    def path(self, table: str) -> Path:
-        """Return the file of a table."""
-        return self._folder / f"{table}.parquet"
-
-    def _check(self, table: str) -> int:
-        """Check the schema of a file; return its number of rows."""
-        path = self.path(table)
-        with _readable(path), pq.ParquetFile(path) as file:
-            schema, metadata = file.schema_arrow, file.metadata
-            if metadata.num_rows > self._most_rows:
-                raise CallerError(
-                    f"{path}: has {metadata.num_rows:,} rows; a run of this scenario has at most "
-                    f"{self._most_rows:,}"
-                )
-            _require_parts(path, metadata)
-            _require_columns(path, schema, self.types[table])
-            groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-            self._groups[table] = [_group(one, metadata) for one in groups]
-            for column, _ in _columns(self.types[table]):
-                place = metadata.schema.names.index(column)
-                found = [group.column(place).statistics for group in groups]
-                if any(one is not None and one.null_count for one in found):
-                    raise CallerError(f"{path}: column {column} has holes")
-            return int(metadata.num_rows)
+        highest = [group.highest_input for group in self._files[table].groups]
+        known = [number for number in highest if number is not None]
+        return (
+            max(known, default=-1) if len(known) == len(highest) else super().highest_input(table)
+        )
 
 
 class _Group(NamedTuple):
@@ -161,87 +138,97 @@ class _Group(NamedTuple):
     """Highest number of an input; None if unknown."""
 
 
-def _group(group: Any, metadata: pq.FileMetaData) -> _Group:
-    names = metadata.schema.names
+class TableFile:
+    """The file of a table, read group by group.
+
+    Args:
+        path: the file.
+        dtype: the type of its rows; the file may have more columns.
+        most_rows: as of :class:`StoredTables`.
+
+    Raises:
+        CallerError: the file cannot be read, has too many rows, also in one group, does not have
+            all columns of its type, or has a column with missing values.
+    """
+
+    def __init__(self, path: Path, dtype: RowType, most_rows: int = MOST_ROWS) -> None:
+        self._path, self._dtype = path, dtype
+        with self._open() as file:
+            metadata = file.metadata
+            groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+        self.rows = int(metadata.num_rows)
+        if self.rows > most_rows:
+            raise CallerError(
+                f"{path}: has {self.rows:,} rows; a run of this scenario has at most {most_rows:,}"
+            )
+        if (largest := max((group.num_rows for group in groups), default=0)) > _MOST_GROUP_ROWS:
+            raise CallerError(
+                f"{path}: has {largest:,} rows in one part; at most {_MOST_GROUP_ROWS:,} are read"
+            )
+        places = {name: place for place, name in enumerate(metadata.schema.names)}
+        for name in [name for name, _ in _columns(dtype)]:
+            found = [group.column(places[name]).statistics for group in groups]
+            if any(statistics is not None and statistics.null_count for statistics in found):
+                raise CallerError(f"{path}: column {name} has holes")
+        self.groups = [_group(group, places) for group in groups]
+
+    def batches(
+        self, dtype: RowType | None = None, groups: Iterable[int] | None = None
+    ) -> Iterator[Rows]:
+        """Yield the rows of each group, or of some, as rows of a type that has fewer columns."""
+        with self._open() as file:
+            for group in range(len(self.groups)) if groups is None else groups:
+                yield self._rows(file, group, self._dtype if dtype is None else dtype)
+
+    def whole(self) -> pa.Table:
+        """Return the table as it is, with all columns of the file."""
+        with self._open() as file:
+            table = file.read()
+            table.validate(full=True)
+        for column, _ in _columns(self._dtype):
+            _require_whole(self._path, column, table.column(column))
+        return table
+
+    def segments(self) -> Iterator[Segment]:
+        """Yield the groups as segments."""
+        for group, rows in enumerate(self.batches(with_columns(self._dtype, ("input",)))):
+            if len(rows):
+                read = partial(self._group, group)
+                yield Segment(int(rows["input"].min()), int(rows["input"].max()), read)
+
+    def _group(self, group: int) -> Rows:
+        (rows,) = self.batches(groups=[group])
+        return rows
+
+    @contextmanager
+    def _open(self) -> Iterator[pq.ParquetFile]:
+        with _readable(self._path), pq.ParquetFile(self._path) as file:
+            _require_columns(self._path, file.schema_arrow, self._dtype)
+            yield file
+
+    def _rows(self, file: pq.ParquetFile, group: int, dtype: RowType) -> Rows:
+        names = [column for column, _ in _columns(dtype)]
+        # One thread, whose memory is used again.
+        table = file.read_row_group(group, columns=names, use_threads=False).combine_chunks()
+        table.validate(full=True)
+        rows, columns = np.empty(len(table), dtype), iter(names)
+        for name in dtype.names or ():
+            field = dtype[name]
+            for entry in rows[name].T if field.shape else [rows[name]]:
+                column = next(columns)
+                entry[...] = _values(self._path, column, table[column], field.base)
+        return rows
+
+
+def _group(group: Any, places: Mapping[str, int]) -> _Group:
     loops, inputs = (
-        group.column(names.index(name)).statistics if name in names else None
+        group.column(places[name]).statistics if name in places else None
         for name in (LOOP, "input")
     )
     highest = int(inputs.max) if inputs is not None and inputs.has_min_max else None
     if loops is None or not loops.has_min_max:
         return _Group(group.num_rows, 0, MAX_LOOPS, highest)
     return _Group(group.num_rows, int(loops.min), int(loops.max), highest)
-
-
-def read_table(path: Path, dtype: RowType) -> pa.Table:
-    """Read a table's file as it is.
-
-    Raises:
-        CallerError: the file cannot be read, or does not have all columns of that type.
-    """
-    with _readable(path):
-        table = pq.read_table(path)
-        table.validate(full=True)
-        _require_columns(path, table.schema, dtype)
-    for column, _ in _columns(dtype):
-        _require_whole(path, column, table.column(column))
-    return table
-
-
-def read_batches(path: Path, dtype: RowType) -> Iterator[Rows]:
-    """Yield the rows of a table's file, ``BATCH_ROWS`` at a time.
-
-    Raises:
-        CallerError: as :func:`read_table`.
-    """
-    yield from _read_batches(path, None, dtype)
-
-
-def _read_batches(path: Path, groups: Sequence[int] | None, dtype: RowType) -> Iterator[Rows]:
-    """Yield the rows of some groups of a file, by default of all."""
-    names = [column for column, _ in _columns(dtype)]
-    with _readable(path), pq.ParquetFile(path) as file:
-        _require_columns(path, file.schema_arrow, dtype)
-        for group in range(file.num_row_groups) if groups is None else groups:
-            # A reader of several groups would keep the memory of all of them to the end.
-            for batch in file.iter_batches(
-                BATCH_ROWS, row_groups=[group], columns=names, use_threads=False
-            ):
-                batch.validate(full=True)
-                yield _rows(path, batch, dtype)
-
-
-def group_segments(path: Path, dtype: RowType) -> Iterator[Segment]:
-    """Yield the row groups of a table's file as segments.
-
-    Raises:
-        CallerError: as :func:`read_table`.
-    """
-    with _readable(path), pq.ParquetFile(path) as file:
-        _require_parts(path, file.metadata)
-        groups = file.num_row_groups
-    for group in range(groups):
-        inputs = _read_group(path, group, with_columns(dtype, ("input",)))["input"]
-        if len(inputs):
-            read = partial(_read_group, path, group, dtype)
-            yield Segment(int(inputs.min()), int(inputs.max()), read)
-
-
-def _require_parts(path: Path, metadata: pq.FileMetaData) -> None:
-    """Raise CallerError if a part of a file has more rows than noack writes into one."""
-    rows = max((metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)), default=0)
-    if rows > _GROUP_ROWS:
-        raise CallerError(f"{path}: has {rows:,} rows in one part; noack writes {_GROUP_ROWS:,}")
-
-
-def _read_group(path: Path, group: int, dtype: RowType) -> Rows:
-    names = [column for column, _ in _columns(dtype)]
-    with _readable(path), pq.ParquetFile(path) as file:
-        _require_columns(path, file.schema_arrow, dtype)
-        table = file.read_row_group(group, columns=names).combine_chunks()
-        table.validate(full=True)
-        batches = table.to_batches()
-        return joined([_rows(path, one, dtype) for one in batches], dtype)
 
 
 def write_table(
@@ -274,7 +261,7 @@ def arrow_table(rows: Rows) -> pa.Table:
 
 
 def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
-    """Yield the same rows in batches of at most ``_GROUP_ROWS``.
+    """Yield the same rows in batches of at most ``BATCH_ROWS``.
 
     A loop with enough rows begins a batch of its own; so it can be read alone.
     """
@@ -289,11 +276,11 @@ def _regrouped(batches: Iterable[Rows], dtype: RowType) -> Iterator[Rows]:
             waiting, count = [], 0
         waiting.append(batch)
         count += len(batch)
-        if count >= _GROUP_ROWS:
+        if count >= BATCH_ROWS:
             rows = joined(waiting, dtype)
-            whole = count - count % _GROUP_ROWS
-            for first in range(0, whole, _GROUP_ROWS):
-                yield rows[first : first + _GROUP_ROWS]
+            whole = count - count % BATCH_ROWS
+            for first in range(0, whole, BATCH_ROWS):
+                yield rows[first : first + BATCH_ROWS]
             waiting, count = [rows[whole:].copy()], count - whole
     if count:
         yield joined(waiting, dtype)
@@ -319,27 +306,15 @@ def _array(values: NDArray[Any]) -> Any:
     return pa.Array.from_buffers(type_, len(values), [None, data])
 
 
-def _rows(path: Path, batch: pa.RecordBatch, dtype: RowType) -> Rows:
-    rows = np.zeros(batch.num_rows, dtype)
-    for name in dtype.names or ():
-        field = dtype[name]
-        entries = entry_names(name, field.shape[0]) if field.shape else (name,)
-        for i, entry in enumerate(entries):
-            column = batch.column(entry)
-            _require_whole(path, entry, column)
-            if field.shape:
-                rows[name][:, i] = _values(column, field.base)
-            else:
-                rows[name] = _values(column, field)
-    return rows
-
-
-def _values(column: Any, field: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values of an Arrow array; its ``to_numpy`` would import pandas."""
+def _values(path: Path, name: str, column: Any, field: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values of a column in one chunk; its ``to_numpy`` would import pandas."""
+    _require_whole(path, name, column)
     if not len(column):
         return np.zeros(0, field)
-    data: memoryview = memoryview(column.buffers()[1])
-    return np.frombuffer(data, field, len(column), column.offset * field.itemsize)
+    chunk = column.chunk(0)
+    return np.frombuffer(
+        memoryview(chunk.buffers()[1]), field, len(chunk), chunk.offset * field.itemsize
+    )
 
 
 def _columns(dtype: RowType) -> Iterator[tuple[str, pa.DataType]]:

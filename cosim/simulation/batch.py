@@ -66,6 +66,8 @@ class Events(NamedTuple):
     """(k,)"""
     delivered: NDArray[np.bool_]
     """(k,)"""
+    states: NDArray[np.float64]
+    """(x, e_s, e_c) just before the events, (k, 3, n)."""
 
 
 def setting_of(resolved: Scenario) -> Setting:
@@ -115,14 +117,13 @@ def run_with_events(
 ) -> tuple[NDArray[np.void], list[Events]]:
     """Run every draw; return its row, as :func:`run_batch` does, and its events.
 
-    The memory for the events is 9 bytes times ``setting.most_events`` for each draw.
+    There is room for ``setting.most_events`` events of each draw; only the used part takes memory.
     """
     rows, log = _run(setting, population, setting.most_events)
-    counts = rows["transmissions"].tolist()
-    return rows, [
-        Events(log.event_s[run, :events], log.delivered[run, :events])
-        for run, events in enumerate(counts)
-    ]
+    assert log.states is not None
+    events = rows["transmissions"].tolist()
+    parts = zip(events, log.event_s, log.delivered, log.states, strict=True)
+    return rows, [Events(*(part[:count] for part in own)) for count, *own in parts]
 
 
 def _run(
@@ -140,7 +141,7 @@ def _run(
         known_start=setting.known_start, link=LinkState(setting.link, 0, UPDATE_LINK),
         Q=setting.Q, R=setting.R, settle=setting.settle, most_events=setting.most_events,
     )  # fmt: skip
-    return simulation.runs(*population[:3], keys, places)
+    return simulation.runs(*population[:3], keys, places, states=places > 0)
 
 
 def _check(setting: Setting, population: Population) -> None:

@@ -7,17 +7,22 @@ of the network couple the loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from cosim.record.record_source import NetworkRows, RecordSource, RowsInMemory, without_loop
-from cosim.record.run_record import RecordedRun, Rows, RunRecord
+from cosim.record.record_source import (
+    NetworkRows,
+    RecordSource,
+    RowsInMemory,
+    joined,
+    without_loop,
+)
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
-from noack.config.parameter_changes import change_notice, scheduled
+from noack.config.parameter_changes import change_notice, scheduled, settings_key
 from noack.config.resolution import (
     has_loop,
     is_of_network,
@@ -49,14 +54,40 @@ _ROLES: Mapping[str, Callable[..., LoopMachines]] = {
 _REASONS = tuple(reason.value for reason in Rejection)
 _INPUTS_PER_PROGRESS = 2048
 _SENT_PLACES = 64
+_PIECE_BYTES = 2**24
+
+
+class RowMemory:
+    """Memory for rows, in pieces for which the kernel has large pages.
+
+    It takes the kernel longer to provide a small page than the core to fill it with rows.
+    """
+
+    def __init__(self) -> None:
+        self._rest = np.empty(0, np.uint8)
+
+    def rows(self, places: int, dtype: np.dtype[np.void]) -> Rows:
+        """Return memory for rows of a type."""
+        size = places * dtype.itemsize
+        if size > len(self._rest):
+            self._rest = np.empty(max(size, _PIECE_BYTES), np.uint8)
+        rows, self._rest = np.split(self._rest, [size])
+        return rows.view(dtype)
 
 
 class RecordCollector:
-    """Rows and notices of a run, in the order in which the machines of a role write them."""
+    """Rows and notices of a run, in the order in which the machines of a role write them.
 
-    def __init__(self) -> None:
+    Args:
+        types: the row type of each table.
+        loops: the number of loops.
+    """
+
+    def __init__(self, types: Mapping[str, np.dtype[np.void]], loops: int) -> None:
+        self._types, self._loops = types, loops
         self._batches: dict[str, list[Rows]] = {}
         self._settings: dict[str, list[tuple[Any, ...]]] = {}
+        self._by_loop: dict[str, list[Rows]] = {}
         self._notices: list[tuple[Notice, str]] = []
 
     def take(self, role: str, output: Record | Notice) -> None:
@@ -70,24 +101,25 @@ class RecordCollector:
         """Take rows of a table."""
         self._batches.setdefault(table, []).append(rows)
 
-    def rows(self, table: str, dtype: np.dtype[np.void]) -> Rows:
-        """Return all rows of a table of this type."""
-        return _joined(
-            [np.array(self._settings.get(table, []), dtype), *self._batches.get(table, [])]
-        )
-
-    def counts(self, table: str, loops: int) -> NDArray[np.int64]:
+    def counts(self, table: str) -> NDArray[np.int64]:
         """Return the number of rows of each loop in a table of the machines, shape (loops,)."""
         numbers = [rows[LOOP] for rows in self._batches.get(table, [])]
         numbers.append(np.array([row[0] for row in self._settings.get(table, [])], np.uint16))
-        return np.bincount(np.concatenate(numbers), minlength=loops)
+        return np.bincount(np.concatenate(numbers), minlength=self._loops)
 
-    def take_by_loop(self, table: str, dtype: np.dtype[np.void], loops: int) -> list[Rows]:
-        """Return the rows of each loop in a table of the machines, and keep them no longer."""
+    def whole(self, table: str) -> Rows:
+        """Return all rows of a table, and keep them no longer."""
+        dtype = self._types[table]
         batches = self._batches.pop(table, [])
         if settings := self._settings.pop(table, []):
             batches = [np.array(settings, dtype), *batches]
-        return _split(_joined(batches or [np.zeros(0, dtype)]), loops)
+        return joined(batches or [np.zeros(0, dtype)], dtype)
+
+    def of_loop(self, table: str, number: int) -> Rows:
+        """Return the rows of a loop in a table of the machines, without the loop's number."""
+        if table not in self._by_loop:
+            self._by_loop[table] = _split(self.whole(table), self._loops)
+        return self._by_loop[table][number]
 
     def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
@@ -120,8 +152,15 @@ class VirtualRun:
         """When each loop begins."""
         self.machines = {role: make(loops, self.phases_ns) for role, make in _ROLES.items()}
         """The machines of all loops, by role."""
+        memory = RowMemory()
+        for machines in self.machines.values():
+            machines.take_rows_from(memory.rows)
         self.channel = channel_of(scenario, loops=len(loops), network=network)
-        self.record = RecordCollector()
+        kinds = {settings_key(loop): loop for loop in loops}
+        self.types = {kind: tables_of(loop) for kind, loop in kinds.items()}
+        """The row types of the tables of each kind of loops (:func:`settings_key`)."""
+        run_types = {**row_types(map(shape_of, kinds.values())), **network_tables()}
+        self.record = RecordCollector(run_types, len(loops))
         self.core: Any = self._new_core(len(loops))
         wrong = core.noack_simulation_check(self.core)
         if wrong != ffi.NULL:
@@ -167,7 +206,7 @@ class VirtualRun:
         """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
         machine = self.machines[role].machines[loop].machine
         counts = machine.acknowledgements if acknowledges else machine.received
-        rejected = zip(_REASONS, counts.rejected, strict=True)
+        rejected = zip(_REASONS, ffi.unpack(counts.rejected, len(_REASONS)), strict=True)
         return {
             "accepted": counts.accepted,
             "rejected": {reason: count for reason, count in rejected if count},
@@ -250,86 +289,58 @@ def _simulated(
     run.announce()
     with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         run.run(progress=progress)
-    of_network = {table: run.record.rows(table, dtype) for table, dtype in network_tables().items()}
-    packets = NetworkRows(of_network, run.phases_ns)
-    types = row_types(map(shape_of, loops))
+    of_network = {table: run.record.whole(table) for table in network_tables()}
+    packets = NetworkRows(RowsInMemory(of_network), run.phases_ns)
+    tables = {table for types in run.types.values() for table in types}
     counts = packets.counts() | {
-        table: run.record.counts(table, len(loops)) for table in types if not is_of_network(table)
+        table: run.record.counts(table) for table in tables if not is_of_network(table)
     }
-    by_table: dict[str, list[Rows]] = {}
+    numbers = {table: of_loops.tolist() for table, of_loops in counts.items()}
     records = []
     for number, loop in enumerate(loops):
-        own_types = tables_of(loop)
-        rows = _LoopRows(run.record, by_table, types, packets, number, len(loops), own_types)
-        own_counts = {table: int(counts[table][number]) for table in own_types}
+        rows = _LoopRows(run.record, packets, number, run.types[settings_key(loop)])
+        own_counts = {table: numbers[table][number] for table in rows.types}
         reports = _reports(run, own_counts, scenario, number)
         notices = run.record.notices(number)
-        shared = number if len(loops) > 1 else None
-        records.append(RunRecord(loop, rows, notices, reports, "simulated", number=shared))
+        roles = loop_roles(len(loops))
+        records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
-    reports = {"netem": _report("netem", of_all, {"rejected": {}})}
+    reports = {"netem": _report(of_all, "netem")}
     common = RunRecord(
-        scenario, of_network, run.record.notices(), reports, "simulated", is_network=True
+        scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES
     )
     return RecordedRun(common, records)
 
 
 class _LoopRows(RecordSource):
-    """The rows of a loop. A table of the run is split by loops when one of them is first read.
+    """The rows of a loop, which are separated from those of the other loops when they are read.
 
     Args:
         record: the rows of the run's machines.
-        by_table: the tables that have been split, of all loops.
-        run_types: the types of the run's rows.
         packets: the rows of the network.
         number: the number of the loop.
-        loops: the number of loops.
         types: the types of the loop's rows.
     """
 
     def __init__(
         self,
         record: RecordCollector,
-        by_table: dict[str, list[Rows]],
-        run_types: Mapping[str, np.dtype[np.void]],
         packets: NetworkRows,
         number: int,
-        loops: int,
         types: Mapping[str, np.dtype[np.void]],
     ) -> None:
         super().__init__(types)
-        self._record, self._by_table, self._run_types = record, by_table, run_types
-        self._packets, self._number, self._loops = packets, number, loops
-
-    @cached_property
-    def _of_network(self) -> Mapping[str, Rows]:
-        return self._packets.of_loop(self._number)
-
-    def whole(self, table: str) -> Rows:
-        """Return all rows of a table."""
-        if is_of_network(table):
-            return self._of_network[table]
-        if not has_loop(table):  # nothing in virtual time compares clocks
-            return np.zeros(0, self.types[table])
-        if table not in self._by_table:
-            whole = self._run_types[table]
-            self._by_table[table] = self._record.take_by_loop(table, whole, self._loops)
-        return without_loop(self._by_table[table][self._number], self.types[table])
+        self._record, self._packets, self._number = record, packets, number
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
         return len(self.whole(table))
 
-    def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order."""
-        yield from RowsInMemory({table: self.whole(table)}).batches(table, columns)
-
-
-def _joined(batches: Sequence[Rows]) -> Rows:
-    """Return rows of one type in one array; numpy's own function takes as long for each column."""
-    if len(batches) == 1:
-        return batches[0]
-    return np.concatenate([rows.view(np.uint8) for rows in batches]).view(batches[0].dtype)
+    def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
+        if is_of_network(table):
+            yield from self._packets.of_loop(table, self._number)
+        elif has_loop(table):  # nothing in virtual time compares clocks
+            yield without_loop(self._record.of_loop(table, self._number), self.types[table])
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:
@@ -346,18 +357,15 @@ def _reports(
     run: VirtualRun, counts: Mapping[str, int], scenario: Scenario, loop: int
 ) -> dict[str, dict[str, Any]]:
     """Return the final report of each role, as of a loop with these numbers of rows."""
-    reports = {
-        role: _report(
-            role, counts, run.reception(role, loop) if role in _ROLES else {"rejected": {}}
-        )
-        for role in LOOP_ROLES
-    }
+    reports = {role: _report(counts, role) for role in LOOP_ROLES}
+    for role in _ROLES:
+        reports[role]["channel"] = run.reception(role, loop)
     if scenario.protocol.acknowledges:
         received = run.reception("sensor", loop, acknowledges=True)
         reports["sensor"]["channel"]["acknowledgements"] = received
     return reports
 
 
-def _report(role: str, counts: Mapping[str, int], channel: dict[str, Any]) -> dict[str, Any]:
+def _report(counts: Mapping[str, int], role: str) -> dict[str, Any]:
     owned = {table: count for table, count in counts.items() if OWNER[table] == role}
-    return {"ended": HORIZON, "channel": channel, "rows": owned}
+    return {"ended": HORIZON, "channel": {"rejected": {}}, "rows": owned}

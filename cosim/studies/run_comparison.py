@@ -1,7 +1,7 @@
-"""A comparison of runs: key numbers, settings that differ, and the distance between states."""
+"""A comparison of runs: key numbers, settings that differ, distances, and one overlaid figure."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,10 +10,34 @@ import numpy as np
 
 from cosim.analysis.summary_model import FidelityPart, LoopSummary, RunSummary
 from cosim.live.finalize import reopen
+from cosim.output import palette
+from cosim.output.figure_description import (
+    TIME,
+    Axis,
+    Dash,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Row,
+    plain,
+    series_colour,
+    time_axis,
+)
+from cosim.record.align import Reals, align_tables
 from cosim.record.run_directory import chosen_run
 from cosim.record.run_record import RunRecord, load_record
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, shortened
-from noack.protocol.record_tables import PLANT_STEP
+from noack.core.file_access import write_whole
+from noack.core.number_format import as_text
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,9 +61,9 @@ class ComparedRun(NamedTuple):
     @property
     def title(self) -> str:
         """The scenario and its kind of run, as text."""
-        one = self.summary
         mode = "model-based" if self.loop.mode == "model" else "zero-order hold"
-        return f"{one.scenario}, {mode}, {one.kind}, M − 1 = {one.mansd}"
+        summary = self.summary
+        return f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"
 
     @property
     def loop(self) -> LoopSummary:
@@ -88,16 +112,17 @@ class RunComparison:
             name: tuple(value(run.loop) for run in self.runs) for name, value in _NUMBERS.items()
         }
         apart = [_distance(self.runs[0].record, run.record) for run in self.runs]
-        found["distance in x to A, RMS"] = tuple(rms for rms, _ in apart)
-        found["distance in x to A, maximum"] = tuple(largest for _, largest in apart)
+        found["distance in x to A, RMS"], found["distance in x to A, maximum"] = zip(
+            *apart, strict=True
+        )
         return [KeyNumber(*one) for one in found.items() if any(v is not None for v in one[1])]
 
     @cached_property
     def settings(self) -> dict[str, tuple[str, ...]]:
         """The settings that differ, by key, with the value in every run."""
         flat = [dict(_flat(run.record.scenario.model_dump(mode="json"))) for run in self.runs]
-        keys = dict.fromkeys(key for one in flat for key in one)
-        found = {key: tuple(one.get(key, "-") for one in flat) for key in keys}
+        keys = dict.fromkeys(key for settings in flat for key in settings)
+        found = {key: tuple(settings.get(key, "-") for settings in flat) for key in keys}
         return {
             key: tuple(shortened(value, _LONGEST_VALUE) for value in values)
             for key, values in found.items()
@@ -106,8 +131,7 @@ class RunComparison:
 
     def plot(self) -> "Figure":
         """Draw states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions of all runs overlaid."""
-        from cosim.output.figure_drawing import draw
-        from cosim.studies.comparison_figure import overlay_figure
+        from cosim.output.figure_drawing import draw  # it imports matplotlib
 
         return draw(overlay_figure(self.runs))
 
@@ -122,9 +146,19 @@ class RunComparison:
             CallerError: the name has another ending, or there is no such width.
             MachineError: the file cannot be written.
         """
-        from cosim.studies.comparison_figure import write_overlay
+        from cosim.output.figure_files import FIGURE_SUFFIXES, save_figure  # they import matplotlib
+        from cosim.output.page_kit import templates
 
-        write_overlay(self, path, width)
+        if path.suffix in FIGURE_SUFFIXES:
+            save_figure(overlay_figure(self.runs), path, width)
+            return
+        if path.suffix != ".html":
+            known = ", ".join(FIGURE_SUFFIXES)
+            raise CallerError(f"{path}: a comparison is written as .html, {known}")
+        if width is not None:
+            raise CallerError(f"{path}: a page has its own width; --width is that of a figure")
+        template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
+        write_whole(path, template.render(found=self, figure=overlay_figure(self.runs)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison without the figure, for programs."""
@@ -133,15 +167,15 @@ class RunComparison:
                 {"label": run.label, "directory": str(run.directory), "title": run.title}
                 for run in self.runs
             ],
-            "numbers": {one.name: list(one.values) for one in self.numbers},
-            "differences": {one.name: list(one.differences) for one in self.numbers},
+            "numbers": {key.name: list(key.values) for key in self.numbers},
+            "differences": {key.name: list(key.differences) for key in self.numbers},
             "settings": {key: list(values) for key, values in self.settings.items()},
         }
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
         """Return the key numbers as a table of text: name, then a cell per run."""
-        return [(one.name, *one.cells) for one in self.numbers]
+        return [(key.name, *key.cells) for key in self.numbers]
 
     @property
     def setting_rows(self) -> list[tuple[str, ...]]:
@@ -149,8 +183,6 @@ class RunComparison:
         return [(key, *values) for key, values in self.settings.items()]
 
     def __repr__(self) -> str:
-        from noack.core.number_format import as_text
-
         legend = "\n".join(f"{run.label}  {run.title}  {run.directory}" for run in self.runs)
         return f"{legend}\n{as_text([('', *(run.label for run in self.runs)), *self.rows])}"
 
@@ -193,16 +225,12 @@ def _compared(label: str, given: Path) -> ComparedRun:
 
 
 def _claims(verdict: str) -> Callable[[LoopSummary], int]:
-    return lambda loop: sum(one.verdict == verdict for one in loop.claims)
+    return lambda loop: sum(claim.verdict == verdict for claim in loop.claims)
 
 
 def _missed(loop: LoopSummary) -> int | None:
     late = loop.lateness_us
-    return sum(one.late_steps for one in late.values()) if late else None
-
-
-def _loss_rate(loop: LoopSummary) -> float:
-    return float(100 * loop.drops / max(loop.drops + loop.deliveries, 1))
+    return sum(role.late_steps for role in late.values()) if late else None
 
 
 def _ideal(loop: LoopSummary) -> int | None:
@@ -212,11 +240,11 @@ def _ideal(loop: LoopSummary) -> int | None:
 _NUMBERS: dict[str, Callable[[LoopSummary], float | None]] = {
     "simulated time, s": lambda s: s.reached_s,
     "transmissions": lambda s: s.events,
-    "ideal loop: transmissions": lambda s: _ideal(s),
+    "ideal loop: transmissions": _ideal,
     "deliveries": lambda s: s.deliveries,
     "forced by the guarantee": lambda s: s.forced_deliveries,
     "lost in the network": lambda s: s.drops,
-    "loss rate, %": _loss_rate,
+    "loss rate, %": lambda s: 100 * s.drops / max(s.drops + s.deliveries, 1),
     "longest loss burst": lambda s: s.longest_loss_burst,
     "shortest inter-event time, s": lambda s: s.inter_event_min_s,
     "median inter-event time, s": lambda s: s.inter_event_median_s,
@@ -252,3 +280,80 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", str(value)
+
+
+_MOST_STATES = 6
+_STATE_IN, _NORM_IN, _EVENTS_IN = 1.25, 1.8, 0.35
+_DECADES = 5
+_WIDEST, _NARROWER, _NORM_WIDTH = 3.4, 0.75, 1.2
+
+
+def overlay_figure(runs: Sequence[ComparedRun]) -> FigureDescription:
+    """Describe states, ‖e_s‖ with thresholds, ‖e_c‖ and transmissions, one colour per run.
+
+    Args:
+        runs: runs with the same number of states; the first 6 states are drawn.
+    """
+    with np.errstate(all="ignore"):  # a run may diverge
+        aligned = [align_tables(run.record) for run in runs]
+    times = [np.asarray(samples.t_ns / NS_PER_S, dtype=np.float64) for samples in aligned]
+    longest = time_axis(max(times, key=lambda t_s: t_s.max(initial=0.0)), numbers=False)
+    every = list(enumerate(zip(runs, times, aligned, strict=True)))
+    panels = [
+        # Each run's line is thinner than the line below it.
+        Panel(x=longest, y=Axis(label=plain(name)), legend=() if i else None, items=[
+            Line(x=t_s, y=samples.x[:, i], label=f"{run.label}: {plain(run.title, 60)}",
+                 colour=series_colour(k), width=max(_WIDEST * _NARROWER**k, 0.8))
+            for k, (run, t_s, samples) in every
+        ])
+        for i, name in enumerate(runs[0].record.loop.state_names[:_MOST_STATES])
+    ]  # fmt: skip
+    rows = [Row(panels=[panel], height_in=_STATE_IN) for panel in panels]
+    for title, name in (
+        (r"Sensor's error $\|e_s\|$ and threshold (dashed)", "e_s_norm"),
+        (r"Controller's error $\|e_c\|$", "e_c_norm"),
+    ):
+        items: list[Item] = []
+        for k, (_, t_s, samples) in every:  # the first run is on top
+            curves: list[tuple[Reals, Dash]] = [(getattr(samples, name), ())]
+            curves += [(samples.threshold, (5, 2))] if name == "e_s_norm" else []
+            items += [
+                Line(x=t_s, y=values, colour=series_colour(k), width=_NORM_WIDTH,
+                     order=3 - 0.1 * k, dash=dash)
+                for values, dash in curves
+            ]  # fmt: skip
+        about = np.concatenate([getattr(samples, name) for samples in aligned])
+        y = Axis(label="norm", logarithmic=True, about=about, decades=_DECADES)
+        rows.append(
+            Row(panels=[Panel(title=title, items=items, x=longest, y=y)], height_in=_NORM_IN)
+        )
+    events = replace(_events(runs), x=replace(longest, label=TIME, numbers=True))
+    return FigureDescription(
+        name="runs",
+        heading=f"{len(runs)} runs",
+        rows=[*rows, Row(panels=[events], height_in=_EVENTS_IN * (len(runs) + 1))],
+        caption="One colour per run. Dashed: threshold. Bar: transmission delivered; cross: "
+        "transmission lost.",
+        description="States, error norms and transmissions of the runs over time, overlaid.",
+    )
+
+
+def _events(runs: Sequence[ComparedRun]) -> Panel:
+    """One row of marks per run: a bar for a delivered transmission, a cross for a lost one."""
+    rows = range(len(runs) - 1, -1, -1)
+    items: list[Item] = []
+    for number, (run, row) in enumerate(zip(runs, rows, strict=True)):
+        sensor = run.record[SENSOR_MEASUREMENT]
+        sent = sensor[sensor["event"] != NO_SEQUENCE]
+        delivered = np.isin(sent["event"], run.record[CONTROLLER_DELIVERY]["sequence"])
+        t_s, at = sent["t_ns"] / NS_PER_S, np.full(len(sent), float(row))
+        items += [
+            Marks(x=t_s[delivered], y=at[delivered], marker="|", size=13.0, stroke=1.6,
+                  colour=series_colour(number)),
+            Marks(x=t_s[~delivered], y=at[~delivered], marker="x", size=4.5, colour=palette.LOST,
+                  label="lost"),
+        ]  # fmt: skip
+    ticks = {float(row): run.label for row, run in zip(rows, runs, strict=True)}
+    y = Axis(ticks=ticks, ends=(-0.6, len(runs) - 0.4), grid=False)
+    title = "Transmissions (bar: delivered, cross: lost)"
+    return Panel(title=title, items=items, x=Axis(), y=y)

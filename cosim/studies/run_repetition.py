@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from cosim.analysis.replay import replay
@@ -17,6 +16,7 @@ from cosim.analysis.replay.replay_result import difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.live.finalize import finalize, reopen
 from cosim.live.simulated_run import simulate_run
+from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_tables import network_rows
 from cosim.record.record_source import Slice
 from cosim.record.run_directory import SCENARIO_FILE, Kind, all_changes_since, kind_of
@@ -26,6 +26,7 @@ from cosim.studies.run_comparison import compare_runs
 from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, printable, why
+from noack.core.number_format import number
 from noack.settings.user_files import file_tables
 
 _MOST_STEPS = 1_000_000
@@ -83,8 +84,11 @@ def repeat_archive(
         scenario = _scenario(path, archived, run_code=run_code)
         if (manifest.scenario, manifest.kind) != (scenario.name, kind_of(archived)):
             raise CallerError(f"{path}: {MANIFEST} describes another run than the archive contains")
-        if not long:
-            _require_short(path, scenario)
+        if not long and (steps := steps_of(scenario)) > _MOST_STEPS:
+            raise CallerError(
+                f"{path}: its run has {steps:,} steps, and would take about "
+                f"{steps * _US_PER_STEP * 1e-6 / 3600:.1f} hours; --long repeats it nevertheless"
+            )
         try:
             recorded = load_run(archived)
         except CallerError as error:
@@ -103,16 +107,6 @@ def repeat_archive(
             gaps=[text for one in found for text in one.gaps],
             changes=all_changes_since(archived),
             numbers=_numbers(archived, ending.run_dir),
-        )
-
-
-def _require_short(path: Path, scenario: Scenario) -> None:
-    steps = steps_of(scenario)
-    if steps > _MOST_STEPS:
-        hours = steps * _US_PER_STEP * 1e-6 / 3600
-        raise CallerError(
-            f"{path}: its run has {steps:,} steps, and would take about {hours:.1f} hours; "
-            "--long repeats it nevertheless"
         )
 
 
@@ -215,14 +209,10 @@ def _numbers(archived: Path, repeated: Path) -> list[tuple[str, ...]]:
         rows = [(name, value, second.get(name, "-")) for name, value in first.items()]
         return [row for row in rows if row[1] != row[2]]
     return [
-        (one.name, *map(_cell, one.values))
-        for one in compare_runs([archived, repeated]).numbers
-        if one.values[0] != one.values[1] and one.values != (None, 0.0)  # a distance of 0
+        (key.name, *(number(value, 6) for value in key.values))
+        for key in compare_runs([archived, repeated]).numbers
+        if key.values[0] != key.values[1] and key.values != (None, 0.0)  # a distance of 0
     ]
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6g}"
 
 
 def print_repetition(console: Console, found: Repetition) -> None:
@@ -230,30 +220,24 @@ def print_repetition(console: Console, found: Repetition) -> None:
 
     Texts of the archive are printed without control characters.
     """
+
+    def say(text: str, style: str = "") -> None:
+        console.print(Text(printable(text), style), soft_wrap=True)
+
     what = "inputs replayed" if found.kind == "live" else "rows repeated"
     verdict = ("bit-exact", "green") if found.bit_exact else ("not reproduced", "bold red")
     if not found.compared:
         verdict = "nothing to compare", "bold red"
-    lines = [
-        Text(
-            printable(f"{found.scenario}, {found.kind}: {verdict[0]}, {found.compared:,} {what}"),
-            verdict[1],
-        )
-    ]
-    lines += [Text(printable(f"first difference: {text}")) for text in found.differences]
-    lines += [Text(printable(f"record incomplete: {text}"), "yellow") for text in found.gaps]
-    for line in lines:
-        console.print(line, soft_wrap=True)
+    say(f"{found.scenario}, {found.kind}: {verdict[0]}, {found.compared:,} {what}", verdict[1])
+    for text in found.differences:
+        say(f"first difference: {text}")
+    for text in found.gaps:
+        say(f"record incomplete: {text}", "yellow")
     if found.numbers:
-        title = "numbers that differ"
-        if found.kind == "live":
-            title += ": the simulation has no lateness"
-        table = Table("quantity", "archived", "repeated", title=title)
-        for place in (1, 2):
-            table.columns[place].justify = "right"
-        for row in found.numbers:
-            table.add_row(*(Text(printable(cell)) for cell in row))
-        console.print(table)
+        late = ": the simulation has no lateness" if found.kind == "live" else ""
+        rows = [[*map(printable, row)] for row in found.numbers]
+        heads = ("quantity", "archived", "repeated")
+        table = ResultTable("numbers", f"numbers that differ{late}", heads, rows)
+        console.print(terminal_table(table))
     for change in found.changes:
-        text = printable(f"differs from the archived run's machine: {change}")
-        console.print(Text(text), soft_wrap=True)
+        say(f"differs from the archived run's machine: {change}")

@@ -27,6 +27,7 @@ enum {
     SETTLE_NS = 200000,
     MOST_SETTLE_NS = 10000000,
     MOST_PUT_OFF_NS = 50000000, /* if a tick is always near */
+    MANY_BYTES = 49152,         /* of rows: as many go to the recorder without a pause */
     EARLY_NS = 1000             /* a timer may expire so much before its time */
 };
 
@@ -63,6 +64,7 @@ typedef struct {
     int64_t worked;            /* 1: something was done since it last slept */
     int64_t has_followed;      /* 1: something was done since housekeeping has been due */
     int64_t has_more;          /* 1: a socket may have more datagrams than were received */
+    int64_t first;             /* the socket that is read first the next time */
     int64_t has_asked;         /* 1: the present step has asked Python */
     noack_message message;
     uint8_t out_data[BUFFERS][BUFFER_BYTES];
@@ -432,11 +434,13 @@ static void take_arrivals(noack_driver *driver) {
     }
 }
 
-/* Receive messages from the sockets that have some. */
+/* Receive messages from the sockets that have some. They are read first in turn: one that always
+   has many would leave no room for the other. */
 static void receive(noack_driver *driver, int64_t ready) {
     driver_scratch *own = scratch_of(driver);
     own->message_next = own->message_end = own->taken_bytes = own->has_more = 0;
-    for (int64_t k = 0; k < driver->receiver_count; k++) {
+    for (int64_t turn = 0; turn < driver->receiver_count; turn++) {
+        int64_t k = (own->first + turn) % driver->receiver_count;
         int64_t most = min_of(own->batch, MESSAGES - 1 - own->message_end);
         if (!(ready >> k & 1) || most == 0)
             continue;
@@ -444,6 +448,7 @@ static void receive(noack_driver *driver, int64_t ready) {
         own->message_end += max_of(taken, 0);
         own->has_more |= taken == most;
     }
+    own->first ^= 1;
     take_arrivals(driver);
 }
 
@@ -457,12 +462,23 @@ static int64_t wait_for_ns(
     }
     if (until_ns == INT64_MIN) /* what has been received is still to be handled */
         return SETTLE_NS;
+    if (driver->rest_ns > 0) /* no moment is better than another */
+        return 0;
     int64_t overdue_ns = noack_clock_wait_ns(&driver->clock, now_ns - until_ns);
     own->has_followed |= own->worked;
     int settled = overdue_ns >= MOST_SETTLE_NS || (own->has_followed && !own->worked);
     if ((settled && tick_ns > QUIET_NS) || overdue_ns >= MOST_PUT_OFF_NS)
         return 0;
     return own->has_followed || settled ? SETTLE_NS : MOST_SETTLE_NS - overdue_ns;
+}
+
+/* Whether a table has so many rows that Python should take them before the next steps: few at a
+   time keep it for a short time only. */
+static int has_many_rows(const noack_process *process) {
+    for (int k = 0; k < NOACK_TABLES; k++)
+        if (process->tables[k].count * process->tables[k].row_bytes >= MANY_BYTES)
+            return 1;
+    return 0;
 }
 
 int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
@@ -483,6 +499,8 @@ int64_t noack_drive(noack_driver *driver, int64_t until_ns) {
             take_arrivals(driver);
         if (until_ns == INT64_MIN && own->in_next == own->in_end)
             return NOACK_DRIVEN;
+        if (has_many_rows(driver->process))
+            return NOACK_DRIVER_ROWS;
         int64_t wall_ns = clock_ns(CLOCK_MONOTONIC);
         int64_t now_ns = noack_clock_at_ns(&driver->clock, wall_ns);
         int64_t tick_ns = next_tick_ns(driver, now_ns);

@@ -150,14 +150,9 @@ static int64_t tick(noack_input_replay *replay, int64_t now_ns) {
     noack_process *process = replay->process;
     int64_t due_ns = tick_ns(noack_process_machine(process, replay->loop));
     check_deadline(replay, due_ns, now_ns);
-    if (due_ns == NO_TICK)
+    if (due_ns == NO_TICK || process->role == NOACK_SENSOR)
         return NOACK_CANNOT_TAKE;
-    if (process->role == NOACK_PLANT)
-        return noack_plant_tick(
-            &process->plants[replay->loop], now_ns, &process->output, process->notes);
-    if (process->role == NOACK_CONTROLLER)
-        return noack_controller_tick(&process->controllers[replay->loop], now_ns, &process->output);
-    return NOACK_CANNOT_TAKE;
+    return do_tick(process, replay->loop, now_ns);
 }
 
 static int64_t handle(
@@ -186,12 +181,7 @@ static int64_t handle(
             (size_t)columns->entries * sizeof *message.vector);
         message.entries += columns->entries;
     }
-    noack_output *output = &process->output;
-    if (process->role == NOACK_PLANT)
-        return noack_plant_handle(&process->plants[replay->loop], &message, now_ns, output);
-    if (process->role == NOACK_SENSOR)
-        return noack_sensor_handle(&process->sensors[replay->loop], &message, now_ns, output);
-    return noack_controller_handle(&process->controllers[replay->loop], &message, now_ns, output);
+    return handle_message(process, replay->loop, &message, now_ns);
 }
 
 static int64_t replay_machine(

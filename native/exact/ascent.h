@@ -1,21 +1,23 @@
-/* Newton's method where h increases, in a bracket that is bisected to the last bit if need be. */
+/* Halley's method where h increases, in a bracket that is bisected to the last bit if need be.
+
+   With the Newton step n = -h/h' it steps by n/(1 + n h''/(2 h')), and converges cubically. */
 #ifndef NOACK_EXACT_ASCENT_H
 #define NOACK_EXACT_ASCENT_H
 
 #include "exact.h"
 
-enum { NEWTON_STEPS = 60, TURNS = NEWTON_STEPS + 1100 }; /* more than any two doubles need */
-static const double CLOSE = 1e-8; /* relative size of Newton's last step; its square is rounding */
+enum { FAST_STEPS = 60, TURNS = FAST_STEPS + 1100 }; /* more than any two doubles need */
+static const double CLOSE = 1e-5; /* relative size of the last step; its cube is rounding */
 
 typedef search_point look_function(const void *curve, const level_search *search, double s);
 
-/* Newton's point, if it is in the bracket, else a safe one. low_s is below the root, if there is
+/* The next point, if it is in the bracket, else a safe one. low_s is below the root, if there is
    one; there is one below high_s if beyond. */
 static inline double bracketed(
     double following, int turn, double low_s, double high_s, int beyond) {
-    if (turn < NEWTON_STEPS && low_s < following && following < high_s)
+    if (turn < FAST_STEPS && low_s < following && following < high_s)
         return following;
-    if (!beyond && (turn >= NEWTON_STEPS || following >= high_s))
+    if (!beyond && (turn >= FAST_STEPS || following >= high_s))
         return high_s;
     return 0.5 * (low_s + high_s);
 }
@@ -29,15 +31,17 @@ static inline double safe_step(double value, double slope, double most, double s
     return least(slope > 0.0 ? -2.0 * value / (slope + root) : (root - slope) / most, span);
 }
 
-/* The root of an increasing h in (start.s, ahead_s), or NONE. look gives h and its derivative. */
+/* The root of an increasing h in (at.s, ahead_s), or NONE. look gives h and its derivatives. */
 static inline __attribute__((always_inline)) double ascend(
     look_function *look, const void *curve, const level_search *search, search_point at,
     double ahead_s) {
     double low_s = at.s, high_s = ahead_s;
     int beyond = 0;
     for (int turn = 0; turn < TURNS; turn++) {
-        double following = at.slope > 0.0 ? at.s - at.excess / at.slope : INFINITY;
-        if (fabs(following - at.s) <= CLOSE * at.s && turn < NEWTON_STEPS)
+        double newton = -at.excess / at.slope, turned = 0.5 * newton * (at.bend / at.slope);
+        double step = turned > -0.5 ? newton / (1.0 + turned) : newton;
+        double following = at.slope > 0.0 ? at.s + step : INFINITY;
+        if (fabs(step) <= CLOSE * at.s && fabs(turned) <= CLOSE && turn < FAST_STEPS)
             return following < ahead_s || beyond ? following : NONE;
         following = bracketed(following, turn, low_s, high_s, beyond);
         if (following == at.s)

@@ -9,6 +9,9 @@ enum { CACHE_LINE = 8 }; /* doubles */
 #if defined(__x86_64__)
 #include <cpuid.h>
 
+static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
+                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
 static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
 
 /* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
@@ -20,29 +23,22 @@ __attribute__((constructor)) static void ask_processor(void) {
     __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
     is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
 }
+#else
+static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
+                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
+static const exact_code *const *const fused = plain;
+static const int is_fused = 0;
+#endif
 
 int64_t noack_exact_is_fused(void) { return is_fused; }
 
-static const exact_code *code_for(int64_t entries) {
-    if (!is_fused)
-        return entries == 3 ? &exact_plain_3 : &exact_plain_64;
-    if (entries <= 2)
-        return &exact_fused_2;
-    if (entries <= 4)
-        return entries == 3 ? &exact_fused_3 : &exact_fused_4;
-    return entries <= 8 ? &exact_fused_8 : entries <= 16 ? &exact_fused_16 : &exact_fused_64;
+/* The code for the fewest states that suffice. */
+static const exact_code *code_for(const noack_exact *exact) {
+    const exact_code *const *code = is_fused ? fused : plain;
+    while ((*code)->n < max_of(exact->n, exact->m))
+        code++;
+    return *code;
 }
-#else
-int64_t noack_exact_is_fused(void) { return 0; }
-
-static const exact_code *code_for(int64_t entries) {
-    if (entries <= 2)
-        return &exact_plain_2;
-    if (entries <= 4)
-        return entries == 3 ? &exact_plain_3 : &exact_plain_4;
-    return entries <= 8 ? &exact_plain_8 : entries <= 16 ? &exact_plain_16 : &exact_plain_64;
-}
-#endif
 
 void pad(int64_t rows, int64_t columns, const double *matrix, int64_t stride, double *result) {
     for (int64_t j = 0; j < columns; j++, result += stride)
@@ -134,7 +130,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     const noack_trigger_rule *rule = &exact->rule;
     int64_t square = code->n * code->stride, n = exact->n, curve = TERMS * code->stride;
     int64_t blocks = blocks_of(rule, code);
-    int64_t count = (4 * (TERMS + 1) + 10) * square + 8 * curve
+    int64_t count = (5 * (TERMS + 1) + 10) * square + 8 * curve
                     + 2 * blocks * (2 * square + code->stride + curve) + CACHE_LINE;
     if (memory == NULL)
         return count;
@@ -161,6 +157,7 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     memory->minus_BK = take(&next, square);
     memory->D_k = take(&next, (TERMS + 1) * square);
     memory->H_k = take(&next, (TERMS + 1) * square);
+    memory->KH_k = take(&next, (TERMS + 1) * square);
     memory->A_k = take(&next, (TERMS + 1) * square);
     memory->X_k = take(&next, (TERMS + 1) * square);
     double **curves[] = {&memory->r, &memory->e, &memory->d,         &memory->q,
@@ -168,7 +165,6 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     for (int i = 0; i < 8; i++)
         *curves[i] = take(&next, curve);
     memory->weighted = rule->weight == NULL ? memory->e : memory->own_weighted;
-    memory->one_input = exact->m == 1;
     memory->is_static = 1;
     for (int64_t i = 0; i < n * n; i++)
         memory->is_static &= exact->H[i] == 0.0;
@@ -186,14 +182,26 @@ static int64_t lay_out(const noack_exact *exact, const exact_code *code, exact_m
     return count;
 }
 
+/* Copy a state (3, n) to a padded one, or back. */
+static void pack(int64_t n, int64_t stride, const double *state, double *padded) {
+    memset(padded, 0, 3 * (size_t)stride * sizeof *padded);
+    for (int64_t i = 0; i < 3; i++)
+        memcpy(padded + i * stride, state + i * n, (size_t)n * sizeof *state);
+}
+
+static void unpack(int64_t n, int64_t stride, const double *padded, double *state) {
+    for (int64_t i = 0; i < 3; i++)
+        memcpy(state + i * n, padded + i * stride, (size_t)n * sizeof *state);
+}
+
 int64_t noack_exact_scratch(const noack_exact *exact) {
-    return lay_out(exact, code_for(max_of(exact->n, exact->m)), NULL);
+    return lay_out(exact, code_for(exact), NULL);
 }
 
 void noack_exact_runs(
     const noack_exact *exact, int64_t runs, const double *A, const double *B, const double *x0,
     const int64_t *keys, noack_exact_row *rows) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n, m = exact->m, stages = exact->link == NULL ? 0 : exact->link->stage_count;
     double state[3 * NOACK_EXACT_ENTRIES];
     exact_memory memory = {0};
@@ -219,7 +227,7 @@ void noack_exact_segments(
     const noack_exact *exact, const double *A, const double *B, int64_t count, double *t_s,
     double *states, double *auxiliaries, int64_t *events, double *values, double *at_s,
     int64_t *statuses) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n, stride = code->stride;
     double state[3 * NOACK_EXACT_ENTRIES];
     exact_memory memory = {0};
@@ -229,12 +237,9 @@ void noack_exact_segments(
         noack_exact_row row = {.inter_event_min_s = INFINITY};
         exact_run run = {.row = &row, .stops = 1, .t_s = t_s[i], .at_s = t_s[i], .state = state};
         run.auxiliary = auxiliaries[i];
-        memset(state, 0, sizeof state);
-        for (int64_t j = 0; j < 3 * n; j++)
-            state[j / n * stride + j % n] = states[j];
+        pack(n, stride, states, state);
         code->follow(&memory, &run);
-        for (int64_t j = 0; j < 3 * n; j++)
-            states[j] = state[j / n * stride + j % n];
+        unpack(n, stride, state, states);
         t_s[i] = run.t_s;
         auxiliaries[i] = run.auxiliary;
         events[i] = run.event;
@@ -248,18 +253,17 @@ void noack_exact_sample(
     const noack_exact *exact, const double *A, const double *B, int64_t starts,
     const double *start_s, const double *start_states, int64_t count, const double *t_s,
     double *states) {
-    const exact_code *code = code_for(max_of(exact->n, exact->m));
+    const exact_code *code = code_for(exact);
     int64_t n = exact->n;
     exact_memory memory = {0};
     lay_out(exact, code, &memory);
     code->prepare(&memory, A, B);
     for (int64_t start = 0, sampled = 0; start < starts; start++, start_states += 3 * n) {
-        double state[3 * NOACK_EXACT_ENTRIES] = {0};
+        double state[3 * NOACK_EXACT_ENTRIES];
         int64_t end = sampled;
         while (end < count && (start + 1 == starts || t_s[end] < start_s[start + 1]))
             end++;
-        for (int64_t j = 0; j < 3 * n; j++)
-            state[j / n * code->stride + j % n] = start_states[j];
+        pack(n, code->stride, start_states, state);
         code->sample(
             &memory, state, start_s[start], end - sampled, t_s + sampled, states + 3 * n * sampled);
         sampled = end;

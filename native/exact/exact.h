@@ -10,7 +10,7 @@
 enum {
     HIGHEST = 24,        /* largest degree of a state's Taylor polynomial */
     TERMS = HIGHEST + 1, /* coefficients of a curve */
-    DEGREES = 11,        /* possible degrees: 4, 6, ..., 24 */
+    DEGREES = 6,         /* possible degrees: 4, 8, ..., 24 */
     MORE = 20,           /* coefficients of eta after those that its gain reaches */
     MOST_TERMS = 2 * HIGHEST + 2 + MORE,
     MOST_STEPS = 1000000 /* of a search */
@@ -38,8 +38,8 @@ typedef struct {               /* a search on [0, end_s] for the first crossing 
     int backward;              /* search y(end_s - s) instead of y(s); then r = 0 */
 } level_search;
 
-typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its derivative */
-    double s, excess, slope;
+typedef struct { /* a point of a search: h(s) = g(s) - c e^(-rs), and its derivatives */
+    double s, excess, slope, bend;
 } search_point;
 
 typedef struct { /* memory of a simulation; arrays begin in the caller's scratch */
@@ -51,10 +51,9 @@ typedef struct { /* memory of a simulation; arrays begin in the caller's scratch
     int is_static; /* H = 0: r, d and q stay as they are between events */
     int apart;     /* d is not 0: the models differ, or */
     int renewed;   /* q is not 0: the reference is not x_c */
-    int one_input; /* m = 1: u and its coefficients are numbers, not vectors */
     double grid_s;
     /* shared by all runs; matrices in column-major order, columns padded to a stride */
-    double *H, *K, *H_k;
+    double *H, *K, *H_k, *KH_k;
     double *weight, *forecast_weight, *Q, *R; /* NULL: the identity */
     double *form, *form_signs, *gain, *gain_signs;
     /* of a plant */
@@ -80,6 +79,7 @@ typedef struct { /* a run, or a part of one */
     int64_t event;    /* likewise: 1: an event at t_s */
     int64_t losses;   /* consecutive ones so far */
     double at_s;      /* time at which the supremum is attained */
+    double growth;    /* e^(rt) of the supremum, at the start of a piece */
 } exact_run;
 
 /* The code for a number of states; see simulator.h. */

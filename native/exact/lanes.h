@@ -128,15 +128,6 @@ static inline lanes weigh(const double *weight, lanes v) {
     return weight == NULL ? v : times(weight, v);
 }
 
-/* The first entry of times(). */
-static inline double first_of(const double *matrix, lanes v) {
-    double total = matrix[0] * entry(v, 0);
-#pragma GCC unroll 8
-    for (int j = 1; j < N; j++)
-        total = __builtin_fma(matrix[j * STRIDE], entry(v, j), total);
-    return total;
-}
-
 /* The sum of the entries: halves are added to each other. */
 static inline double sum(lanes v) {
 #if N == 3

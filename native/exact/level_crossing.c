@@ -7,7 +7,7 @@
 
    phi is convex and negative between 0 and its positive root, so a step up to that root skips no
    crossing, however short. Since h'' >= -(b + r^2 c e^(-rs)) =: -L, h increases on all of [s, a] if
-   h'(s) > L (a - s). Then it has at most one root there, and Newton's method may take any steps
+   h'(s) > L (a - s). Then it has at most one root there, and Halley's method may take any steps
    that stay within a bracket.
 
    b = sum of k(k-1) |g_k| a^(k-2) is valid on [0, a]. It is computed again if a smaller a makes it
@@ -32,12 +32,14 @@ double polynomial(const double *g, int degree, double s) {
 static inline search_point look(const void *curve, const level_search *search, double s) {
     const double *g = ((const scalar_curve *)curve)->g;
     int degree = ((const scalar_curve *)curve)->degree;
-    double level = level_at(search, s), total = g[degree], slope = 0.0;
+    double level = level_at(search, s), rate = search->rate;
+    double total = g[degree], slope = 0.0, half = 0.0;
     for (int k = degree - 1; k >= 0; k--) {
+        half = half * s + slope;
         slope = slope * s + total;
         total = total * s + g[k];
     }
-    return (search_point){s, total - level, slope + search->rate * level};
+    return (search_point){s, total - level, slope + rate * level, 2.0 * half - rate * rate * level};
 }
 
 /* A bound on |g''| in [0, s]: the second derivative of the sum of |g_k| s^k. */
@@ -54,7 +56,7 @@ double first_root(const double *g, int degree, const level_search *search, doubl
     scalar_curve curve = {g, degree};
     double rate = search->rate, end_s = search->end_s, ahead_s = end_s;
     double most = bend_of(g, degree, end_s);
-    search_point at = {0.0, g[0] - search->level, g[1] + rate * search->level};
+    search_point at = look(&curve, search, 0.0);
     if (at.excess > grain || (at.excess >= -grain && at.slope > 0.0))
         return 0.0;
     if (end_s <= 0.0)

@@ -4,16 +4,14 @@
 
        h(s + q) <= phi(q) = |y(s) + y'(s) q| + b q^2/2 - c_s (1 - r q),    c_s = c e^(-rs).
 
-   phi is convex. If phi(0) < 0 and phi(q) <= 0, then phi and h are negative in between, so a step
-   of length q skips no crossing, however short. Newton's method from the right stays right of phi's
-   root. It begins at the root that |y(s)| + (y.y'/|y|) q in place of |y(s) + y'(s) q| gives. The
-   chord from its last point to (0, phi(0)) is zero at a point left of the root: this point is the
-   step. A chord of phi lies above phi, so Newton's method may stop at any iteration: the step is
-   then shorter and equally safe.
+   |y(s) + y'(s) q| is at most |y| + |y'| q. With the radial speed v = y.y'/|y| it is also at most
+   |y| + v q + w q^2/(2 |y|), where w is |y'|^2 - v^2 if v > 0, and |y'|^2 otherwise: the first terms
+   of a square root bound it from above. So phi has a quadratic bound, which is negative up to its
+   positive root. A step of this length skips no crossing, however short.
 
    If y is not 0, h'' = (|y'|^2 - (y.y'/|y|)^2 + y.y'')/|y| - r^2 c_s >= -(b + r^2 c_s) =: -L. If
    y = 0, the kink of |y| only increases h'. So if h'(s) > L (a - s), h increases on all of [s, a].
-   Then it has at most one root there, and Newton's method may take any steps within the interval.
+   Then it has at most one root there, and Halley's method may take any steps within the interval.
 
    b is bend() and valid on [0, a]. It is computed again if a smaller a makes it much smaller.
    Nothing is sampled. Only rounding remains: if h is below 0 by less than the rounding error, steps
@@ -32,46 +30,39 @@ typedef struct {
     int p;
 } vector_curve;
 
-/* y and y', forward or backward. */
-static inline void look(
-    const double *curve, int p, const level_search *search, double s, lanes *y, lanes *dy) {
-    value_and_slope(curve, p, search->backward ? search->end_s - s : s, y, dy);
+/* A point of a search, forward or backward. */
+static inline curve_point look(const double *curve, int p, const level_search *search, double s) {
+    if (s == 0.0 && !search->backward) {
+        lanes half = load(curve + 2 * STRIDE);
+        return (curve_point){load(curve), load(curve + STRIDE), add(half, half)};
+    }
+    curve_point at = point_at(curve, p, search->backward ? search->end_s - s : s);
     if (search->backward)
-        *dy = subtract(filled(0.0), *dy);
+        at.dy = subtract(filled(0.0), at.dy);
+    return at;
 }
 
-/* |y|^2 - (c e^(-rs))^2 and its derivative: for Newton's method, in place of h, which has a square
+/* |y|^2 - (c e^(-rs))^2 and its derivatives: for Halley's method, in place of h, which has a square
    root and the same sign. */
 static inline search_point look_at_square(const void *curve, const level_search *search, double s) {
     const vector_curve *own = curve;
-    lanes y, dy;
-    look(own->c, own->p, search, s, &y, &dy);
-    double level = level_at(search, s), square = level * level;
-    return (search_point){s, dot(y, y) - square, 2.0 * (dot(y, dy) + search->rate * square)};
+    curve_point at = look(own->c, own->p, search, s);
+    double level = level_at(search, s), square = level * level, rate = search->rate;
+    return (search_point){
+        s, dot(at.y, at.y) - square, 2.0 * (dot(at.y, at.dy) + rate * square),
+        2.0 * (dot(at.dy, at.dy) + dot(at.y, at.ddy) - 2.0 * rate * rate * square)};
 }
 
-/* The length of a step that skips no crossing, at most length; length if there is none within it.
-   square, mixed and speed are |y|^2, y.y' and |y'|^2; most is b. */
-static double safe_length(
-    double square, double mixed, double speed, double level, double rate, double most,
-    double length) {
-    double below = level - sqrt(square), above = 0.0;
-    for (int step = 0; step < NEWTON_STEPS; step++) {
-        double straight = sqrt(largest_of(square + length * (2.0 * mixed + length * speed), 0.0));
-        above = straight + level * (rate * length - 1.0) + 0.5 * most * length * length;
-        if (above <= 0.0)
-            return length;
-        if (above <= below)
-            break;
-        double slope = level * rate + most * length;
-        if (straight > 0.0)
-            slope += (mixed + length * speed) / straight;
-        double following = length - above / slope;
-        if (!(0.0 < following && following < length))
-            return 0.0;
-        length = following;
-    }
-    return length * (below / (below + above));
+/* The length of a step that skips no crossing, at most span. speed is |y'|^2, most is b. */
+static inline double safe_length(
+    double size, double radial, double speed, double level, double rate, double most, double span) {
+    const double small =
+        0.125; /* share of the level below which |y| + |y'| q is the better bound */
+    if (size < small * level)
+        return safe_step(size - level, rate * level + sqrt(speed), most, span);
+    double turned = radial > 0.0 ? speed - radial * radial : speed;
+    return safe_step(
+        size - level, rate * level + radial, most + largest_of(turned, 0.0) / size, span);
 }
 
 /* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. ends_below: it is
@@ -81,31 +72,32 @@ static double first_exit(
     const double ahead = 3.0, nearer = 0.6;
     vector_curve own = {curve, p};
     double rate = search->rate, end_s = search->end_s, s = 0.0, ahead_s = end_s;
-    double highest, most = bend(curve, p, end_s, &highest), lowest = level_at(search, end_s);
-    if (highest < lowest * lowest)
+    double lowest = level_at(search, end_s);
+    if (largest(curve, p, end_s) < lowest * lowest)
         return NONE;
-    lanes y = load(curve), dy = load(curve + STRIDE);
-    if (search->backward)
-        look(curve, p, search, s, &y, &dy);
+    double most = bend(curve, p, end_s);
+    curve_point at = look(curve, p, search, 0.0);
     for (int steps = 0; steps < most_steps; steps++) {
-        double square = dot(y, y), mixed = dot(y, dy), speed = dot(dy, dy);
+        double square = dot(at.y, at.y), mixed = dot(at.y, at.dy), speed = dot(at.dy, at.dy);
         double level = level_at(search, s), size = sqrt(square);
         if (!(size < level))
             return s;
         if (s >= end_s)
             return NONE;
-        double slope = rate * level + (size > 0.0 ? mixed / size : sqrt(speed));
+        double radial = size > 0.0 ? mixed / size : sqrt(speed), slope = rate * level + radial;
         if (slope > (most + rate * rate * level) * (ahead_s - s)) {
             if (ends_below && ahead_s == end_s)
                 return NONE;
-            search_point at = {s, size - level, slope};
-            s = ascend(look_at_square, &own, search, at, ahead_s);
+            double turned =
+                size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy) : dot(at.dy, at.ddy);
+            double bent = turned / (size > 0.0 ? size : radial) - rate * rate * level;
+            search_point start = {s, size - level, slope, bent};
+            s = ascend(look_at_square, &own, search, start, ahead_s);
             if (s != NONE || ahead_s == end_s)
                 return s;
             s = ahead_s;
         } else {
-            double most_s = safe_step(size - level, slope, most, ahead_s - s);
-            double step = safe_length(square, mixed, speed, level, rate, most, most_s);
+            double step = safe_length(size, radial, speed, level, rate, most, ahead_s - s);
             if (s + step >= end_s)
                 return NONE;
             if (!(s + step > s))
@@ -113,14 +105,14 @@ static double first_exit(
             s = least(s + step, ahead_s);
             if (s + ahead * step < nearer * ahead_s && !search->backward) {
                 ahead_s = s + ahead * step;
-                most = bend(curve, p, ahead_s, &highest);
+                most = bend(curve, p, ahead_s);
             }
         }
         if (s == ahead_s) {
             ahead_s = end_s;
-            most = bend(curve, p, ahead_s, &highest);
+            most = bend(curve, p, ahead_s);
         }
-        look(curve, p, search, s, &y, &dy);
+        at = look(curve, p, search, s);
     }
     return UNRESOLVED;
 }

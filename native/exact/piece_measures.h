@@ -48,62 +48,65 @@ static inline lanes weighted_squares(
     return total;
 }
 
-/* The sum of SHARE v^2 over the nodes; v is a curve of numbers. */
-static inline double weighted_squares_of_one(const double *numbers, int p, double s) {
-    part v[NODES / WIDTH], at[NODES / WIDTH], share[NODES / WIDTH], total[4 / WIDTH] = {{0.0}};
+/* The sum of SHARE u'Ru over the nodes; u is a curve of degree p with m entries. */
+static double weighted_input_squares(const exact_memory *memory, int p, double s) {
+    enum { GROUPS = NODES / WIDTH };
+    const double *us = memory->u, *R = memory->R;
+    int64_t m = memory->exact->m;
+    part u[N][GROUPS], at[GROUPS], share[GROUPS], total[4 / WIDTH] = {{0.0}};
+    memcpy(at, AT, sizeof at);
+    memcpy(share, SHARE, sizeof share);
+    for (int64_t j = 0; j < m; j++) {
+#pragma GCC unroll 6
+        for (int i = 0; i < GROUPS; i++)
+            u[j][i] = spread(us[p * STRIDE + j]);
+        for (int k = p - 1; k >= 0; k--)
+#pragma GCC unroll 6
+            for (int i = 0; i < GROUPS; i++)
+                u[j][i] = fused(u[j][i], at[i] * spread(s), spread(us[k * STRIDE + j]));
+    }
+    for (int64_t j = 0; j < m; j++)
+        for (int i = 0; i < GROUPS; i++) {
+            part weighted = u[j][i];
+            if (R != NULL) {
+                weighted = spread(0.0);
+                for (int64_t l = 0; l < m; l++)
+                    weighted = fused(spread(R[l * STRIDE + j]), u[l][i], weighted);
+            }
+            total[i % (4 / WIDTH)] = fused(u[j][i] * share[i], weighted, total[i % (4 / WIDTH)]);
+        }
     double four[4];
-#pragma GCC unroll 6
-    for (int i = 0; i < NODES / WIDTH; i++) {
-        memcpy(&at[i], AT + i * WIDTH, sizeof at[i]);
-        memcpy(&share[i], SHARE + i * WIDTH, sizeof share[i]);
-        at[i] = at[i] * spread(s);
-        v[i] = spread(numbers[p]);
-    }
-    for (int k = p - 1; k >= 0; k--) {
-#pragma GCC unroll 6
-        for (int i = 0; i < NODES / WIDTH; i++)
-            v[i] = fused(v[i], at[i], spread(numbers[k]));
-    }
-#pragma GCC unroll 6
-    for (int i = 0; i < NODES / WIDTH; i++)
-        total[i % (4 / WIDTH)] = fused(v[i] * share[i], v[i], total[i % (4 / WIDTH)]);
     memcpy(four, total, sizeof four);
     return (four[0] + four[2]) + (four[1] + four[3]);
 }
 
 /* The integral of xQx + uRu over [0, s] of polynomials of degree p. */
 static double square_integrals(const exact_memory *memory, int p, double s) {
-    int u_degree = memory->is_static ? 0 : p; /* of a constant u */
     lanes squares = filled(0.0);
-    for (int first = 0; first < NODES; first += AT_ONCE) {
+    for (int first = 0; first < NODES; first += AT_ONCE)
         squares = add(squares, weighted_squares(memory->x, p, memory->Q, s, first));
-        if (!memory->one_input)
-            squares = add(squares, weighted_squares(memory->u, u_degree, memory->R, s, first));
-    }
-    if (!memory->one_input)
-        return s * sum(squares);
-    double R = memory->R == NULL ? 1.0 : memory->R[0];
-    return s * (sum(squares) + R * weighted_squares_of_one(memory->u, u_degree, s));
+    int u_degree = memory->is_static ? 0 : p; /* of a constant u */
+    return s * (sum(squares) + weighted_input_squares(memory, u_degree, s));
 }
 
 /* |y(s)| e^(rate s) at or near a maximum to the right of low_s; *at_s is the time. */
 static double climb(
     const double *curve, int p, double low_s, double high_s, double rate, double *at_s) {
     const int climbs = 12;
-    lanes y, dy;
-    value_and_slope(curve, p, low_s, &y, &dy);
-    double low = dot(y, dy) + rate * dot(y, y);
-    double best = sqrt(dot(y, y)) * fixed_exp(rate * low_s);
+    curve_point at = point_at(curve, p, low_s);
+    double low = dot(at.y, at.dy) + rate * dot(at.y, at.y);
+    double best = sqrt(dot(at.y, at.y)) * fixed_exp(rate * low_s);
     *at_s = low_s;
-    value_and_slope(curve, p, high_s, &y, &dy);
-    double high = dot(y, dy) + rate * dot(y, y);
+    at = point_at(curve, p, high_s);
+    double high = dot(at.y, at.dy) + rate * dot(at.y, at.y);
     for (int i = 0; i < climbs; i++) {
         /* Regula falsi if the slope decreases through 0, otherwise bisection. */
         double s = 0.5 * (low_s + high_s);
         if (low > 0.0 && 0.0 > high)
             s = low_s + (high_s - low_s) * (low / (low - high));
-        value_and_slope(curve, p, s, &y, &dy);
-        double slope = dot(y, dy) + rate * dot(y, y), size = sqrt(dot(y, y)) * fixed_exp(rate * s);
+        at = point_at(curve, p, s);
+        double square = dot(at.y, at.y), slope = dot(at.y, at.dy) + rate * square;
+        double size = sqrt(square) * fixed_exp(rate * s);
         int rises = slope > 0.0 && size >= best;
         *at_s = size > best ? s : *at_s;
         best = largest_of(best, size);

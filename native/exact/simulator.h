@@ -9,9 +9,9 @@
 enum { MOST_PIECES = 1000000 };      /* of a run */
 static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
 static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
-/* Length of the first search after an event, in units of the time that the error would need at its
-   initial speed. */
-static const double LOOK_AHEAD = 1.25;
+/* Length of the first search after an event, in units of the time that the error would need by its
+   first coefficients. */
+static const double LOOK_AHEAD = 1.05;
 
 typedef struct { /* the comparison from the start of a piece on */
     rule_phase phase;
@@ -28,10 +28,11 @@ static inline __attribute__((always_inline)) void expand_with(
     exact_memory *memory, models state, double factor, int begin, int end, int moves, int apart,
     int renewed) {
     const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
-    const double *K = memory->K, *weight = memory->weight;
+    const double *KH_k = memory->KH_k, *weight = memory->weight;
     double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
     double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
-    int quadratic = memory->quadratic, one_input = memory->one_input;
+    lanes x_c = renewed ? subtract(state.r, state.q) : state.r;
+    int quadratic = memory->quadratic;
     for (int k = begin; k <= end; k++) {
         int table = k * N * STRIDE, at = k * STRIDE;
         lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
@@ -43,13 +44,11 @@ static inline __attribute__((always_inline)) void expand_with(
             d = apart ? times(H_k + table, state.d) : d;
             q = renewed ? times(H_k + table, state.q) : q;
             store(rs + at, r);
-            store(ds + at, d);
-            store(qs + at, q);
-            lanes x_c = renewed ? subtract(r, q) : r;
-            if (one_input)
-                us[k] = first_of(K, x_c);
-            else
-                store(us + at, times(K, x_c));
+            if (apart || k == 0)
+                store(ds + at, d);
+            if (renewed || k == 0)
+                store(qs + at, q);
+            store(us + at, times(KH_k + table, x_c));
         }
         lanes x = subtract(r, e), e_s = add(e, d);
         store(es + at, e);
@@ -125,12 +124,14 @@ static double first_window(exact_memory *memory, const comparison *now, int64_t 
         double soon_s = estimate_root(memory->g, now->level, 2.0 * now->phase.rate_per_s);
         return largest_of(LOOK_AHEAD * soon_s, (double)point * memory->grid_s - t_s);
     }
-    double speed = size_of(load(memory->error + STRIDE));
+    lanes first = load(memory->error + STRIDE), second = load(memory->error + 2 * STRIDE);
+    double speed = size_of(first);
     if (speed == 0.0)
         return INFINITY;
     if (memory->integrates) /* of an error that grows in proportion to time: speed s^2/2 */
         return LOOK_AHEAD * sqrt(2.0 * largest_of(threshold - now->auxiliary, 0.0) / speed);
-    return LOOK_AHEAD * threshold / speed;
+    double norm[] = {0.0, speed, dot(first, second) / speed};
+    return LOOK_AHEAD * estimate_root(norm, threshold, now->phase.rate_per_s);
 }
 
 /* The time of the next event on a piece, NONE or UNRESOLVED; the integral; the next grid point. */
@@ -151,18 +152,29 @@ static double find_event(
     return phase->compares ? first_exit(memory->error, p, &search, 0, MOST_STEPS) : NONE;
 }
 
-/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. */
+/* e^(rt) of the supremum; r is 0 from some time on. */
+static double growth_at(const noack_exact *exact, double t_s) {
+    double rate = exact->fading_per_s;
+    return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
+}
+
+/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. bound: the norm does not
+   exceed its threshold; NULL: it may. */
 static int measure_supremum(
     exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
-    double ceiling) {
+    const rule_phase *bound) {
     const noack_exact *exact = memory->exact;
-    int of_state = exact->measure == NOACK_EXACT_STATE;
+    int of_state = exact->measure == NOACK_EXACT_STATE, fades = t_s < exact->fading_until_s;
     const double *curve = of_state ? memory->x : memory->weighted;
     lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
-    double rate = t_s < exact->fading_until_s ? exact->fading_per_s : 0.0;
-    double growth = fixed_exp(exact->fading_per_s * least(t_s, exact->fading_until_s));
-    double before = run->row->sup_e_c_scaled, at_s = length_s;
-    double best = largest_of(before, size_of(last) * growth * fixed_exp(rate * length_s));
+    double rate = fades ? exact->fading_per_s : 0.0, growth = run->growth;
+    run->growth = fades ? growth_at(exact, t_s + length_s) : growth;
+    double grown =
+        t_s + length_s <= exact->fading_until_s ? run->growth : growth * fixed_exp(rate * length_s);
+    double before = run->row->sup_e_c_scaled, at_s = length_s, ceiling = INFINITY;
+    if (bound != NULL)
+        ceiling = bound->threshold * (bound->rate_per_s > 0.0 ? growth : grown);
+    double best = largest_of(before, size_of(last) * grown);
     if (!(ceiling <= best * (1.0 + CERTAINTY)))
         best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
     if (best == UNRESOLVED)
@@ -172,11 +184,11 @@ static int measure_supremum(
     return 1;
 }
 
-/* Add a piece's contribution to a row; settled is a level of |x|, and ceiling a bound on the
-   measured norm. Return the last time on the piece at which |x| > settled; NONE; or UNRESOLVED. */
+/* Add a piece's contribution to a row; settled is a level of |x|. Return the last time on the piece
+ * at which |x| > settled; NONE; or UNRESOLVED. */
 static double measure_piece(
     exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
-    double ceiling) {
+    const rule_phase *bound) {
     noack_exact_row *row = run->row;
     int64_t measure = memory->exact->measure;
     int q = degree_for(memory->measured_s, length_s);
@@ -184,7 +196,7 @@ static double measure_piece(
         row->cost += square_integrals(memory, q, length_s);
     if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
         return NONE;
-    if (!measure_supremum(memory, run, end, q, t_s, length_s, ceiling))
+    if (!measure_supremum(memory, run, end, q, t_s, length_s, bound))
         return UNRESOLVED;
     if (measure != NOACK_EXACT_ROW)
         return NONE;
@@ -258,9 +270,10 @@ static void follow(exact_memory *memory, exact_run *run) {
     double start = size_of(plant_of(state)), settled = exact->settle * start;
     double t_s = run->t_s, last_s = -1.0, first_s = 0.0, auxiliary = run->auxiliary;
     int64_t status = NOACK_EXACT_UNDECIDED, point = 0;
-    int first_degree = memory->quadratic ? 2 : 1, event = run->event != 0;
+    int event = run->event != 0;
     int above = start > settled, fresh = 1, looked = 0, agree = size_of(state.d) == 0.0;
     memory->renewed = 0;
+    run->growth = growth_at(exact, t_s);
     rule_span span = {0};
     if (memory->dynamic && memory->rule->decay_per_s > 0.0)
         farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
@@ -296,7 +309,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
         memory->apart = !agree || memory->renewed;
-        expand(memory, state, 1.0 / now.scale, 0, first_degree);
+        expand(memory, state, 1.0 / now.scale, 0, 2);
         if (phase.compares && !looked) {
             if (!is_within(state, LARGEST, phase.threshold)) {
                 status = NOACK_EXACT_DIVERGED;
@@ -307,7 +320,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         }
         window_s = least(window_s, left_s);
         int p = degree_for(memory->reach_s, window_s);
-        expand(memory, state, 1.0 / now.scale, first_degree + 1, p);
+        expand(memory, state, 1.0 / now.scale, 3, p);
         double found_s = find_event(memory, &now, p, &point, t_s, window_s);
         if (found_s == UNRESOLVED)
             break;
@@ -326,13 +339,10 @@ static void follow(exact_memory *memory, exact_run *run) {
             t_s += passed_at(memory, spent_s, LARGEST, &phase);
             break;
         }
-        double ceiling = INFINITY; /* while both models agree, e_c = e_s */
-        if (agree && !memory->quadratic && phase.compares && !memory->integrates
-            && exact->measure != NOACK_EXACT_STATE)
-            ceiling = phase.threshold
-                      * fixed_exp(
-                          exact->fading_per_s * (t_s + (phase.rate_per_s == 0.0 ? spent_s : 0.0)));
-        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, ceiling);
+        int is_bounded = agree && !memory->quadratic && phase.compares && !memory->integrates
+                         && exact->measure != NOACK_EXACT_STATE; /* e_c = e_s */
+        const rule_phase *bound = is_bounded ? &phase : NULL;
+        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, bound);
         if (within_s == UNRESOLVED)
             break;
         above = within_s == spent_s;
@@ -349,7 +359,11 @@ static void follow(exact_memory *memory, exact_run *run) {
 }
 
 /* Compute what all runs share. */
-static void share(exact_memory *memory) { powers(memory->H, memory->H_k); }
+static void share(exact_memory *memory) {
+    powers(memory->H, memory->H_k);
+    for (int at = 0; at < (TERMS + 1) * N * STRIDE; at += STRIDE)
+        store(memory->KH_k + at, times(memory->K, load(memory->H_k + at)));
+}
 
 /* Compute a plant's tables; A is (n, n), B (n, m). */
 static void prepare(exact_memory *memory, const double *A, const double *B) {

@@ -30,11 +30,10 @@
 #include "lanes.h"
 
 static const double NEGLIGIBLE = 0x1p-53, ROUNDED_UP = 1.0 + 1e-9;
-static const double LESS_STRICT[DEGREES] = {
-    /* (1e-12/2^-53)^(1/(p + 1)) */
-    6.178996568622248,  3.6723274229378378, 2.750419024561364, 2.2882747106619057,
-    2.0146481673225165, 1.8350137296621136, 1.708531253776262, 1.614865304156447,
-    1.5428148079652244, 1.4857258704959437, 1.4394069351299323};
+static const double LESS_STRICT[DEGREES] = {/* (1e-12/2^-53)^(1/(p + 1)) */
+                                            6.178996568622248,  2.750419024561364,
+                                            2.0146481673225165, 1.708531253776262,
+                                            1.5428148079652244, 1.4394069351299323};
 
 typedef struct {
     lanes r, e, d, q;
@@ -44,7 +43,7 @@ static inline lanes plant_of(models state) { return subtract(state.r, state.e); 
 static inline lanes sensor_error(models state) { return add(state.e, state.d); }
 static inline lanes controller_error(models state) { return subtract(state.e, state.q); }
 
-static inline int degree_of(int i) { return 4 + 2 * i; }
+static inline int degree_of(int i) { return 4 + 4 * i; }
 
 /* Fill a table with H^k/k!, k = 0 ... HIGHEST + 1. */
 static void powers(const double *H, double *table) {
@@ -108,10 +107,11 @@ static void find_reaches(exact_memory *memory) {
 
 /* The lowest degree that is accurate over a window. */
 static inline int degree_for(const double *reach_s, double window_s) {
-    int i = 0;
-    while (i < DEGREES - 1 && !(window_s <= reach_s[i]))
-        i++;
-    return degree_of(i);
+    int lowest = DEGREES - 1;
+#pragma GCC unroll 8
+    for (int i = DEGREES - 2; i >= 0; i--)
+        lowest = window_s <= reach_s[i] ? i : lowest;
+    return degree_of(lowest);
 }
 
 /* The sum over k <= p of c_k s^k; p is even. Even and odd powers are two sums, half as long. */
@@ -138,31 +138,42 @@ static inline models state_at(const exact_memory *memory, int p, double s) {
     return state;
 }
 
-/* The polynomial and its derivative: y = E(s^2) + s O(s^2), y' = O + 2 s (E' + s O'). */
-static inline void value_and_slope(
-    const double *curve, int p, double s, lanes *value, lanes *slope) {
+typedef struct { /* of a curve at a time */
+    lanes y, dy, ddy;
+} curve_point;
+
+/* The polynomial and its derivatives: y = E(s^2) + s O(s^2), y' = O + 2 s (E' + s O'),
+   y'' = 2 (E' + 3 s O') + 4 s^2 (E'' + s O''). */
+static inline curve_point point_at(const double *curve, int p, double s) {
     lanes even = load(curve + p * STRIDE), odd = filled(0.0), even_rise = odd, odd_rise = odd;
+    lanes even_bend = odd, odd_bend = odd; /* halves of E'' and O'' */
     double square = s * s;
     for (int k = p - 2; k >= 0; k -= 2) {
+        even_bend = fma_scaled(even_bend, square, even_rise);
+        odd_bend = fma_scaled(odd_bend, square, odd_rise);
         even_rise = fma_scaled(even_rise, square, even);
         odd_rise = fma_scaled(odd_rise, square, odd);
         even = fma_scaled(even, square, load(curve + k * STRIDE));
         odd = fma_scaled(odd, square, load(curve + (k + 1) * STRIDE));
     }
-    *value = fma_scaled(odd, s, even);
-    *slope = fma_scaled(fma_scaled(odd_rise, s, even_rise), 2.0 * s, odd);
+    lanes half = fma_scaled(odd_rise, 3.0 * s, even_rise);
+    half = fma_scaled(fma_scaled(odd_bend, s, even_bend), 4.0 * square, half);
+    return (curve_point){
+        fma_scaled(odd, s, even),
+        fma_scaled(fma_scaled(odd_rise, s, even_rise), 2.0 * s, odd),
+        add(half, half),
+    };
 }
 
-/* Bounds on |y''| and on |y|^2 in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its
-   derivatives bound those of y; they do not decrease. */
-static inline double bend(const double *curve, int p, double s, double *square) {
+/* A bound on |y''| in [0, s]. Entry by entry, the sum of |c_k| s^k bounds |y|, and its derivatives
+   bound those of y; they do not decrease. */
+static inline double bend(const double *curve, int p, double s) {
     lanes total = magnitude(load(curve + p * STRIDE)), slope = filled(0.0), half = slope;
     for (int k = p - 1; k >= 0; k--) {
         half = fma_scaled(half, s, slope);
         slope = fma_scaled(slope, s, total);
         total = fma_scaled(total, s, magnitude(load(curve + k * STRIDE)));
     }
-    *square = ROUNDED_UP * dot(total, total);
     return ROUNDED_UP * 2.0 * sqrt(dot(half, half));
 }
 

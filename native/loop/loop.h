@@ -66,6 +66,12 @@ static inline double image_norm(
     return noack_norm(rows, image);
 }
 
+/* process.c: a step of the machine of a loop, at a time of the loop; only plants and controllers
+   have ticks. */
+int64_t handle_message(
+    noack_process *process, int64_t loop, const noack_message *message, int64_t now_ns);
+int64_t do_tick(noack_process *process, int64_t loop, int64_t now_ns);
+
 /* plant.c: set the input of the system for a step: u + d, and w behind it. */
 void disturb(noack_plant *plant, int64_t step);
 

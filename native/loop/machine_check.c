@@ -103,15 +103,15 @@ static const char *check_plant(const noack_plant *plant) {
     return check_model(&plant->fallback, n);
 }
 
-static const char *check_rule(const noack_trigger_rule *rule) {
+const char *check_rule(const noack_trigger_rule *rule, int64_t most_ns) {
     const int64_t rows[] = {
         rule->up_rows, rule->down_rows, rule->gain_up_rows, rule->gain_down_rows};
     double *const matrices[] = {rule->up, rule->down, rule->gain_up, rule->gain_down};
     for (int k = 0; k < 4; k++)
         if (!is_between(0, rows[k], 4 * NOACK_MAX_ENTRIES) || (rows[k] > 0 && matrices[k] == NULL))
             return "a trigger rule has no matrix";
-    if (!is_between(0, rule->grid_ns, MOST_NS) || !is_between(-MOST_NS, rule->idle_ns, MOST_NS)
-        || !is_between(0, rule->shortest_ns, MOST_NS) || !is_between(0, rule->longest_ns, MOST_NS))
+    if (!is_between(0, rule->grid_ns, most_ns) || !is_between(-most_ns, rule->idle_ns, most_ns)
+        || !is_between(0, rule->shortest_ns, most_ns) || !is_between(0, rule->longest_ns, most_ns))
         return "a trigger rule has times out of range";
     return NULL;
 }
@@ -139,7 +139,7 @@ static const char *check_sensor(const noack_sensor *sensor) {
     const noack_machine *machine = &sensor->machine;
     const char *wrong;
     if ((wrong = check_model(&sensor->model, machine->n)) != NULL
-        || (wrong = check_rule(&sensor->rule)) != NULL
+        || (wrong = check_rule(&sensor->rule, MOST_NS)) != NULL
         || (wrong = check_observer(&sensor->observer, machine)) != NULL)
         return wrong;
     if (machine->period_ns != 0)

@@ -29,8 +29,7 @@ static int comes_first(const noack_process *process, int64_t one, int64_t other)
 static void lower(noack_process *process, int64_t place) {
     int64_t *heap = process->heap, count = process->heap_count;
     for (int64_t below; (below = 2 * place + 1) < count; place = below) {
-        if (below + 1 < count && comes_first(process, heap[below + 1], heap[below]))
-            below++;
+        below += below + 1 < count && comes_first(process, heap[below + 1], heap[below]);
         if (!comes_first(process, heap[below], heap[place]))
             return;
         int64_t loop = heap[place];
@@ -106,33 +105,38 @@ static int64_t conclude(noack_process *process, int64_t loop, int64_t question) 
     return NOACK_DONE;
 }
 
+int64_t handle_message(
+    noack_process *process, int64_t loop, const noack_message *message, int64_t now_ns) {
+    noack_output *output = &process->output;
+    if (process->role == NOACK_PLANT)
+        return noack_plant_handle(&process->plants[loop], message, now_ns, output);
+    if (process->role == NOACK_SENSOR)
+        return noack_sensor_handle(&process->sensors[loop], message, now_ns, output);
+    return noack_controller_handle(&process->controllers[loop], message, now_ns, output);
+}
+
+int64_t do_tick(noack_process *process, int64_t loop, int64_t now_ns) {
+    noack_output *output = &process->output;
+    if (process->role == NOACK_CONTROLLER)
+        return noack_controller_tick(&process->controllers[loop], now_ns, output);
+    noack_note *note = &process->notes[process->note_count];
+    return noack_plant_tick(&process->plants[loop], now_ns, output, note);
+}
+
 int64_t noack_process_handle(noack_process *process, const noack_message *message, int64_t now_ns) {
     int64_t loop = message->loop, acknowledges = message->flow == NOACK_ACKNOWLEDGEMENT;
     if (is_full(process, acknowledges ? NOACK_ACKNOWLEDGEMENTS : NOACK_MESSAGES))
         return NOACK_ROWS_FULL;
-    noack_output *output = &process->output;
     now_ns -= noack_process_machine(process, loop)->phase_ns;
-    int64_t question;
-    if (process->role == NOACK_PLANT)
-        question = noack_plant_handle(&process->plants[loop], message, now_ns, output);
-    else if (process->role == NOACK_SENSOR)
-        question = noack_sensor_handle(&process->sensors[loop], message, now_ns, output);
-    else
-        question = noack_controller_handle(&process->controllers[loop], message, now_ns, output);
-    return conclude(process, loop, question);
+    return conclude(process, loop, handle_message(process, loop, message, now_ns));
 }
 
 int64_t noack_process_tick(noack_process *process, int64_t now_ns) {
     if (is_full(process, NOACK_TICKS))
         return NOACK_ROWS_FULL;
-    int64_t loop = process->heap[0], question;
-    noack_output *output = &process->output;
+    int64_t loop = process->heap[0];
     now_ns -= noack_process_machine(process, loop)->phase_ns;
-    if (process->role == NOACK_PLANT)
-        question = noack_plant_tick(
-            &process->plants[loop], now_ns, output, &process->notes[process->note_count]);
-    else
-        question = noack_controller_tick(&process->controllers[loop], now_ns, output);
+    int64_t question = do_tick(process, loop, now_ns);
     if (question == NOACK_DONE)
         next_tick(process, loop);
     return conclude(process, loop, question);

@@ -14,6 +14,7 @@ enum {
     HOUSEKEEPING_NS = 500000, /* housekeeping in Python nearly always takes less time */
     SETTLE_NS = 200000,       /* between sending and housekeeping */
     MOST_PUT_OFF_NS = 10000000,
+    MOST_BACKLOG_NS = 50000000, /* for which datagrams that wait come before housekeeping */
     LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
     LOOP_HEADER_BYTES = 32,
     EPOLL_PWAIT2 = 441 /* on every architecture; libc has the function since glibc 2.35 */
@@ -298,22 +299,27 @@ static int64_t decide_batch(noack_relay *relay) {
     return NOACK_CARRY_ON;
 }
 
-/* How long to postpone housekeeping, which is due; 0: not at all. It must not make the next delayed
-   datagram late. It waits for a datagram, and for a moment after it: its receiver comes first, and
-   the next one is usually a period away. */
-static int64_t postponed_ns(noack_relay *relay, int64_t until_ns) {
+/* How long to postpone housekeeping, which is due; 0: not at all. Datagrams that wait come first,
+   as after a stall of this process. It must not make the next delayed datagram late. Else it waits
+   for a datagram, and for a moment after it: its receiver comes first, and the next one is usually
+   a period away. */
+static int64_t postponed_ns(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
     double speed = relay->clock.speed;
-    double left_ns = (double)MOST_PUT_OFF_NS * speed - (double)(relay->read_ns - until_ns);
+    if (own->due_since_ns == 0)
+        own->due_since_ns = relay->read_ns;
+    int64_t most_ns = own->has_more ? MOST_BACKLOG_NS : MOST_PUT_OFF_NS;
+    double left_ns = (double)most_ns * speed - (double)(relay->read_ns - own->due_since_ns);
     own->has_followed |= own->worked;
     if (left_ns <= 0)
         return 0;
     if (relay->heap_length > 0
         && (double)(relay->heap[0].release_ns - relay->read_ns) < (double)HOUSEKEEPING_NS * speed)
         return (int64_t)((double)HOUSEKEEPING_NS * speed);
-    if (own->is_busy || (own->has_followed && !own->worked))
+    if (!own->has_more && (own->is_busy || (own->has_followed && !own->worked)))
         return 0;
-    return (int64_t)(own->has_followed ? (double)SETTLE_NS * speed : left_ns) + 1;
+    int settles = own->has_followed && !own->has_more;
+    return (int64_t)(settles ? (double)SETTLE_NS * speed : left_ns) + 1;
 }
 
 /* Wait for a datagram or the next release time; return 0 if a signal interrupted it. */
@@ -355,9 +361,9 @@ static int wait_for_datagrams(noack_relay *relay, int64_t until_ns) {
 static int receive(noack_relay *relay, int64_t socket, int flags) {
     relay_scratch *own = scratch_of(relay);
     int64_t begin = own->batch_end, before_ns = relay->read_ns;
-    int fd = relay->sockets[socket].fd, taken;
+    int fd = relay->sockets[socket].fd, most = own->is_busy ? (int)(BUFFERS - begin) : 1, taken;
     if (own->is_busy) {
-        taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)(BUFFERS - begin), flags, NULL);
+        taken = recvmmsg(fd, &own->in_headers[begin], (unsigned)most, flags, NULL);
     } else {
         ssize_t size_bytes = recvmsg(fd, &own->in_headers[begin].msg_hdr, flags & MSG_DONTWAIT);
         own->in_headers[begin].msg_len = (unsigned)max_of(size_bytes, 0);
@@ -368,6 +374,7 @@ static int receive(noack_relay *relay, int64_t socket, int flags) {
     if (own->stamps)
         own->real_ns = clock_ns(CLOCK_REALTIME);
     own->is_busy = taken > 1 || relay->read_ns - before_ns < BUSY_NS;
+    own->has_more = own->is_busy && taken == most;
     if (taken > 0) {
         own->batch_socket = socket;
         own->batch_next = begin;
@@ -425,9 +432,10 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             relay->read_ns = sent_ns >= 0 ? sent_ns : run_time_ns(&relay->clock);
             int64_t wait_until_ns = until_ns;
             if (relay->read_ns >= until_ns) {
-                int64_t more_ns = postponed_ns(relay, until_ns);
+                int64_t more_ns = postponed_ns(relay);
                 if (more_ns == 0) {
-                    own->ready_count = own->ready_next = own->has_followed = 0;
+                    own->ready_count = own->ready_next = 0;
+                    own->has_followed = own->due_since_ns = 0;
                     return NOACK_HOUSEKEEPING;
                 }
                 wait_until_ns = relay->read_ns + more_ns;
@@ -435,7 +443,7 @@ int64_t noack_relay_run(noack_relay *relay, int64_t until_ns) {
             own->worked = 0;
             int in_receive = receiving_waits(relay, wait_until_ns);
             if (!(in_receive ? wait_and_receive(relay) : wait_for_datagrams(relay, wait_until_ns)))
-                return NOACK_HOUSEKEEPING;
+                return NOACK_INTERRUPTED;
         }
         if (own->ready_next < own->ready_count)
             receive_ready(relay);

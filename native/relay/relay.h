@@ -63,6 +63,8 @@ typedef struct {
     int64_t worked;        /* 1: it has sent datagrams since it last waited */
     int64_t has_followed;  /* 1: it has sent datagrams since housekeeping has been due */
     int64_t is_busy;       /* 1: the next datagrams may come together */
+    int64_t has_more;      /* 1: as many as could be received were; others may wait */
+    int64_t due_since_ns;  /* since when housekeeping has been due; 0: it is not */
     uint64_t loaded;       /* a sum of what was loaded into the caches, so that it is loaded */
     uint8_t buffers[BUFFERS][BUFFER_STRIDE];
 } relay_scratch;

@@ -126,26 +126,31 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
     A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
     n, m = B_model.shape
     is_linear, found = scenario.coverage.is_linear, list[Scenario]()
+    is_drawn = plant.initial_state_halfwidth is not None or plant.draw in ("uniform", "vertex")
+    own_plant = plant
     for loop in loops:
-        x0, A, B = np.array(plant.initial_state), A_model, B_model
-        if plant.initial_state_halfwidth is not None:
-            halfwidth = np.array(plant.initial_state_halfwidth)
-            x0 += halfwidth * stream(loop.seeds.initial_state, "initial_state").uniform(-1, 1, n)
-        if plant.draw == "given":
-            A, B = np.array(plant.A), np.array(plant.B)
-        elif plant.draw in ("uniform", "vertex"):
-            rng = stream(loop.seeds.plant, "plant")
-            A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
-            B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
-        _require_finite("plant", A, B, period_ns)
-        drawn: dict[str, object] = {
-            "initial_state": tuple(x0.tolist()),
-            "initial_state_halfwidth": None,
-        }
-        if is_linear:
-            drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
+        if is_drawn or not found:
+            x0, A, B = np.array(plant.initial_state), A_model, B_model
+            if plant.initial_state_halfwidth is not None:
+                halfwidth = np.array(plant.initial_state_halfwidth)
+                rng = stream(loop.seeds.initial_state, "initial_state")
+                x0 += halfwidth * rng.uniform(-1, 1, n)
+            if plant.draw == "given":
+                A, B = np.array(plant.A), np.array(plant.B)
+            elif plant.draw in ("uniform", "vertex"):
+                rng = stream(loop.seeds.plant, "plant")
+                A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
+                B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
+            _require_finite("plant", A, B, period_ns)
+            drawn: dict[str, object] = {
+                "initial_state": tuple(x0.tolist()),
+                "initial_state_halfwidth": None,
+            }
+            if is_linear:
+                drawn |= {"draw": "given", "A": rows_of(A), "B": rows_of(B)}
+            own_plant = plant.model_copy(update=drawn)
         found.append(loop.model_copy(update={
-            "model": model, "plant": plant.model_copy(update=drawn), "observer": None,
+            "model": model, "plant": own_plant, "observer": None,
         }))  # fmt: skip
     if scenario.mode == "model":
         H = A_model + B_model @ K

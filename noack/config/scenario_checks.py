@@ -56,6 +56,8 @@ def check_sections(scenario: ScenarioTables) -> None:
         raise ValueError(
             f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
         )
+    if timing.measurement_period_ns > 10**9 * NS_PER_S:
+        raise ValueError("plant.measure_every: more than 1e9 s between two measurements")
     _check_plant(scenario)
     m = scenario.model.dimensions[1]
     require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
@@ -70,12 +72,11 @@ def check_kept_loss(scenario: ScenarioTables) -> None:
     """Raise ValueError if a loss rate cannot be kept; with a trace, as soon as it has been read."""
     network = scenario.network
     for key, section in network.directions.items():
-        link = section.link
-        losses = [getattr(one, "loss", None) for one in link.impairments]
+        losses = [getattr(one, "loss", None) for one in section.link.impairments]
         if any(isinstance(one, TraceLoss) for one in losses):
             continue
         try:
-            with_kept_loss(link)
+            with_kept_loss(section.link)
         except ValueError as error:
             raise ValueError(f"{key}.loss: {error}") from None
 

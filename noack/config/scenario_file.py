@@ -142,7 +142,7 @@ def _path(name: str, folder: Path, named: str) -> Path:
     """Return the path of a file, or of the shipped scenario of that name."""
     shipped = {file.stem: file for file in shipped_folder("scenarios").glob("*.toml")}
     with suppress(OSError, ValueError):  # too long, or with a zero byte
-        if (path := folder / name).exists():
+        if name and (path := folder / name).exists():
             return path
     if name in shipped:
         return shipped[name]

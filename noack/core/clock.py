@@ -120,8 +120,7 @@ class ClockOffset:
     def add(self, exchange: Exchange) -> Restart | None:
         """Take account of an exchange; exchanges may be added in any order.
 
-        Raises:
-            ValueError: a reply was sent or received before its request.
+        Raise ValueError if a reply was sent or received before its request.
         """
         sent_ns, reference_received_ns, reference_sent_ns, received_ns = exchange
         if received_ns < sent_ns or reference_sent_ns < reference_received_ns:
@@ -151,8 +150,7 @@ class ClockOffset:
     def interval(self, now_ns: int) -> OffsetInterval | None:
         """Return the interval at a reading of the own clock; None without an exchange.
 
-        Raises:
-            ValueError: the newest exchange is from after ``now_ns``.
+        Raise ValueError if the newest exchange is from after ``now_ns``.
         """
         limits = self._limits
         if limits is None:
@@ -192,11 +190,8 @@ class SlewedClock:
 
     The applied offset begins at the estimate and then moves towards each new estimate at
     ``slew_ppb`` parts per 10⁹ of the own time, at most. Calls have readings of the own clock that
-    do not decrease.
-
-    Raises:
-        ValueError: there is no estimate at ``own_ns``, or the slew rate is not above the rate at
-            which the offset may change, so that the clock could not follow it.
+    do not decrease. Raise ValueError if there is no estimate at ``own_ns``, or the slew rate is not
+    above the rate at which the offset may change, so that the clock could not follow it.
     """
 
     def __init__(self, offset: ClockOffset, own_ns: int, slew_ppb: int = SLEW_PPB) -> None:

@@ -25,8 +25,7 @@ except ImportError:
 def load_core(path: Path) -> Any:
     """Return the functions and constants of native/noack.h in a library.
 
-    Raises:
-        CallerError: there is no library that goes with the declarations.
+    Raise CallerError if there is no library that goes with the declarations.
     """
     try:
         library = ffi.dlopen(str(path))

@@ -117,7 +117,9 @@ class CoreMemory:
         steps_ns, matrices = np.zeros(places, np.int64), np.zeros(places * n * n)
         scratch = np.zeros(SCRATCH_MATRICES * n * n + 3 * n)
         made.H, made.steps_ns = pointer_to(H, "double *"), pointer_to(steps_ns, "int64_t *")
-        made.matrices, made.scratch = (pointer_to(one, "double *") for one in (matrices, scratch))
+        made.matrices, made.scratch = (
+            pointer_to(array, "double *") for array in (matrices, scratch)
+        )
         self._shared += [H, steps_ns, matrices, scratch]
         return made
 

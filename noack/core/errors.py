@@ -79,7 +79,7 @@ def did_you_mean(name: str, files: Iterable[str]) -> str:
     """
     from difflib import get_close_matches
 
-    by_stem = {Path(one).stem: one for one in files}
+    by_stem = {Path(file).stem: file for file in files}
     close = get_close_matches(Path(name).stem, by_stem, n=1)
     return f"did you mean {by_stem[close[0]]}?" if close else ""
 
@@ -89,5 +89,6 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(
-        one if one.isprintable() else one.encode("unicode_escape").decode() for one in text
+        character if character.isprintable() else character.encode("unicode_escape").decode()
+        for character in text
     )

@@ -49,11 +49,9 @@ def new_file(path: Path, *, make_folder: bool = True, mode: int = 0o666) -> Iter
 
     Until then it has a random name in the same folder, where another user of the folder cannot have
     put a link. An existing file, or a link, is replaced. Missing folders are created with
-    ``make_folder``. The umask applies to ``mode``.
-
-    Raises:
-        OSError, ValueError: it cannot be written, or the path is that of a folder, a FIFO or a
-            device, which would be replaced too; or its folder is a link of another user.
+    ``make_folder``. The umask applies to ``mode``. Raise OSError or ValueError if it cannot be
+    written, or the path is that of a folder, a FIFO or a device, which would be replaced too; or
+    its folder is a link of another user.
     """
     if path.exists() and not path.is_file():
         raise OSError(_NOT_REGULAR)
@@ -76,11 +74,9 @@ def open_growing(path: Path, *, follow: bool = False) -> int:
 
     A file of the user's own is overwritten. A link, another user's file, and a file with several
     names is replaced. With ``follow``, a FIFO, a device or a link that is the user's own or root's
-    (``/dev/stdout``) is opened as it is.
-
-    Raises:
-        OSError, ValueError: it cannot be written, or is a folder, or a FIFO or a device without
-            ``follow``, or another user's; or its folder is a link of another user.
+    (``/dev/stdout``) is opened as it is. Raise OSError or ValueError if it cannot be written, or is
+    a folder, or a FIFO or a device without ``follow``, or another user's; or its folder is a link
+    of another user.
     """
     flags = os.O_WRONLY | os.O_CLOEXEC
     with suppress(FileNotFoundError):

@@ -11,7 +11,7 @@ bounds, which are enlarged by more than the rounding.
 """
 
 from bisect import bisect_right
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -77,16 +77,26 @@ def discretise(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
     return np.ascontiguousarray(both[:n, :n]), np.ascontiguousarray(both[:n, n:])
 
 
+@lru_cache(maxsize=_CACHED_STEPS)
+def _transition(generator: MatrixKey, dt_ns: int) -> Matrix:
+    return transition(matrix_of(generator), dt_ns)
+
+
 class Propagator:
     """Advances states of the autonomous system ``dz/dt = G z`` exactly; G is (n, n), per second.
 
-    Transition matrices are cached by step; a loop on a time grid has few distinct steps.
+    Transition matrices are cached by generator and step; a loop on a time grid has few distinct
+    steps, and loops of one run may have equal models.
     """
 
     def __init__(self, generator: Matrix) -> None:
         self.generator = np.array(generator, dtype=np.float64)
         self._static = not self.generator.any()
-        self.transition = lru_cache(_CACHED_STEPS)(partial(transition, self.generator))
+        self._key = matrix_key(self.generator)
+
+    def transition(self, dt_ns: int) -> Matrix:
+        """Return e^{G dt}, (n, n)."""
+        return _transition(self._key, dt_ns)
 
     def __call__(self, state: Vector, dt_ns: int) -> Vector:
         """Return e^{G dt} ``state``, shape (n,)."""
@@ -178,12 +188,12 @@ class ModelFlow:
         """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
         if not self.moved:
             return self.propagate(x, to_ns - from_ns)
-        place = bisect_right(self._since_ns, from_ns)
-        while place < len(self._since_ns) and self._since_ns[place] < to_ns:
-            x = self._about(self._setpoints[place], x, self._since_ns[place] - from_ns)
-            from_ns = self._since_ns[place]
-            place += 1
-        return self._about(self._setpoints[place], x, to_ns - from_ns)
+        index = bisect_right(self._since_ns, from_ns)
+        while index < len(self._since_ns) and self._since_ns[index] < to_ns:
+            x = self._about(self._setpoints[index], x, self._since_ns[index] - from_ns)
+            from_ns = self._since_ns[index]
+            index += 1
+        return self._about(self._setpoints[index], x, to_ns - from_ns)
 
     def _about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
         if setpoint is None or dt_ns == 0:
@@ -199,16 +209,20 @@ def _same(one: Vector | None, other: Vector | None) -> bool:
 
 
 def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
-    """Return X with M X + X Mᵀ = Q, (n, n).
+    """Return X with M X + X Mᵀ = Q, for matrices or stacks of them, (…, n, n).
 
     Raises:
-        numpy.linalg.LinAlgError: there is no unique solution.
+        numpy.linalg.LinAlgError: one of them has no unique solution.
     """
-    n = len(M)
+    *lead, n, _ = M.shape
     if n > _MOST_STATES:
         from scipy.linalg import solve_continuous_lyapunov
 
+        if lead:
+            return np.array([solve_lyapunov(matrix, Q) for matrix in M])
         return np.asarray(solve_continuous_lyapunov(M, Q))
-    one = np.eye(n)
-    equations = np.kron(M, one) + np.kron(one, M)
-    return np.asarray(np.linalg.solve(equations, Q.ravel()).reshape(n, n))
+    identity = np.eye(n)
+    left = M[..., :, None, :, None] * identity[:, None, :]
+    right = identity[:, None, :, None] * M[..., None, :, None, :]
+    equations = (left + right).reshape(*lead, n * n, n * n)
+    return np.asarray(np.linalg.solve(equations, Q.reshape(n * n, 1)).reshape(M.shape))

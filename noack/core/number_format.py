@@ -113,4 +113,4 @@ def as_html(rows: Rows) -> str:
 
 def _width(text: str) -> int:
     """Return the width of a text in columns; a combining character, as in δ̲, has width 0."""
-    return sum(not unicodedata.combining(one) for one in text)
+    return sum(not unicodedata.combining(character) for character in text)

@@ -20,10 +20,8 @@ _OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't star
 def require_limits() -> None:
     """Check the limits before a run; raise the limit of open files if that is permitted.
 
-    Libraries abort, print stack traces or wait for ever when they reach a limit.
-
-    Raises:
-        MachineError: a limit is too low.
+    Libraries abort, print stack traces or wait for ever when they reach a limit. Raise MachineError
+    if a limit is too low.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if _is_less(soft, _FILES):
@@ -49,7 +47,7 @@ def exhausted_limit(error: BaseException) -> str | None:
         return f"too many open files: at most {soft} are permitted; see `ulimit -n`"
     text = one_line(error)
     known = isinstance(error, ImportError | RuntimeError)
-    known = known and any(one in text.lower() for one in _OUT_OF_MEMORY)
+    known = known and any(phrase in text.lower() for phrase in _OUT_OF_MEMORY)
     if not (known or isinstance(error, MemoryError) or number == errno.ENOMEM):
         return None
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)

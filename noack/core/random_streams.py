@@ -5,7 +5,9 @@ not depend on the random numbers of the plant, the timing or other links.
 """
 
 import hashlib
+import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +120,9 @@ def _sequence(seed: int, name: tuple[str, ...]) -> "np.random.SeedSequence":
     return np.random.SeedSequence(seed, spawn_key=_words(name))
 
 
-def _words(name: tuple[str, ...]) -> list[int]:
+@lru_cache(4096)
+def _words(name: tuple[str, ...]) -> tuple[int, ...]:
     if not name:
         raise ValueError("a random stream needs a name")
     digest = hashlib.blake2b("\0".join(name).encode(), digest_size=16).digest()
-    words: list[int] = np.frombuffer(digest, dtype="<u4").tolist()
-    return words
+    return struct.unpack("<4I", digest)

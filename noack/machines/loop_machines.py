@@ -13,7 +13,7 @@ what a loop's own row lacks is missing in them (:func:`row_layout`).
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -29,6 +29,8 @@ from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow, Message
 
 Rows = NDArray[np.void]
+NewRows = Callable[[int, "np.dtype[np.void]"], Rows]
+"""Returns memory for a number of rows of a type."""
 _ROWS, _ROWS_OF_A_LOOP, _MOST_ROWS = 1024, 256, 16_384
 _NOTES = 256
 NEVER_NS = 2**63 - 1
@@ -186,9 +188,12 @@ class LoopMachines:
         self.core: Any = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(alike or range(len(self.parts)))
+        self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
+        """Loops of which every message may matter."""
         self._message = ffi.new("noack_message *")
         self._notes = np.zeros(_NOTES, dtype_of("noack_note"))
         self._tables: dict[int, Rows] = {}
+        self._new_rows: NewRows = np.empty
         most = min(_ROWS_OF_A_LOOP * len(self.parts), _MOST_ROWS)
         self._fill_tables(rows or max(_ROWS, most))
         wrong = core.noack_process_check(self.core)
@@ -214,7 +219,8 @@ class LoopMachines:
             if others:
                 self._memory.copy(machines, first, others, mark)
             for number in others:
-                self.parts[number].redraw(machines[number], self._memory)
+                if self.parts[number] is not self.parts[first]:
+                    self.parts[number].redraw(machines[number], self._memory)
         for structure, phase_ns in zip(machines, self.phases_ns, strict=True):
             structure.machine.phase_ns = phase_ns
 
@@ -226,10 +232,9 @@ class LoopMachines:
         for number, name in enumerate(self.role.tables):
             if name is None or name not in types:
                 continue
-            self._tables[number] = np.zeros(rows, types[name])
             table = self.core.tables[number]
             table.row_bytes, table.places = types[name].itemsize, rows
-            table.rows = pointer_to(self._tables[number], "uint8_t *")
+            self._renew_table(number, np.empty(rows, types[name]))
             if len(set(shapes)) > 1:
                 table.layouts = self._layouts(name, types[name], shapes)
 
@@ -243,6 +248,16 @@ class LoopMachines:
 
         return self._memory.keep(ffi.new("int64_t *[]", [layout(shape) for shape in shapes]))
 
+    def take_rows_from(self, new_rows: NewRows) -> None:
+        """Let ``new_rows`` provide the memory of the rows, from before the first step on."""
+        self._new_rows = new_rows
+        for number, rows in self._tables.items():
+            self._renew_table(number, new_rows(len(rows), rows.dtype))
+
+    def _renew_table(self, number: int, rows: Rows) -> None:
+        self._tables[number] = rows
+        self.core.tables[number].rows = pointer_to(rows, "uint8_t *")
+
     def next_deadline_ns(self) -> int | None:
         """The earliest tick of all loops, in the run's time."""
         due_ns = int(core.noack_process_due_ns(self.core))
@@ -252,11 +267,13 @@ class LoopMachines:
         """Do what a step needs before it goes on."""
         loop = self.core.asking
         self._keep_notices(loop, self.parts[loop].answer(question, self.machines[loop]))
+        self._note_counting(loop)
 
     def take_rows(self, *, last: bool = False) -> list[tuple[str, Rows]]:
         """Return the rows since the last call, by table, and empty the core's tables.
 
-        ``last``: the machines make no more steps.
+        ``last``: the machines make no step before the caller has used the rows, which the next step
+        overwrites.
         """
         taken: list[tuple[str, Rows]] = []
         for number, rows in self._tables.items():
@@ -266,8 +283,7 @@ class LoopMachines:
                 if not last and 2 * len(found) < len(rows):
                     found = found.copy()
                 elif not last:
-                    self._tables[number] = np.empty(len(rows), rows.dtype)
-                    table.rows = pointer_to(self._tables[number], "uint8_t *")
+                    self._renew_table(number, self._new_rows(len(rows), rows.dtype))
                 name = self.role.tables[number]
                 assert name is not None
                 taken.append((name, found))
@@ -308,6 +324,7 @@ class LoopMachines:
             machine.inputs += 1
             machine.change_ns = next_change_ns(schedule)
             outputs += [_with_loop(loop, output) for output in announced]
+            self._note_counting(loop)
         return outputs
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
@@ -358,15 +375,24 @@ class LoopMachines:
 
     def _inspect(self, rows: Rows) -> None:
         notable = self._notable(rows)
+        if not len(notable):
+            return
         for own in np.split(notable, np.flatnonzero(np.diff(notable[LOOP])) + 1):
-            if len(own):
-                loop = int(own[LOOP][0])
-                self._keep_notices(loop, self.parts[loop].inspect(own))
+            loop = int(own[LOOP][0])
+            self._keep_notices(loop, self.parts[loop].inspect(own))
+            self._note_counting(loop)
+
+    def _note_counting(self, loop: int) -> None:
+        if self.parts[loop].counts_every_message:
+            self._counting.add(loop)
+        else:
+            self._counting.discard(loop)
 
     def _notable(self, rows: Rows) -> Rows:
         """Return the rows that a part may have to say something about."""
-        always = [loop for loop, part in enumerate(self.parts) if part.counts_every_message]
-        notable = np.isin(rows[LOOP], always)
+        notable = np.zeros(len(rows), np.bool_)
+        if self._counting:
+            notable |= np.isin(rows[LOOP], sorted(self._counting))
         if "dropouts" in (rows.dtype.names or ()):
             notable |= rows["dropouts"] > 0
         return rows[notable]
@@ -391,7 +417,12 @@ def message_of(given: Any) -> Message:
 
 def row_types(shapes: Iterable[RecordShape]) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of the tables of loops; a row begins with the number of its loop."""
-    types = tables(**asdict(largest(shapes)))
+    return _row_types(largest(set(shapes)))
+
+
+@lru_cache
+def _row_types(shape: RecordShape) -> Mapping[str, np.dtype[np.void]]:
+    types = tables(**asdict(shape))
     return {name: np.dtype([(LOOP, "<u2"), *kind.descr]) for name, kind in types.items()}
 
 

@@ -20,10 +20,8 @@ _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9
 def parse_address(text: str, what: str, like: Address | None = None) -> Address:
     """Parse an address such as ``127.0.0.1:9000``, ``[::1]:9000``, ``localhost:9000`` or ``:9000``.
 
-    Without a host it is the loopback, of the address family of ``like`` (by default IPv4).
-
-    Raises:
-        CallerError: it has another form, or the host does not exist; ``what`` names the setting.
+    Without a host it is the loopback, of the address family of ``like`` (by default IPv4). Raise
+    CallerError if it has another form, or the host does not exist; ``what`` names the setting.
     """
     found = _FORM.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:

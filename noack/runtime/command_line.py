@@ -33,15 +33,11 @@ TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 """Environment variable of a launched process: its first line of input is its ticket."""
 _ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
 _ENDING = {
-    signal.SIGINT.value: ExitStatus.INTERRUPTED,
-    signal.SIGTERM.value: ExitStatus.TERMINATED,
-    signal.SIGHUP.value: ExitStatus.TERMINATED,
+    signal.SIGINT.value: (ExitStatus.INTERRUPTED, "stopped by the user"),
+    signal.SIGTERM.value: (ExitStatus.TERMINATED, "stopped on request"),
+    signal.SIGHUP.value: (ExitStatus.TERMINATED, "stopped because the terminal was closed"),
 }
-_REASONS = {
-    signal.SIGINT.value: "stopped by the user",
-    signal.SIGTERM.value: "stopped on request",
-    signal.SIGHUP.value: "stopped because the terminal was closed",
-}
+"""Exit status and reason after a signal."""
 
 
 class LogFormat(StrEnum):
@@ -54,8 +50,7 @@ class LogFormat(StrEnum):
 class JsonLog(io.TextIOBase):
     """A text stream that writes a JSON object for each line to another stream.
 
-    Raises:
-        OSError: the other stream cannot be written.
+    Raise OSError if the other stream cannot be written.
     """
 
     encoding = "utf-8"
@@ -196,12 +191,12 @@ class Signals:
     @property
     def status(self) -> ExitStatus:
         """Exit status for the received signal, or OK."""
-        return _ENDING.get(self.received or 0, ExitStatus.OK)
+        return ExitStatus.OK if self.received is None else _ENDING[self.received][0]
 
 
 def stop_reason(number: int) -> str:
     """Return why a program stops after a signal, with the signal's name."""
-    return f"{_REASONS[number]} ({signal.Signals(number).name})"
+    return f"{_ENDING[number][1]} ({signal.Signals(number).name})"
 
 
 class StopRequestError(KeyboardInterrupt):
@@ -209,7 +204,7 @@ class StopRequestError(KeyboardInterrupt):
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__(stop_reason(number))
-        self.exit_status = _ENDING[number]
+        self.exit_status, _ = _ENDING[number]
 
 
 @contextmanager
@@ -241,7 +236,7 @@ def stoppable_imports() -> Iterator[None]:
 def _end_at_once(number: int, _frame: FrameType | None) -> None:
     with suppress(OSError):  # standard error may be closed or full
         os.write(2, f"noack: {stop_reason(number)}\n".encode())
-    os._exit(_ENDING[number])
+    os._exit(_ENDING[number][0])
 
 
 @contextmanager

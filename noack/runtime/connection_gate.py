@@ -150,8 +150,8 @@ class _Gate:
         loop.run_forever()
         self._ending = True
         loop.remove_reader(self._descriptor)
-        for one in list(self._waiting.values()):
-            self._end(one)
+        for waiting in list(self._waiting.values()):
+            self._end(waiting)
         left = asyncio.all_tasks(loop)
         if left and self._linger_s:
             loop.run_until_complete(asyncio.wait(left, timeout=self._linger_s))
@@ -177,10 +177,10 @@ class _Gate:
             if self._first is None:
                 self._serve(connection, b"", host)
                 continue
-            one = _Waiting(connection, source, host, self._loop.time() + self._first.within_s)
-            self._waiting[connection.fileno()] = one
-            if not self._advance(one, self._first):
-                self._loop.add_reader(connection.fileno(), self._advance, one, self._first)
+            waiting = _Waiting(connection, source, host, self._loop.time() + self._first.within_s)
+            self._waiting[connection.fileno()] = waiting
+            if not self._advance(waiting, self._first):
+                self._loop.add_reader(connection.fileno(), self._advance, waiting, self._first)
             if len(self._waiting) > _MOST_WAITING:
                 self._make_room()
 
@@ -188,63 +188,63 @@ class _Gate:
         if not self._ending:
             self._loop.add_reader(self._descriptor, self._accept)
 
-    def _advance(self, one: _Waiting, first: FirstBytes) -> bool:
+    def _advance(self, waiting: _Waiting, first: FirstBytes) -> bool:
         """Read what has arrived; return whether the connection waits no longer."""
         try:
-            data = one.connection.recv(first.most - len(one.data), socket.MSG_DONTWAIT)
+            data = waiting.connection.recv(first.most - len(waiting.data), socket.MSG_DONTWAIT)
         except BlockingIOError:
             return False
         except OSError:
             data = b""
         if not data:
-            self._end(one)
+            self._end(waiting)
             return True
-        one.data += data
-        served = first.judge(one.data, one.source)
-        if served is None and len(one.data) < first.most:
+        waiting.data += data
+        served = first.judge(waiting.data, waiting.source)
+        if served is None and len(waiting.data) < first.most:
             return False
         if served:
-            self._forget(one)
-            self._serve(one.connection, one.data, one.host)
+            self._forget(waiting)
+            self._serve(waiting.connection, waiting.data, waiting.host)
         else:
-            self._end(one, first.refused)
+            self._end(waiting, first.refused)
         return True
 
     def _make_room(self) -> None:
         """End the oldest connections without progress, of the hosts that have the most."""
         newer: Counter[str] = Counter()
         order: list[tuple[int, int, _Waiting]] = []
-        for age, one in enumerate(reversed(self._waiting.values())):
-            order.append((newer[one.host], age, one))
-            newer[one.host] += 1
+        for age, waiting in enumerate(reversed(self._waiting.values())):
+            order.append((newer[waiting.host], age, waiting))
+            newer[waiting.host] += 1
         order.sort(key=lambda entry: entry[:2], reverse=True)
-        for _, _, one in order[:_ROOM]:
-            if self._first is not None and not self._advance(one, self._first):
-                self._end(one, self._first.no_room)
+        for _, _, waiting in order[:_ROOM]:
+            if self._first is not None and not self._advance(waiting, self._first):
+                self._end(waiting, self._first.no_room)
 
     def _check(self) -> None:
         """End the connections that are too late, and report how many were not served."""
         assert self._first is not None
         now_s = self._loop.time()
-        for one in list(self._waiting.values()):
-            if one.until_s > now_s:
+        for waiting in list(self._waiting.values()):
+            if waiting.until_s > now_s:
                 break
-            self._end(one)
+            self._end(waiting)
         count, self._unserved = self._unserved, Counter()
         self._first.unserved(count)
         self._loop.call_later(_CHECK_S, self._check)
 
-    def _end(self, one: _Waiting, answer: bytes = b"") -> None:
+    def _end(self, waiting: _Waiting, answer: bytes = b"") -> None:
         """Close a connection that is not served."""
-        self._unserved[one.host] += 1
-        self._forget(one)
+        self._unserved[waiting.host] += 1
+        self._forget(waiting)
         with suppress(OSError):
-            one.connection.send(answer, socket.MSG_DONTWAIT)
-        one.connection.close()
+            waiting.connection.send(answer, socket.MSG_DONTWAIT)
+        waiting.connection.close()
 
-    def _forget(self, one: _Waiting) -> None:
-        self._loop.remove_reader(one.connection.fileno())
-        del self._waiting[one.connection.fileno()]
+    def _forget(self, waiting: _Waiting) -> None:
+        self._loop.remove_reader(waiting.connection.fileno())
+        del self._waiting[waiting.connection.fileno()]
 
     def _serve(self, connection: socket.socket, data: bytes, host: str) -> None:
         connection.setblocking(False)

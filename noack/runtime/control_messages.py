@@ -16,7 +16,9 @@ from pydantic import (
     JsonValue,
     ValidationError,
 )
+from pydantic_core import to_json
 
+from noack.config.parameter_changes import ParameterChange
 from noack.config.toml_file import brief
 from noack.core.errors import PeerError
 
@@ -30,6 +32,10 @@ class ControlMessage(BaseModel):
     """A message; further fields are allowed."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="allow", defer_build=True)
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields that were given, also further ones, for JSON."""
+        return self.model_dump(exclude_unset=True)
 
 
 def _require_number(host: str) -> str:
@@ -79,6 +85,11 @@ class ChangeAnnouncement(ControlMessage):
     kept_losses: dict[str, FiniteFloat] = {}
     """Probabilities for :func:`noack.impairments.loss_prediction.remember`."""
 
+    @property
+    def change(self) -> ParameterChange:
+        """The change."""
+        return ParameterChange(self.number, self.t_ns, self.settings)
+
 
 class ChangeRequest(ControlMessage):
     """A user requests a change of runtime parameters; without settings, their values."""
@@ -96,6 +107,10 @@ class ChangeReply(ControlMessage):
     """Simulated time from which the change applies; None if none was requested."""
     runtime_parameters: dict[str, JsonValue]
     """Values by scenario key, all announced changes included."""
+    loops: dict[str, dict[str, JsonValue]]
+    """The same for the loops of each entry of [[loops]], by its name."""
+    changed_loops: tuple[str, ...]
+    """The entries with another value than before the request."""
 
 
 class RunStart(ControlMessage):
@@ -158,7 +173,7 @@ class ProcessReport(ControlMessage):
 
 
 class RunProgress(ControlMessage):
-    """The recorder's progress report during the run."""
+    """The recorder's progress report during the run: of all loops together; ‖x‖ is the largest."""
 
     t_s: FiniteFloat
     events: Count
@@ -166,19 +181,24 @@ class RunProgress(ControlMessage):
     longest_loss_burst: Count
     x_norm: float | None
     live: str | None
-    warnings: list[str] = []
+    warnings: list[str] = Field([])
     """Which claims are void so far, and why; which loops diverge; what cannot be checked or shown
     during the run."""
-    changes: list[str] = []  # changes of runtime parameters during the run
+    changes: list[str] = Field([])  # changes of runtime parameters during the run
 
 
 M = TypeVar("M", bound=ControlMessage)
 
 
-def parse_message(kind: type[M], payload: bytes | str) -> dict[str, Any]:
-    """Return the fields of a message; raise PeerError if the payload is not one of this kind."""
+def message_json(content: object) -> bytes:
+    """Return a message, or fields of one, as JSON."""
+    return to_json(content, inf_nan_mode="constants")
+
+
+def parse_message(kind: type[M], payload: bytes | str) -> M:
+    """Return a message; raise PeerError if the payload is not one of this kind."""
     try:
-        return kind.model_validate_json(payload).model_dump(exclude_unset=True)
+        return kind.model_validate_json(payload)
     except ValidationError as error:
         name = re.sub("(?<=[a-z])(?=[A-Z])", " ", kind.__name__).strip("_").lower()
         raise PeerError(f"not a valid {name}: {brief(error)}") from None

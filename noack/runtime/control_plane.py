@@ -11,7 +11,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
@@ -20,13 +20,12 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.address import text_of
-from noack.runtime.control_messages import ChangeAnnouncement, parse_message
+from noack.runtime.control_messages import ChangeAnnouncement, message_json, parse_message
 from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
@@ -44,8 +43,6 @@ _POLL_S = 0.01
 """Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
 RUNS = "runs"
 """Folder of the active runs in the user's runtime directory: sockets, lock files."""
-
-
 _FIRST_POLL_S, _POLL_SHARE = 0.001, 0.05
 """Time between two looks for a reply: at first, and as a share of the time waited so far."""
 
@@ -56,39 +53,30 @@ def open_session(kind: str, name: str, *, listen: bool) -> zenoh.Session:
     The socket is ``NAME.sock`` in the folder ``kind`` of the user's runtime directory. Raise
     zenoh.ZError if that fails, CallerError if other users have access to the folder.
     """
-    return zenoh.open(session_config(endpoint_of(kind, name), listen=listen))
+    return zenoh.open(session_config(socket_path(kind, name), listen=listen))
 
 
 @contextmanager
 def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Session]:
     """Give a session with a coordinator on another host, in a run with this key.
 
-    Raises:
-        NoAnswerError: that fails.
-        MachineError: the link to the coordinator cannot be started.
-        CallerError: other users have access to the user's runtime directory.
+    Raise NoAnswerError if that fails, MachineError if the link to the coordinator cannot be
+    started, CallerError if other users have access to the user's runtime directory.
     """
     # Processes on the coordinator's host need neither TLS nor asyncio.
     from noack.runtime.coordinator_link import Destination, coordinator_link
 
-    destination = Destination(
-        remote.host, remote.port, remote.authority, remote.certificate, remote.private_key,
-        key.hex(),
-    )  # fmt: skip
+    own = remote.coordinator, remote.certificate, remote.private_key
+    destination = Destination(remote.host, remote.port, *own, key.hex())
     address = text_of((remote.host, remote.port))
     with ExitStack() as stack:
         try:
             path = stack.enter_context(coordinator_link(destination))
-            session = zenoh.open(session_config(f"unixsock-stream/{path}", listen=False))
+            session = zenoh.open(session_config(path, listen=False))
         except (NoAnswerError, zenoh.ZError) as error:
             reason = error if isinstance(error, NoAnswerError) else cause_of(error)
             raise NoAnswerError(f"cannot reach the run at {address}: {reason}") from None
         yield session
-
-
-def endpoint_of(kind: str, name: str) -> str:
-    """Return the zenoh endpoint of a socket, in the words of this process."""
-    return f"unixsock-stream/{socket_path(kind, name)}"
 
 
 def socket_path(kind: str, name: str) -> str:
@@ -103,18 +91,13 @@ def socket_path(kind: str, name: str) -> str:
     return f"/proc/self/fd/{known}/{name}.sock"
 
 
-def session_config(
-    endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
-) -> zenoh.Config:
-    """Return the zenoh configuration of a listening or of a connecting session.
-
-    ``more`` has further zenoh settings by key.
-    """
+def session_config(path: str, *, listen: bool) -> zenoh.Config:
+    """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
-        f"{side}/endpoints": [endpoint],
+        f"{side}/endpoints": [f"unixsock-stream/{path}"],
         f"{other}/endpoints": [],
         f"{side}/exit_on_failure": True,
         f"{side}/timeout_ms": _CONNECT_MS,
@@ -131,12 +114,14 @@ def session_config(
         # A batch without room is dropped at once: the loop must not wait.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
-    for key, value in (settings | dict(more or {})).items():
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
+def answer_to(
+    session: zenoh.Session, key: str, question: str | bytes, timeout_s: float
+) -> str | None:
     """Send a request to the listening session and return its answer; None without one in time.
 
     Raise CallerError if the request was refused as wrong.
@@ -205,11 +190,9 @@ def run_name(run_id: int) -> str:
 class ControlPlane:
     """The connection of a process (``role``) to the control plane of a run.
 
-    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator.
-
-    Raises:
-        NoAnswerError: the coordinator cannot be reached, or the socket cannot be listened on.
-        CallerError: other users have access to the user's runtime directory.
+    Every key lies below ``noack/RUN``. With ``listen`` the process is the coordinator. Raise
+    NoAnswerError if the coordinator cannot be reached, or the socket cannot be listened on;
+    CallerError if other users have access to the user's runtime directory.
     """
 
     def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
@@ -227,24 +210,19 @@ class ControlPlane:
         except zenoh.ZError as error:
             what = "start the control plane" if listen else "reach the run's coordinator"
             raise NoAnswerError(f"cannot {what}: {cause_of(error)}") from None
-        self._token = self.session.liveliness().declare_token(
-            self.key("alive", role, self.instance)
-        )
-        self._stops = self.session.declare_subscriber(self.key("stop"), RingChannel(8))
-        self._stop_reason: str | None = None
-        self._coordinator = self.session.liveliness().declare_subscriber(
-            self.key("alive", COORDINATOR, "*"), RingChannel(8), history=True
+        session, key = self.session, self.key
+        self._token = session.liveliness().declare_token(key("alive", role, self.instance))
+        self._coordinator = session.liveliness().declare_subscriber(
+            key("alive", COORDINATOR, "*"), RingChannel(8), history=True
         )
         self._coordinator_gone_s: float | None = None
+        self._stops = session.declare_subscriber(key("stop"), RingChannel(8))
+        self._stop_reason: str | None = None
         # Room for all possible changes: none is ever pushed out.
-        self._changes = self.session.declare_subscriber(
-            self.key("change"), RingChannel(MOST_CHANGES)
-        )
-        self._dones = self.session.declare_subscriber(self.key("done", "*"), RingChannel(8))
+        self._changes = session.declare_subscriber(key("change"), RingChannel(MOST_CHANGES))
+        self._dones = session.declare_subscriber(key("done", "*"), RingChannel(8))
         self._done: set[str] = set()
-        self._persisted = self.session.declare_subscriber(
-            self.key("persisted", role), RingChannel(1)
-        )
+        self._persisted = session.declare_subscriber(key("persisted", role), RingChannel(1))
 
     def __enter__(self) -> Self:
         return self
@@ -264,10 +242,8 @@ class ControlPlane:
 
     def stop_requested(self) -> str | None:
         """The reason of the coordinator's stop request; None without a request."""
-        if self._stop_reason is None:
-            reason = next_payload(self._stops)
-            if reason is not None:
-                self._stop_reason = reason.decode(errors="replace") or "stopped"
+        if self._stop_reason is None and (reason := next_payload(self._stops)) is not None:
+            self._stop_reason = reason.decode(errors="replace") or "stopped"
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
@@ -292,12 +268,8 @@ class ControlPlane:
 
     def acknowledge_rows(self, role: str, content: object) -> None:
         """Confirm to a process which of its rows are on disk."""
-        self.publish(
-            "persisted",
-            role,
-            content=json.dumps(content),
-            congestion_control=CongestionControl.DROP,
-        )
+        drop = CongestionControl.DROP
+        self.publish("persisted", role, content=message_json(content), congestion_control=drop)
 
     def persisted(self) -> bytes | None:
         """The recorder's newest confirmation of rows of this process; None without a new one."""
@@ -305,7 +277,7 @@ class ControlPlane:
 
     def announce_change(self, content: object) -> None:
         """Announce a change of runtime parameters to all processes."""
-        self.publish("change", content=json.dumps(content), priority=Priority.REAL_TIME)
+        self.publish("change", content=message_json(content), priority=Priority.REAL_TIME)
 
     def next_change(self) -> bytes | None:
         """The next announced change; None if there is none."""
@@ -328,23 +300,18 @@ class ControlPlane:
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        self.publish(
-            "telemetry", self.role, table,
-            content=payload, header=header,
-            congestion_control=CongestionControl.DROP, priority=Priority.BACKGROUND,
-        )  # fmt: skip
+        how = {"congestion_control": CongestionControl.DROP, "priority": Priority.BACKGROUND}
+        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        self.publish(
-            "telemetry", self.role, table,
-            content=payload, header=header, congestion_control=CongestionControl.BLOCK,
-        )  # fmt: skip
+        how = {"congestion_control": CongestionControl.BLOCK}
+        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:
         """Answer a request."""
-        query.reply(query.key_expr, json.dumps(content))
+        query.reply(query.key_expr, message_json(content))
         query.drop()  # type: ignore[no-untyped-call]
 
     @staticmethod
@@ -370,14 +337,11 @@ class ControlPlane:
 
         The request is sent again while the queryable does not exist, and every five seconds: an
         interrupted connection may lose request or answer. So the answering side must accept a
-        request twice. The wait ends early when ``give_up()`` is true.
-
-        Raises:
-            NoAnswerError: no answer came.
-            PeerError: the answer was an error.
+        request twice. The wait ends early when ``give_up()`` is true. Raise NoAnswerError if no
+        answer came, PeerError if the answer was an error.
         """
         deadline_s = time.monotonic() + timeout_s
-        payload = json.dumps(content)
+        payload = message_json(content)
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
             wait_s = min(left_s, _REQUEST_AGAIN_S)
             replies = self.session.get(
@@ -401,23 +365,23 @@ class ParameterUpdates:
 
     def __init__(self, plane: ControlPlane) -> None:
         self._plane = plane
-        self._waiting: list[dict[str, Any]] = []
+        self._waiting: list[ChangeAnnouncement] = []
         self._next_number = 0
 
-    def extend(self, announcements: Iterable[dict[str, Any]]) -> None:
+    def extend(self, announcements: Iterable[ChangeAnnouncement]) -> None:
         """Add the changes that were announced before this process joined."""
         self._waiting.extend(announcements)
 
-    def take(self, at_most: int | None = None) -> list[tuple[ParameterChange, Mapping[str, Any]]]:
-        """Return waiting changes, at most a number of them, each with its announcement."""
+    def take(self, at_most: int | None = None) -> list[ChangeAnnouncement]:
+        """Return waiting changes, at most a number of them."""
         while (message := self._plane.next_change()) is not None:
             with suppress(PeerError):  # not from the coordinator
                 self._waiting.append(parse_message(ChangeAnnouncement, message))
-        taken: list[tuple[ParameterChange, Mapping[str, Any]]] = []
+        taken: list[ChangeAnnouncement] = []
         while self._waiting and (at_most is None or len(taken) < at_most):
-            one = self._waiting.pop(0)
-            remember(one.get("kept_losses", {}))
-            if one["number"] >= self._next_number:  # a late process receives some twice
-                self._next_number = one["number"] + 1
-                taken.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))
+            announced = self._waiting.pop(0)
+            remember(announced.kept_losses)
+            if announced.number >= self._next_number:  # a late process receives some twice
+                self._next_number = announced.number + 1
+                taken.append(announced)
         return taken

@@ -115,21 +115,15 @@ def _packed(address: tuple[str, int]) -> bytes:
     return host.packed.ljust(_ADDRESS_BYTES, b"\0") + address[1].to_bytes(2, "big")
 
 
-def tls_context(
-    authority: str, certificate: str, private_key: str, *, server: bool
-) -> ssl.SSLContext:
+def tls_context(other: str, certificate: str, private_key: str, *, server: bool) -> ssl.SSLContext:
     """Return the settings of one end, which accepts only the other end's certificate.
 
-    Args:
-        authority: the certificate that signed both, as PEM text.
-        certificate: of this end, as PEM text.
-        private_key: of this end, as PEM text.
-        server: whether this end is the coordinator.
+    Certificates and key are PEM text. ``server`` says whether this end is the coordinator.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(cadata=authority)
+    context.load_verify_locations(cadata=other)
     with _file_in_memory(private_key + certificate) as path:
         context.load_cert_chain(path)
     return context
@@ -253,11 +247,14 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 class Destination(NamedTuple):
-    """A coordinator, and the keys of those that join, as PEM text; the run's key in hexadecimal."""
+    """Where a coordinator is, its certificate, and the keys of those that join, as PEM text.
+
+    The run's key is in hexadecimal.
+    """
 
     host: str
     port: int
-    authority: str
+    coordinator: str
     certificate: str
     private_key: str
     key: str
@@ -267,10 +264,8 @@ class Destination(NamedTuple):
 def coordinator_link(destination: Destination) -> Iterator[str]:
     """Open a link within the context; yield the path of its Unix socket, for this process.
 
-    Raises:
-        NoAnswerError: the coordinator cannot be reached.
-        MachineError: the program cannot be started.
-        CallerError: other users have access to the user's runtime directory.
+    Raise NoAnswerError if the coordinator cannot be reached, MachineError if the program cannot be
+    started, CallerError if other users have access to the user's runtime directory.
     """
     with _unnamed_socket() as (listening, path):
         command = python_command("-m", __name__, listening.fileno())
@@ -322,9 +317,7 @@ def _unnamed_socket() -> Iterator[tuple[socket.socket, str]]:
 async def connect(destination: Destination) -> Streams:
     """Connect with the coordinator by TLS; the message of an error is for the person who tries.
 
-    Raises:
-        NoAnswerError: that fails, and may succeed later.
-        PeerError: that fails.
+    Raise NoAnswerError if that fails, and may succeed later; PeerError if that fails.
     """
     try:
         async with asyncio.timeout(_OPEN_S):
@@ -363,7 +356,7 @@ async def _connect(destination: Destination) -> Streams:
         if answer != Answer.ADMITTED:
             raise PeerError(_FOREIGN)
         context = tls_context(
-            destination.authority, destination.certificate, destination.private_key, server=False
+            destination.coordinator, destination.certificate, destination.private_key, server=False
         )
         await writer.start_tls(context, server_hostname=destination.host)
     except BaseException:
@@ -373,8 +366,8 @@ async def _connect(destination: Destination) -> Streams:
 
 
 def _main() -> None:
-    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(one, signal.SIG_IGN)  # it ends after the process that it serves
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends after the process that it serves
     destination = Destination(*json.loads(sys.stdin.buffer.readline()))
     prepared: list[Streams] = []
 

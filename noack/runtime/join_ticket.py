@@ -11,8 +11,7 @@ import secrets
 import socket
 import stat
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
@@ -28,7 +27,7 @@ from noack.impairments.loss_prediction import found_probabilities, remember
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK, Address, family_of, text_of
 from noack.runtime.control_messages import NumericHost, SocketAddress
-from noack.runtime.private_folder import live_lock_file, lock_file, private_folder, require_name
+from noack.runtime.private_folder import live_lock_files, lock_file, require_name
 from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
@@ -43,7 +42,7 @@ class RemoteAccess(ScenarioSection):
 
     host: NumericHost
     port: Annotated[int, Field(ge=1, le=65_535)]
-    authority: str  # certificates, and the key of this one, as PEM text
+    coordinator: str  # its certificate, and that of those that join with its key, as PEM text
     certificate: str
     private_key: str
     valid_until: str  # for people; the coordinator measures the time itself
@@ -98,12 +97,6 @@ def loads(text: str) -> Ticket:
         raise CallerError(f"not a valid ticket: {brief(error)}") from None
 
 
-def ticket_path(session: str) -> Path:
-    """Return the path of a session's ticket; raise CallerError for an unfit name."""
-    require_name(session, "session")
-    return private_folder() / f"{session}.json"
-
-
 @contextmanager
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
     """Publish the ticket in a file that only its owner can read, while the context lasts.
@@ -111,48 +104,29 @@ def published(ticket: Ticket, session: str) -> Iterator[Path]:
     The file is locked: if several runs use a session's name, one succeeds. Raise CallerError if
     another run is open in the session, or the folder is not the user's own.
     """
-    path = ticket_path(session)
+    require_name(session, "session")
     with ExitStack() as stack:
         try:
-            stack.enter_context(lock_file("", session, ticket.model_dump(mode="json")))
+            yield stack.enter_context(lock_file("", session, ticket.model_dump(mode="json")))
         except FileExistsError:
             raise CallerError(
                 f"session {session!r}: another run is open in it; choose --session NAME"
             ) from None
-        yield path
 
 
-def wait_for_ticket(
-    session: str, timeout_s: float, stop: Callable[[], bool], on_wait: Callable[[Path], None]
-) -> Ticket:
-    """Wait until a recorder or launcher has published the session's ticket, and return it.
-
-    Raise PeerError if there was none in time.
-    """
-    path = ticket_path(session)
-    deadline_s = time.monotonic() + timeout_s
-    waiting = False
-    while True:
-        if (file := live_lock_file("", session)) is not None:
-            return loads(file.content.decode())
-        if stop() or time.monotonic() > deadline_s:
-            raise PeerError(
-                f"no run to join in session {session!r}: start `noack record SCENARIO` first"
-            )
-        if not waiting:
-            on_wait(path)
-            waiting = True
-        time.sleep(0.05)
+def find_ticket(session: str) -> Ticket | None:
+    """Return the ticket that a recorder or launcher has published in a session; None without."""
+    require_name(session, "session")
+    files = live_lock_files("", session)
+    return loads(files[0].content.decode()) if files else None
 
 
 @contextmanager
 def invitation_file(path: Path, ticket: Ticket) -> Iterator[None]:
     """Write an invitation that only its owner can read; replace an older one.
 
-    At the end it is removed, unless that of another run has replaced it.
-
-    Raises:
-        CallerError: it cannot be written.
+    At the end it is removed, unless that of another run has replaced it. Raise CallerError if it
+    cannot be written.
     """
     write_invitation(path, ticket)
     try:
@@ -166,8 +140,7 @@ def invitation_file(path: Path, ticket: Ticket) -> Iterator[None]:
 def write_invitation(path: Path, ticket: Ticket) -> None:
     """Write an invitation that only its owner can read; replace an older one.
 
-    Raises:
-        CallerError: it cannot be written.
+    Raise CallerError if it cannot be written.
     """
     try:
         with new_file(path, make_folder=False, mode=0o600) as file:
@@ -184,16 +157,13 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     """Return the ticket of an invitation, as this host uses it.
 
     Sockets of loop data listen on the address from which this host reaches the coordinator. Rows
-    that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name.
-
-    Raises:
-        CallerError: it cannot be read, other users can read it, or it is no invitation; or
-            ``runs`` cannot be written.
-        PeerError: there is no route to the coordinator.
+    that cannot be sent to the recorder stay below ``runs``, in a folder with the run's name. Raise
+    CallerError if it cannot be read, other users can read it, or it is no invitation; or ``runs``
+    cannot be written; PeerError if there is no route to the coordinator.
     """
-    content = _bytes_of(path)
+    text = _text(path)
     try:
-        ticket = loads(_text(content))
+        ticket = loads(text)
     except CallerError as error:
         raise CallerError(f"{path}: not an invitation: {error}") from None
     if ticket.remote is None:
@@ -207,30 +177,27 @@ def read_invitation(path: Path, runs: Path) -> Ticket:
     return ticket.model_copy(update={"host": host, "run_dir": str(run_dir)})
 
 
-def _bytes_of(path: Path) -> bytes:
+def _text(path: Path) -> str:
     try:
         if path == STANDARD_INPUT:
-            return sys.stdin.buffer.read(_MOST_BYTES + 1)
-        with open_regular(path) as file:
-            status = os.fstat(file.fileno())
-            if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
-                raise CallerError(
-                    f"{path}: it has secret keys, but other users can read or change it; "
-                    f"make it yours alone: chmod 600 {path}"
-                )
-            return file.read(_MOST_BYTES + 1)
+            content = sys.stdin.buffer.read(_MOST_BYTES + 1)
+        else:
+            with open_regular(path) as file:
+                status = os.fstat(file.fileno())
+                if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+                    raise CallerError(
+                        f"{path}: it has secret keys, but other users can read or change it; "
+                        f"make it yours alone: chmod 600 {path}"
+                    )
+                content = file.read(_MOST_BYTES + 1)
     except (OSError, ValueError) as error:
-        reason = why(error) if isinstance(error, OSError) else error
-        raise CallerError(f"{path}: the invitation cannot be read: {reason}") from None
-
-
-def _text(content: bytes) -> str:
+        raise CallerError(f"{path}: the invitation cannot be read: {why(error)}") from None
     if len(content) > _MOST_BYTES:
-        raise CallerError(f"larger than {_MOST_BYTES // 2**20} MiB")
+        raise CallerError(f"{path}: not an invitation: larger than {_MOST_BYTES // 2**20} MiB")
     try:
         return content.decode()
     except UnicodeDecodeError:
-        raise CallerError("it is no text") from None
+        raise CallerError(f"{path}: not an invitation: it is no text") from None
 
 
 def _require_writable(folder: Path) -> None:

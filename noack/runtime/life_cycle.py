@@ -101,9 +101,8 @@ class LifeCycle:
     def apply(self, event: Event, reason: str | None = None) -> None:
         """Enter the next state; ``reason`` says why, for STOP and END.
 
-        Raises:
-            CallerError: this side caused an event that the state does not allow.
-            PeerError: the other side did.
+        Raise CallerError if this side caused an event that the state does not allow, PeerError if
+        the other side did.
         """
         state = TRANSITIONS[self.state].get(event)
         if state is None:

@@ -208,7 +208,7 @@ class LiveDriver:
             raise ValueError(ffi.string(wrong).decode())
 
     def _pass_rows(self, sink: RecordSink) -> None:
-        for table, rows in self.machines.take_rows():
+        for table, rows in self.machines.take_rows(last=True):
             sink.extend_table(table, rows)
         for notice in self.machines.take_notices():
             sink.notice(notice)

@@ -59,9 +59,7 @@ class PrivateFolder:
     def open(self, name: str) -> int:
         """Open a file for reading; return its descriptor.
 
-        Raises:
-            CallerError: it is not a file of the user's.
-            FileNotFoundError: there is none.
+        Raise CallerError if it is not a file of the user's, FileNotFoundError if there is none.
         """
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
@@ -181,23 +179,15 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
             _remove(folder, name, os.fstat(descriptor))
 
 
-def live_lock_files(kind: str) -> list[LockFile]:
-    """Return the lock files of a kind whose process runs, by name."""
+def live_lock_files(kind: str, only: str = "") -> list[LockFile]:
+    """Return the lock files of a kind, or only that of a name, whose process runs, by name."""
     try:
         with open_private(*_inside(kind)) as folder:
-            names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
+            known = [only + _SUFFIX] if only else sorted(folder.names())
+            names = [name for name in known if name.endswith(_SUFFIX)]
             return [file for name in names if (file := _alive(folder, name)) is not None]
     except FileNotFoundError:
         return []
-
-
-def live_lock_file(kind: str, name: str) -> LockFile | None:
-    """Return the lock file of this name; None if there is none whose process runs."""
-    try:
-        with open_private(*_inside(kind)) as folder:
-            return _alive(folder, name + _SUFFIX)
-    except FileNotFoundError:
-        return None
 
 
 def _inside(kind: str) -> tuple[str, ...]:

@@ -99,8 +99,7 @@ class ReferenceClock:
     ) -> None:
         """Exchange times until the error is small enough to begin.
 
-        Raises:
-            PeerError: it is not after ``wait_s``, or ``give_up`` is true.
+        Raise PeerError if it is not after ``wait_s``, or ``give_up`` is true.
         """
         until_ns = self._clocks.monotonic_ns() + round(wait_s * NS_PER_S)
         while True:
@@ -152,7 +151,7 @@ class ReferenceClock:
         if self._client.accepted > self._accepted:
             self._accepted, self._answered_ns = self._client.accepted, now_ns
         lost = self._why_lost(restarts, now_ns)
-        since_ns = min([self._since_ns, *(one.since_ns for one in restarts)])
+        since_ns = min([self._since_ns, *(restart.since_ns for restart in restarts)])
         self._since_ns = now_ns
         return ClockReport(
             since_ns, now_ns, slewed.now_ns(now_ns) - now_ns,
@@ -185,8 +184,7 @@ def reads_other_clock(ticket: Ticket) -> bool:
 def reference_clock(ticket: Ticket) -> ReferenceClock | None:
     """Return the clock of the run's coordinator; None if this process reads that clock itself.
 
-    Raises:
-        PeerError: it is another clock, and nobody answers requests for its time.
+    Raise PeerError if it is another clock, and nobody answers requests for its time.
     """
     if not reads_other_clock(ticket):
         return None

@@ -15,12 +15,12 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from setproctitle import setproctitle
 
@@ -44,15 +44,23 @@ from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, WITH_DEADL
 from noack.protocol.wire_format import Wire
 from noack.runtime.address import Address, text_of
 from noack.runtime.command_line import TICKET_ON_STDIN, Parser, Signals, failed, print_to_stderr
-from noack.runtime.control_messages import Admission, ControlMessage, RunStart, parse_message
-from noack.runtime.control_plane import ControlPlane, ParameterUpdates
+from noack.runtime.control_messages import (
+    Admission,
+    AdmissionRequest,
+    ControlMessage,
+    JoinRequest,
+    M,
+    RunStart,
+    parse_message,
+)
+from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,
     STANDARD_INPUT,
     Ticket,
+    find_ticket,
     loads,
     read_invitation,
-    wait_for_ticket,
 )
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
@@ -61,7 +69,6 @@ from noack.runtime.telemetry import (
     OwnSpool,
     TelemetryBuffer,
     deliver_report,
-    own_spool,
     persisted_rows,
 )
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
@@ -71,19 +78,18 @@ _ADMISSION_TIMEOUT_S = 10.0
 _CHANGES_AT_ONCE = 2
 """Changes taken in the loop every 50 ms: a machine needs some tenths of a millisecond for each."""
 _FEW_LOOPS = 8
-_REST_SHARE = 30
-_LONGEST_REST_NS = 700_000
+_REST_SHARE = 25
+_LONGEST_REST_NS = 800_000
 """Ticks of more than a few loops that are nearer to others than this part of a period are done
 together: waking up for each takes CPU time."""
 _GRACE_TURNS = 3  # of housekeeping, 50 ms each, after the horizon for packets in flight
 _RUNS = Path("runs")
 _POLL_S = 0.1
 _TICKET_TIMEOUT_S = 24 * 3600.0  # a person may start the recorder late; Ctrl-C ends the wait
-
-
 _BUFFER_BYTES, _LARGEST_BUFFER_BYTES = 4 * 1024 * 1024, 256 * 1024 * 1024
 """Receive buffer for each loop, and for all. At 50,000 datagrams a second the largest covers a
 stall of 7 s. The kernel takes what is in use."""
+T = TypeVar("T")
 
 
 class Reconfigurable(Protocol):
@@ -123,13 +129,14 @@ class RunProcess:
 
         Raise NoAnswerError without an answer within ten seconds, PeerError if it refuses.
         """
-        shown = {"admission_pass": self.ticket.admission_pass}
-        admission = self._request("admit", shown, Admission, _ADMISSION_TIMEOUT_S)
+        request = AdmissionRequest(
+            instance=self.plane.instance, admission_pass=self.ticket.admission_pass
+        )
+        admission = self._request("admit", request, Admission, _ADMISSION_TIMEOUT_S)
         self.life.apply(Event.ADMIT)
-        self.start = Start(admission["generation"], admission["from_ns"])
-        if self.start.is_restart:
-            self._address, self.replaces = admission["address"], admission["replaces"]
-            self.admitted_ns = admission["admitted_ns"]
+        self.start = Start(admission.generation, admission.from_ns)
+        self._address, self.replaces = admission.address, admission.replaces
+        self.admitted_ns = admission.admitted_ns
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return all addresses. Sets the common epoch.
@@ -142,26 +149,22 @@ class RunProcess:
             self._reference.wait_until_known(lambda: self.stopping)
         prepare_changes()
         self.life.apply(Event.JOIN)
-        begin = self._request("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
-        epoch_ns, speed = begin["epoch_ns"], self.scenario.speed
-        self.clock = RunClock(epoch_ns, speed)
+        request = JoinRequest(instance=self.plane.instance, address=address)
+        begin = self._request("join", request, RunStart, _JOIN_TIMEOUT_S)
+        self.clock = RunClock(begin.epoch_ns, self.scenario.speed)
         if (reference := self._reference) is not None:
-            self.clock = SlewedRunClock(epoch_ns, speed, reference.slewed)
-        addresses: Mapping[str, Address] = begin["addresses"]
-        self.updates.extend(begin.get("changes", ()))
-        if not addresses.keys() >= set(LOOP_ROLES):
+            self.clock = SlewedRunClock(begin.epoch_ns, self.scenario.speed, reference.slewed)
+        self.updates.extend(begin.changes)
+        if not begin.addresses.keys() >= set(LOOP_ROLES):
             raise PeerError("the coordinator did not send the addresses of all processes")
         self.life.apply(Event.START)
         if not self.ticket.launched:
             verb = f"replaces a process ({self.replaces})" if self.replaces else "started"
             print_to_stderr(f"noack {self.role}: {verb}")
-        return addresses
+        return begin.addresses
 
-    def _request(
-        self, what: str, more: dict[str, Any], answer: type[ControlMessage], timeout_s: float
-    ) -> Any:
-        """Send the coordinator a request of this process; return the answer's fields."""
-        request = {"pid": os.getpid(), "instance": self.plane.instance, **more}
+    def _request(self, what: str, request: ControlMessage, answer: type[M], timeout_s: float) -> M:
+        """Send the coordinator a request of this process; return the answer."""
         try:
             message = self.plane.request(what, request, timeout_s=timeout_s, give_up=self._gives_up)
         except PeerError as error:
@@ -258,7 +261,10 @@ class RunProcess:
 
     @cached_property
     def _spool(self) -> OwnSpool:
-        return own_spool(self.ticket, self.role, self.plane.secret)
+        """The recorder reads it, or `noack collect` on another host."""
+        ticket = self.ticket
+        kept_of = None if ticket.remote is None else run_name(ticket.run_id)
+        return OwnSpool(Path(ticket.run_dir), self.role, self.plane.secret, kept_of)
 
     def _telemetry(self) -> TelemetryBuffer:
         tables = run_tables(self.scenario)
@@ -354,22 +360,15 @@ class RunProcess:
     def _news(
         self, machine: Reconfigurable, now_ns: int, at_most: int | None
     ) -> Sequence[Record | Notice]:
-        outputs = self._announce(machine, now_ns, at_most)
-        if self._clock_record is None:
-            return outputs
-        return [*outputs, *self._clock_record.news(now_ns)]
-
-    def _announce(
-        self, machine: Reconfigurable, now_ns: int, at_most: int | None
-    ) -> Sequence[Record | Notice]:
-        if self.role not in CHANGEABLE:
-            return ()
+        """Pass announced changes on, and compare the clocks; return the outputs."""
         outputs: list[Record | Notice] = []
-        for change, _ in self.updates.take(at_most):
+        for announced in self.updates.take(at_most) if self.role in CHANGEABLE else ():
             try:
-                outputs += machine.announce(change, now_ns)
+                outputs += machine.announce(announced.change, now_ns)
             except CallerError as error:  # not from the coordinator, which checks changes
                 print_to_stderr(f"noack {self.role}: ignored: {error}")
+        if self._clock_record is not None:
+            outputs += self._clock_record.news(now_ns)
         return outputs
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
@@ -482,35 +481,40 @@ def _exit_status(role: str, signals: Signals, *, as_json: bool) -> Iterator[None
 def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     if os.environ.pop(TICKET_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
-    ticket = wait_for_ticket(
-        session,
-        _TICKET_TIMEOUT_S,
-        lambda: signals.received is not None,
-        lambda path: print(
-            f"noack {role}: waiting for `noack record SCENARIO` on this host (session "
-            f"{session!r}); of a run on another host, give its --invitation; Ctrl-C ends",
-            file=sys.stderr,
-        ),
-    )
+    ticket = _wait_for(
+        lambda: find_ticket(session), signals,
+        f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
+        "a run on another host, give its --invitation; Ctrl-C ends",
+    )  # fmt: skip
+    if ticket is None:
+        raise PeerError(
+            f"no run to join in session {session!r}: start `noack record SCENARIO` first"
+        )
     print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
     return ticket
 
 
 def _invited(role: str, invitation: Path, runs: Path, signals: Signals) -> Ticket:
     """Wait for an invitation and return its ticket; raise CallerError or PeerError without one."""
-    from_a_file = invitation != STANDARD_INPUT
-    if from_a_file and not invitation.exists() and invitation.parent.is_dir():
-        print(f"noack {role}: waiting for {invitation}; Ctrl-C ends", file=sys.stderr)
-        deadline_s = time.monotonic() + _TICKET_TIMEOUT_S
-        while not invitation.exists() and time.monotonic() < deadline_s:
-            if signals.received is not None:
-                raise PeerError("no invitation")
-            time.sleep(_POLL_S)
+    if invitation != STANDARD_INPUT and invitation.parent.is_dir():
+        waiting = f"noack {role}: waiting for {invitation}; Ctrl-C ends"
+        if not _wait_for(invitation.exists, signals, waiting):
+            raise PeerError("no invitation")
     ticket = read_invitation(invitation, runs)
     assert ticket.remote is not None  # else it is no invitation
     where = text_of((ticket.remote.host, ticket.remote.port))
     print(f"noack {role}: joining run of {ticket.scenario.name!r} at {where}", file=sys.stderr)
     return ticket
+
+
+def _wait_for(find: Callable[[], T], signals: Signals, waiting: str) -> T:
+    """Return what is found once it is true; after a signal, or a day, what is found then."""
+    until_s = time.monotonic() + _TICKET_TIMEOUT_S
+    if not find():
+        print(waiting, file=sys.stderr)
+    while not (found := find()) and signals.received is None and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+    return found
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:

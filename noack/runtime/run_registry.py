@@ -4,7 +4,6 @@ The launcher keeps a lock file for its run (:mod:`noack.runtime.private_folder`)
 of its control plane.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,12 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from noack.config.toml_file import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import private_folder
-from noack.runtime.control_messages import ChangeReply, parse_message
+from noack.runtime.control_messages import (
+    ChangeReply,
+    ChangeRequest,
+    message_json,
+    parse_message,
+)
 from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session, run_name
 from noack.runtime.join_ticket import Ticket
 
@@ -70,21 +74,17 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
     raise CallerError(f"no run is active {which}; {active}")
 
 
-def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
+def request_change(run: OpenRun, settings: Mapping[str, Any]) -> ChangeReply:
     """Request a change of runtime parameters; without settings, their values. Return the answer.
 
     Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
+    request = message_json(ChangeRequest(settings=dict(settings)))
     try:
-        plane = open_session(RUNS, run.name, listen=False)
+        with open_session(RUNS, run.name, listen=False) as plane:
+            answer = answer_to(plane, f"noack/{run.name}/runtime_parameters", request, _ANSWER_S)
     except zenoh.ZError as error:
         raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
-    try:
-        request = json.dumps({"settings": dict(settings)})
-        key = f"noack/{run.name}/runtime_parameters"
-        answer = answer_to(plane, key, request, _ANSWER_S)
-    finally:
-        plane.close()  # type: ignore[no-untyped-call]
     if answer is None:
         raise PeerError(f"{run.run_dir}: the run does not answer")
     return parse_message(ChangeReply, answer)

@@ -87,9 +87,9 @@ class SpoolWriter:
         return self._folder / f"{table}.{self._writer}"
 
     def _open(self, table: str) -> BinaryIO:
-        file = self._files.get(table)
-        if file is None:
-            file = self._files[table] = _appended(self._path(table))
+        if (file := self._files.get(table)) is None:
+            file = os.fdopen(open_append(self._path(table)), "ab", buffering=0)
+            self._files[table] = file
         return file
 
     def close(self) -> None:
@@ -97,10 +97,6 @@ class SpoolWriter:
         for file in self._files.values():
             file.close()
         self._files.clear()
-
-
-def _appended(path: Path) -> BinaryIO:
-    return os.fdopen(open_append(path), "ab", buffering=0)
 
 
 def _write_complete(file: BinaryIO, chunk: bytes) -> None:
@@ -120,8 +116,6 @@ class Chunk(NamedTuple):
     first: int
     """Number of its first row."""
     rows: bytes
-    end: int
-    """Offset of the byte after it."""
 
 
 def kept_run_name(folder: Path) -> str:
@@ -150,33 +144,28 @@ def batch_bytes(data: memoryview) -> int | None:
     return None if len(data) < _CHUNK.size else _CHUNK.size + int(_CHUNK.unpack_from(data)[1])
 
 
-def chunks_in(path: Path, begin: int = 0, end: int | None = None) -> Iterator[Chunk]:
-    """Yield the complete batches of a file from the offset ``begin`` up to ``end``."""
-    with path.open("rb", buffering=_READ_BYTES) as file:
-        yield from chunks_of(file, begin, end)
+def chunks_of(file: IO[bytes], most_bytes: int | None = None) -> Iterator[Chunk]:
+    """Yield the complete batches of an open file, from its beginning.
 
-
-def chunks_of(
-    file: IO[bytes], begin: int = 0, end: int | None = None, most_bytes: int | None = None
-) -> Iterator[Chunk]:
-    """Do the same for an open file; raise ValueError for a batch of more than ``most_bytes``."""
-    size = os.fstat(file.fileno()).st_size
-    end = size if end is None else end
-    file.seek(begin)
-    while begin < end and len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+    Raise ValueError for a batch of more than ``most_bytes``.
+    """
+    size, end = os.fstat(file.fileno()).st_size, 0
+    file.seek(0)
+    while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
         first, length = _CHUNK.unpack(head)
-        begin += _CHUNK.size + length
-        if begin > size:  # incomplete, or damaged: a read could be endless
+        end += _CHUNK.size + length
+        if end > size:  # incomplete, or damaged: a read could be endless
             break
         if most_bytes is not None and length > most_bytes:
             raise ValueError(f"a batch of {length} bytes")
-        yield Chunk(first, file.read(length), begin)
+        yield Chunk(first, file.read(length))
 
 
-def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
-    """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
+def read_chunks(folder: Path, table: str) -> Iterator[Chunk]:
+    """Yield each complete batch of a table, from all writers."""
     for path in spool_files(folder, table):
-        yield from ((chunk.first, chunk.rows) for chunk in chunks_in(path))
+        with path.open("rb", buffering=_READ_BYTES) as file:
+            yield from chunks_of(file)
 
 
 def notices_of(role: str) -> str:

@@ -23,8 +23,7 @@ from noack.core.file_access import write_whole
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP
 from noack.runtime.control_messages import BatchHeader, MissingRows, PersistedAck, parse_message
-from noack.runtime.control_plane import ControlPlane, run_name
-from noack.runtime.join_ticket import Ticket
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.spool import (
     KEPT_KEY,
     KEPT_REPORT,
@@ -59,8 +58,8 @@ def contain(ranges: Ranges, first: int, end: int) -> bool:
 
 def overlap(ranges: Ranges, first: int, end: int) -> bool:
     """Return whether the ranges have one of the numbers from ``first`` to before ``end``."""
-    place = bisect_right(ranges, first, key=lambda known: known[1])
-    return place < len(ranges) and ranges[place][0] < end
+    index = bisect_right(ranges, first, key=lambda known: known[1])
+    return index < len(ranges) and ranges[index][0] < end
 
 
 class ReceivedRows:
@@ -127,12 +126,7 @@ class TelemetryBuffer:
 
     def append(self, record: Record) -> None:
         """Add a row; a full batch is published."""
-        table = record.table
-        index = self._filled[table]
-        self._rows[table][index] = record.row
-        self._filled[table] = index + 1
-        if index + 1 == _BATCH_ROWS:
-            self.flush()  # all tables: a reader merges them in the order of publication
+        self.extend_table(record.table, np.array([record.row], self._rows[record.table].dtype))
 
     def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table; many are published at once."""
@@ -146,7 +140,7 @@ class TelemetryBuffer:
         self._rows[table][begin : begin + len(rows)] = rows
         self._filled[table] = begin + len(rows)
         if begin + len(rows) == _BATCH_ROWS:
-            self.flush()
+            self.flush()  # all tables: a reader merges them in the order of publication
 
     def notice(self, notice: Notice) -> None:
         """Add a line for the run's log; many are published together."""
@@ -240,20 +234,16 @@ class TelemetryBuffer:
 def first_row(header: bytes) -> tuple[int, int]:
     """Generation and number of a batch's first row, from its header; raise PeerError if invalid."""
     found = parse_message(BatchHeader, header)
-    return found.get("generation", 0), found["first"]
+    return found.generation, found.first
 
 
 def persisted_rows(plane: ControlPlane, generation: int) -> Mapping[str, Sequence[tuple[int, int]]]:
     """Ranges of this process's rows that are on disk, by table; empty without a new message."""
-    message = plane.persisted()
-    if message is None:
-        return {}
-    try:
-        acknowledged = parse_message(PersistedAck, message)
-    except PeerError:  # not from the recorder
-        return {}
-    rows: Mapping[str, Sequence[tuple[int, int]]] = acknowledged["rows"]
-    return rows if acknowledged["generation"] == generation else {}
+    with suppress(PeerError):  # not from the recorder
+        if (message := plane.persisted()) is not None:
+            acknowledged = parse_message(PersistedAck, message)
+            return acknowledged.rows if acknowledged.generation == generation else {}
+    return {}
 
 
 def deliver_report(
@@ -266,7 +256,7 @@ def deliver_report(
     try:
         for _ in range(_REPORT_ATTEMPTS):
             answer = plane.request("report", report, timeout_s=_REPORT_TIMEOUT_S)
-            missing = parse_message(MissingRows, answer)["rows"]
+            missing = parse_message(MissingRows, answer).rows
             if not missing:
                 return True
             telemetry.resend(missing, plane.publish_telemetry_blocking)
@@ -317,12 +307,6 @@ class OwnSpool:
         """Write the final report; raise MachineError if it cannot be written."""
         text = json.dumps({**report, "process": self._role})
         self._files.append(KEPT_REPORT, 0, text.encode())
-
-
-def own_spool(ticket: Ticket, role: str, secret: str) -> OwnSpool:
-    """Return the spool of a process: the recorder reads it, or `noack collect` on another host."""
-    kept_of = None if ticket.remote is None else run_name(ticket.run_id)
-    return OwnSpool(Path(ticket.run_dir), role, secret, kept_of)
 
 
 def _kept_folder(run_dir: Path, name: str) -> Path:

@@ -40,7 +40,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from typing import NamedTuple
@@ -256,23 +256,28 @@ class ArrivalSocket:
 _HOST_CLOCKS = HostClocks()
 
 
+def _open_socket(
+    address: Address, use: Callable[[socket.socket, Address], None], what: str
+) -> socket.socket:
+    endpoint = socket.socket(family_of(address), socket.SOCK_DGRAM)
+    try:
+        use(endpoint, address)
+    except OSError as error:
+        endpoint.close()
+        raise CallerError(f"cannot {what} {text_of(address)}: {why(error)}") from None
+    return endpoint
+
+
 class TimeReference:
     """Answers requests with times of this host's monotonic clock.
 
-    Its clock has a random number. A client that sees another number begins again.
-
-    Raises:
-        CallerError: the address cannot be used.
+    Its clock has a random number. A client that sees another number begins again. Raise CallerError
+    if the address cannot be used.
     """
 
     def __init__(self, listen: Address, key: bytes, clocks: HostClocks = _HOST_CLOCKS) -> None:
         self._format = TimeFormat(key)
-        self._endpoint = socket.socket(family_of(listen), socket.SOCK_DGRAM)
-        try:
-            self._endpoint.bind(listen)
-        except OSError as error:
-            self._endpoint.close()
-            raise CallerError(f"cannot listen on {text_of(listen)}: {why(error)}") from None
+        self._endpoint = _open_socket(listen, socket.socket.bind, "listen on")
         self.address: Address = self._endpoint.getsockname()[:2]
         self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, clocks)
         self._clocks = clocks
@@ -330,8 +335,7 @@ def answering(reference: TimeReference) -> Iterator[TimeReference]:
 class TimeClient:
     """Exchanges timestamps with a reference and enters them into ``offset``.
 
-    Raises:
-        CallerError: the address cannot be used.
+    Raise CallerError if the address cannot be used.
     """
 
     def __init__(
@@ -344,12 +348,7 @@ class TimeClient:
         clocks: HostClocks = _HOST_CLOCKS,
     ) -> None:
         self._format = TimeFormat(key)
-        self._endpoint = socket.socket(family_of(reference), socket.SOCK_DGRAM)
-        try:
-            self._endpoint.connect(reference)
-        except OSError as error:
-            self._endpoint.close()
-            raise CallerError(f"cannot send to {text_of(reference)}: {why(error)}") from None
+        self._endpoint = _open_socket(reference, socket.socket.connect, "send to")
         self._arrivals = ArrivalSocket(self._endpoint, TIME_BYTES, clocks)
         self._clocks = clocks
         self._offset = offset
@@ -395,7 +394,7 @@ class TimeClient:
             other = self._offset.begin_again(received_ns)
         self._clock = reply.clock
         exchange = Exchange(sent_ns, reply.received_ns, reply.sent_ns, received_ns)
-        return [one for one in (other, self._offset.add(exchange)) if one is not None]
+        return [restart for restart in (other, self._offset.add(exchange)) if restart is not None]
 
     def _send(self) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES)

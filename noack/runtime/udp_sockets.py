@@ -176,13 +176,17 @@ class CountingSocket(ABC):
         self._counted[source] = total
 
     def report(self) -> dict[str, object]:
-        """Counters, for the run's summary."""
+        """Counters, for the run's summary.
+
+        A drop of the kernel is one datagram, or up to 64 that the peer sent together, each for
+        another loop.
+        """
         drops = [drops_of(one) for one in self.peer_sockets]
         return {
             "local": text_of(self._unexpected[0].getsockname()),
             "destination": text_of(self._destination),
             "received_from": self._sources.report(),
-            "lost_in_kernel": None if None in drops else sum(n for n in drops if n is not None),
+            "kernel_drops": None if None in drops else sum(n for n in drops if n is not None),
         }
 
     def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:

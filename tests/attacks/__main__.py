@@ -29,7 +29,7 @@ def table_of(run: Attacked) -> Table:
             if to == role:
                 column[f"sent, {sender}: {kind}"] += number
         column.update({f"rejected: {reason}": n for reason, n in channel["rejected"].items()})
-        column["lost in the kernel, of the peer's"] = channel["lost_in_kernel"]
+        column["lost in the kernel, of the peer's"] = channel["kernel_drops"]
         column["accepted, of the peer's"] = run.accepted(role)
         column["accepted, others"] = run.accepted(role) - peer_sent
         columns.append(column)

@@ -56,8 +56,8 @@ def nothing_is_lost(run: Attacked) -> Iterator[str]:
         if loop[key]:
             yield f"{key}: {loop[key]}, {loop['unintended_losses_by_leg']}"
     for role in LOOP_ROLES:
-        if run.channel(role)["lost_in_kernel"] not in (0, None):
-            yield f"{role}: {run.channel(role)['lost_in_kernel']} lost in the kernel"
+        if run.channel(role)["kernel_drops"] not in (0, None):
+            yield f"{role}: {run.channel(role)['kernel_drops']} lost in the kernel"
 
 
 def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:

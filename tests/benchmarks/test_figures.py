@@ -4,14 +4,15 @@ from typing import Any
 
 import pytest
 
-from benchmarks import demo_run, goals, lateness, long_run, plants, startup
+from benchmarks import goals, lateness, long_run, plants, startup
 from benchmarks.__main__ import all_benchmarks
 from benchmarks._report import MeasurementError, Rounds
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS
 from cosim.live.progress import progress_text
+from noack.runtime.control_messages import RunProgress
 
-ACCOUNT = {
+ACCOUNT: dict[str, Any] = {
     "t_s": 0.0, "events": 1, "deliveries": 1, "longest_loss_burst": 0, "x_norm": 1.0, "live": None,
 }  # fmt: skip
 ROOT = Path(__file__).parents[2]
@@ -31,13 +32,13 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_complete_and_punctual_demo_reaches_all_goals() -> None:
-    verdicts = [row.holds for row in demo_run.rows_of(summary()) if row.goal is not None]
+    verdicts = [row.holds for row in startup.demo_rows(summary()) if row.goal is not None]
     assert verdicts == [True, True, True]
 
 
 def test_a_missing_sample_or_too_many_late_steps_miss_their_goals() -> None:
     late = summary()["loops"][0]["lateness_us"]["plant"] | {"late_steps": 11}
-    rows = demo_run.rows_of(summary(missing_samples=1, lateness_us={"plant": late}))
+    rows = startup.demo_rows(summary(missing_samples=1, lateness_us={"plant": late}))
     assert [row.holds for row in rows[:3]] == [False, True, False]
 
 
@@ -75,11 +76,11 @@ def test_lateness_is_judged_against_cyclictest(
 def test_the_earliest_progress_line_bounds_the_time_of_the_first_step() -> None:
     lines = [
         Line(100.9, "noack: something else"),
-        Line(102.0, progress_text(ACCOUNT | {"t_s": 0.25}, 20.0)),
+        Line(102.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.25}), 20.0)),
         Line(
-            102.2, progress_text(ACCOUNT | {"t_s": 0.5}, 20.0)
+            102.2, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.5}), 20.0)
         ),  # the epoch is at 101.75 or earlier
-        Line(103.0, progress_text(ACCOUNT | {"t_s": 1.0}, 20.0)),
+        Line(103.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 1.0}), 20.0)),
     ]
     assert first_step_s(100.0, lines) == pytest.approx(1.75)
 
@@ -89,11 +90,14 @@ def test_without_a_progress_line_there_is_no_first_step() -> None:
 
 
 def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
-    goal, peer, launch = startup.rows_of([1.0, 1.2, 5.0], [0.9], [0.2, 0.3, 0.4])
+    rounds = Rounds()
+    for first_s, launch_s in ((1.0, 0.2), (1.2, 0.3), (5.0, 0.4)):
+        rounds.add(startup.OURS, {"first_s": first_s, "launch_s": launch_s})
+        rounds.add(startup.IMPORTS, {"first_s": 0.3})
+    goal, peer, launch = startup.rows_of(rounds)
     assert (goal.value, goal.holds) == (1.2, False)
     assert peer.ratio == pytest.approx(4.0)
-    assert launch.value == 0.9
-    assert len(startup.rows_of([1.0], [], [0.2])) == 2
+    assert launch.value == 0.3
 
 
 def test_the_end_of_a_long_run_is_judged_by_its_memory_and_its_additional_time() -> None:
@@ -121,10 +125,10 @@ def test_standard_output_and_error_lines_are_separate() -> None:
 
 
 def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
-    for case in plants.CASES:
-        ours, linear = plants.timed(case, count=20, pace_ns=0, asked=False)
-        assert len(ours.us) == len(linear.us) == 19
-        p50, p99, share = plants.rows_of(case, ours, linear)
+    for name, scenario in plants.cases():
+        found = plants.timed(scenario, count=20, pace_ns=0, asked=False)
+        assert len(found) == 20
+        p50, p99, share = plants.rows_of(name, scenario, found)
         assert p50.peer is not None
         assert p50.value is not None
         assert p99.value is not None

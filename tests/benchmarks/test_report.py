@@ -1,3 +1,5 @@
+"""Rows, rounds, the command line and the page of the goals."""
+
 import argparse
 import json
 from pathlib import Path
@@ -14,64 +16,42 @@ from benchmarks._report import (
     Peer,
     Rounds,
     Row,
+    compared,
+    per_cpu_s,
 )
 from benchmarks.goals import BEGIN, BENCHMARKS, END, rows_of_figures, write_docs
 
-KEYS = {"name", "value", "unit", "peer", "ratio", "goal", "holds"}
+HALF = Goal("<=", 0.5)
 
 
 @pytest.mark.parametrize(
-    ("goal", "found", "holds"),
+    ("row", "holds"),
     [
-        (Goal("<=", 3), 3.0, True),
-        (Goal("<=", 3), 3.01, False),
-        (Goal("<", 3), 3.0, False),
-        (Goal(">=", 99.9), 99.9, True),
-        (Goal("==", 0), 1, False),
+        (Row("a", 3.0, "s", goal=Goal("<=", 3)), True),
+        (Row("a", 3.01, "s", goal=Goal("<=", 3)), False),
+        (Row("a", 3.0, "s", goal=Goal("<", 3)), False),
+        (Row("a", 99.9, "%", goal=Goal(">=", 99.9)), True),
+        (Row("a", 1, "", goal=Goal("==", 0)), False),
+        (Row("a", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3)), True),  # the ratio is judged
+        (Row("nothing asked", 1.0, "s"), None),
+        (Row("not measured", None, "s", goal=Goal("<", 3)), None),
+        (Row("no peer to compare with", 1.0, "s", Peer("cyclictest", None), Goal("<", 3)), None),
+        (Row("a", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unjudged="no SCHED_FIFO"), None),
     ],
 )
-def test_a_goal_compares_a_value_with_its_limit(goal: Goal, found: float, holds: bool) -> None:
-    assert goal.holds(found) is holds
-
-
-def test_with_a_peer_the_goal_applies_to_the_ratio() -> None:
-    row = Row("latency", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3))
-    assert row.ratio == 2.5
-    assert row.holds is True
-
-
-def test_without_a_peer_the_goal_applies_to_the_value() -> None:
-    assert Row("missing", 1, "samples", goal=Goal("==", 0)).holds is False
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        Row("nothing asked", 1.0, "s"),
-        Row("not measured", None, "s", goal=Goal("<", 3)),
-        Row("no peer to compare with", 1.0, "s", Peer("cyclictest", None), Goal("<", 3)),
-        Row("not comparable", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unjudged="no SCHED_FIFO"),
-    ],
-)
-def test_a_row_that_cannot_be_judged_neither_holds_nor_fails(row: Row) -> None:
-    assert row.holds is None
+def test_a_row_holds_fails_or_cannot_be_judged(row: Row, holds: bool | None) -> None:
+    assert row.holds is holds
 
 
 def test_a_row_as_json_has_all_keys_and_the_reason_if_not_judged() -> None:
     plain = Row("p50", 3.0, "µs", Peer("ping", 1.5), Goal("<=", 3)).as_json()
     assert plain == {
-        "name": "p50",
-        "value": 3.0,
-        "unit": "µs",
-        "peer": {"name": "ping", "value": 1.5},
-        "ratio": 2.0,
-        "goal": "<= 3",
-        "holds": True,
-    }
+        "name": "p50", "value": 3.0, "unit": "µs", "peer": {"name": "ping", "value": 1.5},
+        "ratio": 2.0, "goal": "<= 3", "holds": True,
+    }  # fmt: skip
     unjudged = Row("p99", 3.0, "µs", goal=Goal("<=", 3), note="n = 3", unjudged="refused").as_json()
-    assert unjudged.keys() == KEYS | {"note"}
+    assert unjudged.keys() == plain.keys() | {"note"}
     assert unjudged["note"] == "refused; n = 3"
-    assert unjudged["holds"] is None
 
 
 def test_a_busy_machine_is_reported() -> None:
@@ -82,40 +62,32 @@ def test_a_busy_machine_is_reported() -> None:
     assert others.note == steal.note == "the machine was busy: figures are doubtful"
 
 
-def benchmark(rows: list[Row]) -> Benchmark:
-    return Benchmark("example", "An example", lambda options: list(rows))
+def named(name: str, *rows: Row, done: list[str] | None = None) -> Benchmark:
+    def measure(options: argparse.Namespace) -> list[Row]:
+        if done is not None:
+            done.append(name)
+        if not rows and done is None:
+            raise MeasurementError("no such program")
+        return list(rows)
+
+    return Benchmark(name, name.title(), measure)
 
 
-def test_the_rows_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "rows.json"
-    status = run([benchmark([Row("a", 1.5, "s", goal=Goal("<", 3))])], ["--json", str(path)])
-    assert status == 0
-    rows = json.loads(path.read_text())
-    assert rows[0] == Row("a", 1.5, "s", goal=Goal("<", 3)).as_json() | {"benchmark": "example"}
-    assert all(row.keys() >= KEYS for row in rows)
-    assert "An example" in capsys.readouterr().out
-
-
-def test_a_benchmark_that_cannot_run_states_the_reason_and_the_next_one_runs(
+def test_rows_and_reasons_are_printed_and_written_as_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(options: argparse.Namespace) -> list[Row]:
-        raise MeasurementError("no such program")
-
-    path = tmp_path / "rows.json"
-    status = run(
-        [Benchmark("broken", "Broken", fail), benchmark([Row("a", 1.0, "s")])],
-        ["--json", str(path)],
-    )
-    assert status == 1
-    rows = {row["name"]: row for row in json.loads(path.read_text())}
+    path, row = tmp_path / "rows.json", Row("a", 1.5, "s", goal=Goal("<", 3))
+    assert run([named("broken"), named("example", row)], ["--json", str(path)]) == 1
+    rows = {found["name"]: found for found in json.loads(path.read_text())}
     assert rows["broken"]["value"] is None
     assert "no such program" in rows["broken"]["note"]
-    assert rows["a"]["value"] == 1.0
-    assert "no such program" in capsys.readouterr().out
+    assert rows["a"] == row.as_json() | {"benchmark": "example"}
+    said = capsys.readouterr().out
+    assert "Example" in said
+    assert "no such program" in said
 
 
-def test_options_are_passed_to_their_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_are_passed_to_their_benchmark() -> None:
     seen: list[bool] = []
 
     def measure(options: argparse.Namespace) -> list[Row]:
@@ -127,30 +99,16 @@ def test_options_are_passed_to_their_benchmark(capsys: pytest.CaptureFixture[str
 
     run([Benchmark("example", "An example", measure, declare)], ["--install"])
     assert seen == [True]
-    assert capsys.readouterr().out
 
 
 def test_benchmarks_are_chosen_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     done: list[str] = []
-
-    def named(name: str) -> Benchmark:
-        def measure(options: argparse.Namespace) -> list[Row]:
-            done.append(name)
-            return []
-
-        return Benchmark(name, name, measure)
-
-    benchmarks = [named("a"), named("b"), named("c")]
-    assert run(benchmarks, ["c", "a"]) == 0
-    assert done == ["a", "c"]
-    assert run(benchmarks, []) == 0
+    benchmarks = [named(name, done=done) for name in "abc"]
+    assert run(benchmarks, ["c", "a"]) == run(benchmarks, []) == 0
     assert done == ["a", "c", "a", "b", "c"]
     with pytest.raises(SystemExit):
         run(benchmarks, ["d"])
     assert "no benchmark 'd'; benchmarks: a, b, c" in capsys.readouterr().err
-
-
-HALF = Goal("<=", 0.5)
 
 
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:
@@ -161,17 +119,19 @@ def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:
     return rounds
 
 
-def test_a_row_has_the_medians_of_the_rounds() -> None:
+def test_a_row_has_the_medians_of_the_rounds_or_the_median_of_their_ratios() -> None:
     row = rounds_of([12.0, 11.0, 900.0], [6.0]).row("cost", "µs", "us", "ours", "theirs", HALF)
     assert (row.value, row.peer, row.ratio, row.holds) == (12.0, Peer("theirs", 6.0), 2.0, False)
-
-
-def test_a_paired_ratio_is_the_median_of_the_ratios_per_round() -> None:
     rounds = rounds_of([1.0, 30.0, 3.0], [2.0, 60.0, 8.0])
     row = rounds.row("cost", "µs", "us", "ours", "theirs", HALF, paired=True)
     assert (row.value, row.peer) == (3.0, Peer("theirs", 8.0))
     assert row.ratio == 0.5  # not 3 / 8
-    assert row.holds is True
+    ours, theirs = iter([1.0, 30.0, 3.0]), iter([2.0, 60.0, 8.0])
+    again = compared(
+        "cost", "µs", lambda: next(ours), ("theirs", lambda: next(theirs)), HALF, rounds=3
+    )
+    assert again == row
+    assert compared("a", "/s", per_cpu_s(1, lambda: None), Peer("known", 2.0)).ratio is not None
 
 
 @pytest.mark.parametrize("side", ["ours", "theirs"])
@@ -184,14 +144,12 @@ def test_a_side_without_measurements_is_named_and_not_judged(side: str) -> None:
 
 
 def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_path: Path) -> None:
+    end = Row("1,000 loops: end of the run", 3.0, "s", Peer("the run", 60), Goal("<=", 0.1))
     rows = [
         ("size", Row("C", 4000, "lines", goal=Goal("<=", 5000))),
         ("startup", Row("noack run → first control step", 0.7, "s", goal=Goal("<=", 0.6))),
         ("startup", Row("the same, against a bare import", 0.7, "s", Peer("Python", 0.2))),
-        (
-            "fleet",
-            Row("1,000 loops: end of the run", 3.0, "s", Peer("the run", 60), Goal("<=", 0.1)),
-        ),
+        ("fleet", end),
     ]
     figures = rows_of_figures(rows)
     assert [row.unit for _, row in figures] == ["s", "s", "lines"]

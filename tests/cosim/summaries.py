@@ -6,14 +6,14 @@ from typing import Any
 from cosim.analysis.network_summary import summarise_run
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary, RunSummary
-from cosim.record.run_record import RecordedRun, RunRecord
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 
 
 def alone(record: RunRecord) -> RecordedRun:
     """Return the record of a run whose only loop has the network for itself."""
     network = RunRecord(
         record.scenario, record.source, [], record.reports, record.kind, record.earlier,
-        is_network=True,
+        roles=NETWORK_ROLES,
     )  # fmt: skip
     return RecordedRun(network, [record])
 

@@ -5,6 +5,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
+from noack.runtime.control_messages import message_json
 from noack.runtime.control_plane import label
 
 
@@ -106,7 +107,7 @@ class FakePlane:
 
     def answer(self, query: Query, content: Any) -> None:
         self.answers.append(content)
-        query.reply(query.key_expr, json.dumps(content))
+        query.reply(query.key_expr, message_json(content).decode())
 
     def refuse(self, query: Query, reason: str) -> None:
         query.reply_err(reason)
@@ -115,10 +116,10 @@ class FakePlane:
         query.dismissed = True
 
     def announce_change(self, content: Any) -> None:
-        self.announced.append(json.loads(json.dumps(content)))
+        self.announced.append(json.loads(message_json(content)))
 
     def acknowledge_rows(self, role: str, content: Any) -> None:
-        self.acknowledged[role] = json.loads(json.dumps(content))
+        self.acknowledged[role] = json.loads(message_json(content))
 
     def request_stop(self, reason: str) -> None:
         pass

@@ -7,6 +7,7 @@ import pytest
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.record.align import align_tables
+from cosim.record.processes import places_of_lives
 from cosim.record.run_record import Rows, RunRecord, load_record
 from noack.config.resolution import run_tables
 from noack.config.scenario_file import load
@@ -103,7 +104,7 @@ def test_the_run_continues_and_lists_its_restarts(restarted: live.Finished) -> N
 
 def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
     rows = record[table]
-    numbers: Rows = rows[record.life_numbers(OWNER[table]).places(rows) == place]
+    numbers: Rows = rows[places_of_lives(rows, record.begun_lives(OWNER[table])) == place]
     return numbers
 
 

@@ -189,5 +189,5 @@ def test_restarted_processes_serve_all_loops_again(scenario: Path, tmp_path: Pat
     for name in NAMES:
         record = record_of(run, name)
         assert replay(record).bit_exact
-        assert len(record.life_numbers("sensor").begun) == 2
-        assert len(record.life_numbers("netem").begun) == 2
+        assert len(record.begun_lives("sensor")) == 2
+        assert len(record.begun_lives("netem")) == 2

@@ -327,30 +327,16 @@ def print_worst(
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate, trigger: str) -> str:
-    if trigger == "sampled":
-        return _sampled_quantity(objective, certificate)
-    rate = certificate.alpha_per_s
-    if certificate.constants is not None:
-        rate = certificate.constants.rate_per_s
-    symbol = "α" if rate == certificate.alpha_per_s else f"{rate:.3g}"
+    constants, sampled = certificate.constants, trigger == "sampled"
+    alpha = certificate.alpha_per_s
+    rate = (0.0 if sampled else alpha) if constants is None else constants.rate_per_s
+    symbol = "α" if rate == alpha and not sampled else f"{rate:.3g}"
     growth = f" e^({symbol}t)" if rate else ""
+    if sampled and _is_shaped(certificate):
+        growth = ", scaled"
     return {
-        Objective.ERROR: f"Δ: ‖e_c‖{growth} / β",
-        Objective.STATE: f"X: ‖x‖{growth}",
-        Objective.COST: "∫ ‖x‖² dt",
-        Objective.INTER_EVENT: "inter-event time, s",
-    }[objective]
-
-
-def _sampled_quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
-    constants, scaled = certificate.constants, ""
-    if _is_shaped(certificate):
-        scaled = ", scaled"
-    elif constants is not None and constants.rate_per_s:
-        scaled = f" e^({constants.rate_per_s:.3g}t)"
-    return {
-        Objective.ERROR: f"‖e_c‖{scaled}",
-        Objective.STATE: f"‖x‖{scaled}",
+        Objective.ERROR: f"‖e_c‖{growth}" if sampled else f"Δ: ‖e_c‖{growth} / β",
+        Objective.STATE: f"‖x‖{growth}" if sampled else f"X: ‖x‖{growth}",
         Objective.COST: "∫ ‖x‖² dt",
         Objective.INTER_EVENT: "inter-event time, s",
     }[objective]

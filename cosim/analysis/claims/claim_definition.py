@@ -9,6 +9,7 @@ import numpy as np
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
 from noack.core.linear_systems import row_norms
+from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 ROUNDING = 1e-9
@@ -42,6 +43,15 @@ class Bound(NamedTuple):
     is_lower: bool = False
 
 
+class Findings(NamedTuple):
+    """What a claim says about some samples of a run."""
+
+    bound: Bound | None = None
+    """None if there is no claim about this run."""
+    envelope: Envelope | None = None
+    """The bound as a curve."""
+
+
 @dataclass(frozen=True)
 class ClaimDefinition:
     """A claim that needs no certificate."""
@@ -49,23 +59,34 @@ class ClaimDefinition:
     statement: str
     source: str
     assumes: str
-    bound: Callable[[RunEvidence, Samples], Bound | None]
-    """Returns the bound at some samples; None if there is no claim about this run."""
-    envelope: Callable[[RunEvidence, Samples], Envelope | None] = lambda run, samples: None
-    needs_ideal_loop: bool = False
+    find: Callable[[RunEvidence, Samples], Findings]
+    needs_ideal_loop: bool
     """A run that exceeds the bound does not refute it."""
 
 
 @dataclass(frozen=True)
 class CertifiedClaim:
-    """A claim of a certificate; evaluated for each certificate of the scenario."""
+    """A claim of a certificate with constants; it is evaluated for each one of the scenario."""
 
     statement: str
-    bound: Callable[[RunEvidence, Samples, ScenarioCertificate], Bound | None]
-    envelope: Callable[[RunEvidence, Samples, ScenarioCertificate], Envelope | None] = (
-        lambda run, samples, one: None
-    )
+    find: Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]
     assumes: str = "the conditions of the certificate"
+
+
+def claim(
+    statement: str, source: str, assumes: str, *, needs_ideal_loop: bool = False
+) -> Callable[[Callable[[RunEvidence, Samples], Findings]], ClaimDefinition]:
+    """Make a function the definition of a claim."""
+    return lambda find: ClaimDefinition(statement, source, assumes, find, needs_ideal_loop)
+
+
+def certified(
+    statement: str,
+) -> Callable[
+    [Callable[[RunEvidence, Samples, ScenarioCertificate, Constants], Findings]], CertifiedClaim
+]:
+    """Make a function the definition of a claim of certificates."""
+    return lambda find: CertifiedClaim(statement, find)
 
 
 def upper_shares(observed: Reals, bound: Reals) -> Reals:
@@ -90,14 +111,17 @@ def controller_error_bound(
     return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
 
 
-def inter_event_bound(samples: Samples, least_s: float, void: VoidFrom | None) -> Bound:
-    """Return a lower bound of the inter-event time."""
+def least_inter_event_time(
+    run: RunEvidence,
+    samples: Samples,
+    least_s: float,
+    void: VoidFrom | None,
+    label: str,
+    kind: Literal["certified", "printed"] = "certified",
+) -> Findings:
+    """Return a lower bound of the inter-event time, and the same as a line over the run."""
     t_s, passed_s = samples.inter_event_s
     formula = "t_(i+1) − t_i ≥ {:.4g} s"
-    return Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
-
-
-def inter_event_envelope(run: RunEvidence, label: str, least_s: float) -> Envelope:
-    """Return the same bound as a line over the run."""
+    bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])
-    return Envelope(label, "inter_event", ends_s, np.full(2, least_s))
+    return Findings(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))

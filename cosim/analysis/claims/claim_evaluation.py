@@ -18,10 +18,10 @@ the last time that all of them reached, because the loop is incomplete after it.
 import importlib
 import math
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
-from typing import TypeVar
+from functools import cache, cached_property, lru_cache, partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from cosim.analysis.claims.claim_definition import (
     CertifiedClaim,
     ClaimDefinition,
     Envelope,
+    Findings,
 )
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import RunEvidence, RunPart, Samples
@@ -57,6 +58,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
 from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
 
@@ -67,7 +69,6 @@ _ACKNOWLEDGED = (
     'network.protocol = "ack": x_s is reset when an update is acknowledged, and not at every '
     "event as (I1), and every claim that follows from it, assumes"
 )
-_CERTIFIED = "certificate "
 _Kind = TypeVar("_Kind", ClaimDefinition, CertifiedClaim)
 
 
@@ -109,6 +110,11 @@ class ClaimCheck:
         self._ratio: float | None = None
         self._exceeded_s: float | None = None
         self._bound: Bound | None = None
+
+    @property
+    def is_claimed(self) -> bool:
+        """Whether there is a claim about the run."""
+        return self._bound is not None
 
     def add(self, bound: Bound) -> None:
         """Add the bound at the next samples; formula and constants are the same in every part."""
@@ -159,6 +165,32 @@ class ClaimCheck:
         )  # fmt: skip
 
 
+class _Instance(NamedTuple):
+    """A claim about a run, by a certificate or without one."""
+
+    find: Callable[[Samples], Findings]
+    check: ClaimCheck
+    curve: list[Envelope]
+    """The parts of its curve."""
+    certificate: ScenarioCertificate | None = None
+    outside: str | None = None
+    """Why the certificate does not cover the run's plant."""
+
+    def take(self, samples: Samples, columns: int, *, counts: bool) -> None:
+        """Check the next samples, and add to the curve, which is thinned if the run is long."""
+        bound, envelope = self.find(samples)
+        if counts and bound is not None:
+            if self.outside is not None:
+                bound = bound._replace(void=VoidFrom(0.0, self.outside))
+            self.check.add(bound)
+        if envelope is None or (envelope.quantity == "inter_event" and self.curve):
+            return  # the same line in every part
+        if envelope.quantity != "inter_event":
+            keep = decimate(envelope.t_s, envelope.values, columns)
+            envelope = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
+        self.curve.append(envelope)
+
+
 class ClaimEvaluation(RunEvidence):
     """The claims about one run, or about one part of it."""
 
@@ -169,77 +201,57 @@ class ClaimEvaluation(RunEvidence):
         if self.record.scenario.protocol.acknowledges:
             what = "x_c − x_s is the sum of the missed jumps"
             return [void_claim(what, "(I1)", 0.0, _ACKNOWLEDGED)]
-        checks, _ = self._checked
-        found = [checks[key].result() for key in checks if not key.startswith(_CERTIFIED)]
-        for i, certificate in enumerate(self.certificates):
-            if certificate.constants is None:
+        found: list[Claim] = []
+        for certificate in (None, *self.certificates):
+            if certificate is not None and certificate.constants is None:
                 what = f"a certificate for {certificate.scope}"
                 found.append(void_claim(what, certificate.source, 0.0, certificate.void or ""))
-            mine = f"{_CERTIFIED}{i} "
-            found += [checks[key].result() for key in checks if key.startswith(mine)]
+            found += [
+                instance.check.result()
+                for instance in self._checked
+                if instance.certificate is certificate and instance.check.is_claimed
+            ]
         return found
 
     @cached_property
-    def _checked(self) -> tuple[dict[str, ClaimCheck], dict[str, list[Envelope]]]:
-        """The checks of all claims, and the curves of all bounds, from one pass over the run."""
-        checks: dict[str, ClaimCheck] = {}
-        curves: dict[str, list[Envelope]] = {}
+    def _checked(self) -> list[_Instance]:
+        """All claims, checked in one pass over the run."""
+        instances = list(self._instances())
         columns, counts = self.record.slice_columns, self.facts.any_in_common
         for samples in self.samples():
-            for key, check, bound in self._bounds(samples) if counts else ():
-                checks.setdefault(key, check).add(bound)
-            for key, envelope in self._envelopes(samples):
-                if envelope.quantity == "inter_event":  # the same line in every part
-                    curves.setdefault(key, [envelope])
-                    continue
-                keep = decimate(envelope.t_s, envelope.values, columns)
-                thin = envelope._replace(t_s=envelope.t_s[keep], values=envelope.values[keep])
-                curves.setdefault(key, []).append(thin)
-        return checks, curves
+            for instance in instances:
+                instance.take(samples, columns, counts=counts)
+        return instances
 
-    def _bounds(self, samples: Samples) -> Iterator[tuple[str, ClaimCheck, Bound]]:
-        """Yield each claim's name, a new check, and its bound at some samples."""
-        until_s = self.part.until_s
-        for number, claim in enumerate(definitions(ClaimDefinition)):
-            if (bound := claim.bound(self, samples)) is not None:
-                unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
-                check = ClaimCheck(claim.statement, claim.source, until_s, unmet)
-                yield f"{number}", check, bound
-        for i, certificate in enumerate(self.certificates):
-            if certificate.constants is None:
+    def _instances(self) -> Iterator[_Instance]:
+        """Yield the claims of each certificate, and those that need none."""
+        until_s, scenario = self.part.until_s, self.record.scenario
+        for certificate in self.certificates:
+            if (constants := certificate.constants) is None:
                 continue
-            scenario = self.record.scenario
             outside = outside_box(scenario) if certificate.scope != OWN_PLANT else None
-            for number, one in enumerate(definitions(CertifiedClaim)):
-                if (bound := one.bound(self, samples, certificate)) is not None:
-                    if outside is not None:
-                        bound = bound._replace(void=VoidFrom(0.0, outside))
-                    check = ClaimCheck(one.statement, certificate.source, until_s)
-                    yield f"{_CERTIFIED}{i} {number}", check, bound
+            for one in definitions(CertifiedClaim):
+                check = ClaimCheck(one.statement, certificate.source, until_s)
+                given = {"certificate": certificate, "constants": constants}
+                find = partial(one.find, self, **given)
+                yield _Instance(find, check, [], certificate, outside)
+        for claim in definitions(ClaimDefinition):
+            unmet = _IDEAL_LOOP if claim.needs_ideal_loop else ""
+            check = ClaimCheck(claim.statement, claim.source, until_s, unmet)
+            yield _Instance(partial(claim.find, self), check, [])
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds; those of a long run are thinned."""
         if self.record.scenario.protocol.acknowledges:
             return []
-        _, curves = self._checked
         return [
-            parts[0]._replace(
-                t_s=np.concatenate([one.t_s for one in parts]),
-                values=np.concatenate([one.values for one in parts]),
+            curve[0]._replace(
+                t_s=np.concatenate([part.t_s for part in curve]),
+                values=np.concatenate([part.values for part in curve]),
             )
-            for parts in curves.values()
+            for curve in (instance.curve for instance in self._checked)
+            if curve
         ]
-
-    def _envelopes(self, samples: Samples) -> Iterator[tuple[str, Envelope]]:
-        for i, certificate in enumerate(self.certificates):
-            if certificate.constants is None:
-                continue
-            for number, one in enumerate(definitions(CertifiedClaim)):
-                if (envelope := one.envelope(self, samples, certificate)) is not None:
-                    yield f"{_CERTIFIED}{i} {number}", envelope
-        for number, claim in enumerate(definitions(ClaimDefinition)):
-            if (envelope := claim.envelope(self, samples)) is not None:
-                yield f"{number}", envelope
 
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
@@ -253,11 +265,13 @@ _PACES = {
 """By process: the table and column with the times of its steps."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class RunClaims:
     """The claims about a run, part by part; each property is computed once."""
 
     record: RunRecord
+    certificates: Sequence[ScenarioCertificate] | None = None
+    """Those of the run's scenario, if they are known."""
 
     @cached_property
     def _judged(self) -> RunRecord:
@@ -279,8 +293,11 @@ class RunClaims:
         record = self._judged
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
-        part = RunPart(record, 0.0, _seconds(first_ns), None, void_at_setpoint(record.scenario))
-        own = record if self._setpoint is None else _part_of(record, record.scenario, 0, None)
+        void, certificates = void_at_setpoint(record.scenario), self.certificates
+        own = record
+        if self._setpoint is not None:
+            own, certificates = _part_of(record, record.scenario, 0, None), None
+        part = RunPart(record, 0.0, _seconds(first_ns), None, void, certificates)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns

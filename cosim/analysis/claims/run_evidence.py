@@ -57,7 +57,8 @@ from noack.theory.certificates.conditions import (
     ideal_conditions,
     nominal_conditions,
 )
-from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.certificates.scenario_certificates import box, certify, own_plant
+from noack.theory.certificates.solution import Search, completed
 from noack.theory.paper.error_bounds import ErrorMonitor
 from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
@@ -79,6 +80,8 @@ class RunPart(NamedTuple):
     no input before."""
     void: Mapping[str, str] = {}
     """By scope: why there is no certificate."""
+    certificates: Sequence[ScenarioCertificate] | None = None
+    """Those of the part's scenario, if they are known."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,10 @@ class RunEvidence:
     def certificates(self) -> list[ScenarioCertificate]:
         """The certificates of the run's scenario under the scenario's schedule."""
         found, void = [], self.part.void
-        for one in scheduled_certificates(self.record.scenario, self.part.start_error):
+        scheduled = self.part.certificates
+        if scheduled is None:
+            scheduled = scheduled_certificates(self.record.scenario, self.part.start_error)
+        for one in scheduled:
             if one.scope in void:
                 one = replace(one, constants=None, floor_constants=None, void=void[one.scope])
             found.append(one)
@@ -219,6 +225,8 @@ class RunEvidence:
         found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
         whole = self.part.whole or self.record
         for role in LOOP_ROLES:
+            if whole.is_complete(role):
+                continue
             gaps_ns = filter(None, (life.hole_ns for life in whole.lives(role)))
             times_s = [ns * 1e-9 - self.part.from_s for ns in gaps_ns]
             why = f"rows of {role} are missing from the record"
@@ -298,15 +306,31 @@ def scheduled_certificates(
 ) -> list[ScenarioCertificate]:
     """Return the certificates of a resolved scenario under its schedule, if it can have any.
 
-    A part that starts with an input of the part before has a ``start_error``.
+    A part of a run that starts with an input of the part before has a ``start_error``.
     """
-    if not scenario.coverage.is_certifiable:
-        return []
-    conditions, error = allowed_conditions(scenario), 0.0
-    if start_error is not None:
-        conditions, error = conditions._replace(start_s=0.0), start_error
-    found = [certify(scenario, conditions, error), certify_box(scenario, conditions, error)]
-    return [certificate for certificate in found if certificate is not None]
+    (found,) = certificates_together([scenario], start_error)
+    return found
+
+
+def certificates_together(
+    scenarios: Sequence[Scenario], start_error: float | None = None
+) -> list[list[ScenarioCertificate]]:
+    """Return the certificates of several scenarios; see :func:`scheduled_certificates`."""
+    searches: list[Search[ScenarioCertificate]] = []
+    numbers: list[int] = []
+    for number, scenario in enumerate(scenarios):
+        if not scenario.coverage.is_certifiable:
+            continue
+        conditions, error = allowed_conditions(scenario), 0.0
+        if start_error is not None:
+            conditions, error = conditions._replace(start_s=0.0), start_error
+        for scope in filter(None, (own_plant(scenario, error), box(scenario, error))):
+            searches.append(scope.search(conditions))
+            numbers.append(number)
+    found: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
+    for number, certificate in zip(numbers, completed(searches), strict=True):
+        found[number].append(certificate)
+    return found
 
 
 class _Start(NamedTuple):

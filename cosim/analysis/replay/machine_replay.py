@@ -6,8 +6,8 @@ recorded inputs and compares each row that the machine writes. The class explain
 difference, and answers what the core asks: for users' code, and for changes of settings.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from controller_node.controller import controllers_of
 from cosim.analysis.replay.replay_result import ProcessReplay, difference, rows_differ
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.processes import RowCounts
+from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
@@ -48,33 +48,9 @@ _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _DAMAGE = (ArithmeticError, LookupError, ValueError, CallerError)
 """Errors of a machine that gets an input from a damaged record, which no run can have."""
 _HEADER_WORDS = 3
+SEQUENCE, TIME, VECTOR = 0, 1, 2
+"""Columns of the words of a message; those of its vector have the bits of its entries."""
 _DATAGRAM_WORDS = 1 + PACKET_HEAD_BYTES // 8
-
-
-class SentMessages(NamedTuple):
-    """Messages of a flow."""
-
-    sequences: Numbers
-    t_ns: Numbers
-    vectors: NDArray[np.float64]
-    """(k, entries)"""
-
-    def at(self, places: slice | Numbers) -> "SentMessages":
-        """Return those at some places."""
-        return SentMessages(self.sequences[places], self.t_ns[places], self.vectors[places])
-
-    def followed_by(self, more: "SentMessages") -> "SentMessages":
-        """Return these and more."""
-        if not len(self.sequences):
-            return more
-        return SentMessages(
-            np.concatenate([self.sequences, more.sequences]),
-            np.concatenate([self.t_ns, more.t_ns]),
-            np.concatenate([self.vectors, more.vectors]),
-        )
-
-
-NONE_SENT = SentMessages(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0)))
 
 
 class InputReplay:
@@ -117,7 +93,7 @@ class InputReplay:
         for place in range(len(tables), 4):
             replay.tables[place].count = 0
         order = np.ascontiguousarray(order, np.int64)
-        self._sent = np.zeros(((1 + self._is_network) * len(order), replay.sent_width), np.int64)
+        self._sent = np.empty(((1 + self._is_network) * len(order), replay.sent_width), np.int64)
         replay.order, replay.count = pointer_to(order, "int64_t *"), len(order)
         replay.sent, replay.sent_count = pointer_to(self._sent, "int64_t *"), 0
         replay.next = 0
@@ -141,13 +117,15 @@ class InputReplay:
             self._machine.take_rows()
         return int(replay.next)
 
-    def sent_in(self, flow: Flow) -> SentMessages:
-        """Return the messages of a flow that the machine sent in the newest part."""
+    def sent_in(self, flow: Flow) -> Numbers:
+        """Return the messages of a flow that the machine sent in the newest part, (k, 2 + n).
+
+        The words of a message are its sequence number, its time, and its vector's n entries.
+        """
         sent = self._sent[: self._core.sent_count]
-        entries = self._sizes.get(flow, 0)
-        words = sent[sent[:, 0] == flow][:, : _HEADER_WORDS + entries]
-        vectors = np.ascontiguousarray(words[:, _HEADER_WORDS:]).view(np.float64)
-        return SentMessages(words[:, 1].copy(), words[:, 2].copy(), vectors)
+        mine = sent[:, 0] == flow
+        words = sent if mine.all() else sent[mine]
+        return words[:, 1 : _HEADER_WORDS + self._sizes.get(flow, 0)]
 
     def forwarded(self) -> tuple[Numbers, NDArray[np.void]]:
         """Return flows and heads of the datagrams that left the network in the newest part."""
@@ -247,13 +225,18 @@ def received_columns(table: str, dtype: np.dtype[np.void]) -> list[str]:
     return ["y", "u_applied"] if "y" in names else ["x"]
 
 
-def received_vectors(table: str, rows: Rows) -> tuple[NDArray[np.float64], list[str]]:
-    """Return the vectors of the received messages, (k, n), and the names of their entries."""
+def received_words(table: str, rows: Rows) -> tuple[Numbers, list[str]]:
+    """Return the words of the received messages, (k, 2 + n), and the names of the n entries."""
     columns = received_columns(table, rows.dtype)
-    vectors = np.hstack([np.zeros((len(rows), 0)), *(rows[column] for column in columns)])
-    return vectors, [
-        entry for column in columns for entry in entry_names(column, rows[column].shape[1])
-    ]
+    names = [entry for name in columns for entry in entry_names(name, rows.dtype[name].shape[0])]
+    words = np.empty((len(rows), VECTOR + len(names)), np.int64)
+    words[:, SEQUENCE], words[:, TIME] = rows["sequence"], rows["t_ns"]
+    first = VECTOR
+    for name in columns:
+        last = first + rows.dtype[name].shape[0]
+        words[:, first:last].view(np.float64)[...] = rows[name]
+        first = last
+    return words, names
 
 
 def _recorded_table(table: str, rows: Rows) -> dict[str, Any]:
@@ -310,7 +293,7 @@ class MachineReplay:
 
     def __init__(self, role: str, record: RunRecord) -> None:
         self._tables = record.owned_by(role)
-        self._numbers = record.life_numbers(role)
+        self._begun = record.begun_lives(role)
         self._lives = [_LifeReplay(role, record.scenario, life) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
@@ -318,19 +301,10 @@ class MachineReplay:
     def take(self, part: Slice) -> None:
         """Replay the next part of the record."""
         self.newest = []
-        for owned, life in zip(self._by_life(part), self._lives, strict=True):
-            if any(map(len, owned.values())):
-                self.newest += life.take(owned)
-
-    def _by_life(self, part: Slice) -> Iterator[Slice]:
-        """Yield the rows of each generation."""
         owned = {table: part[table] for table in self._tables}
-        if len(self._lives) == 1:
-            yield owned
-            return
-        places = {table: self._numbers.places(rows) for table, rows in owned.items()}
-        for i in range(len(self._lives)):
-            yield {table: rows.compress(places[table] == i) for table, rows in owned.items()}
+        for own, life in zip(split_by_life(owned, self._begun), self._lives, strict=True):
+            if any(map(len, own.values())):
+                self.newest += life.take(own)
 
     @property
     def results(self) -> tuple[ProcessReplay, ...]:
@@ -346,7 +320,7 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: RowCounts) -> None:
+    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
         self._role, self._scenario, self._life = role, scenario, life
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.replay.machine_replay import (
-    NONE_SENT,
+    SEQUENCE,
+    TIME,
+    VECTOR,
     MachineReplay,
     Numbers,
-    SentMessages,
-    received_vectors,
+    received_words,
 )
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.record_source import Rows, Slice
@@ -30,7 +31,7 @@ from noack.protocol.record_tables import (
     direction_of,
 )
 from noack.protocol.topology import ENDS
-from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, Message, datagram_bytes
+from noack.protocol.wire_format import HEADER_ROW, MAGIC, Flow, datagram_bytes
 
 _RECEIVED = {
     Flow.MEASUREMENT: SENSOR_MEASUREMENT,
@@ -50,7 +51,7 @@ class MessageComparison:
         self._record, self._machines = record, machines
         network = record.scenario.network.flows
         self._hops = [
-            _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number or 0, network)
+            _Hop(leg, table, machines[ENDS[flow].sender], flow, record.number, network)
             for leg, table, flow in _hops(network)
         ]
 
@@ -141,8 +142,8 @@ class _Hop:
         self._direction = direction_of(flow)
         self._selects = table == NETEM_PACKET and len(network) > 1
         self._was_forwarded = table != NETEM_PACKET and flow in network
-        self._sent = NONE_SENT
-        """Messages that may still be received, in order of their numbers."""
+        self._sent: Numbers = np.zeros((0, VECTOR), np.int64)
+        """Messages that may still be received, in order of their numbers, (k, 2 + n)."""
         self._survivors: set[int] = set()
         self._waiting: Rows | None = None
         self._newest = -1
@@ -189,8 +190,8 @@ class _Hop:
         self._received += len(self._rows)
         self._read += len(rows)
         # Every receiver accepts only messages that are newer than those before.
-        first = int(np.searchsorted(self._sent.sequences, self._newest))
-        self._sent = self._sent.at(slice(first, None))
+        first = int(np.searchsorted(self._sent[:, SEQUENCE], self._newest))
+        self._sent = self._sent[first:]
         self._survivors = {k for k in self._survivors if k >= self._newest}
 
     def result(self, *, network_is_whole: bool) -> MessagesReplay:
@@ -206,40 +207,41 @@ class _Hop:
             leg=self._leg, received=self._received, compared=self._compared, difference=found
         )
 
-    def _add(self, sent: SentMessages) -> None:
+    def _add(self, sent: Numbers) -> None:
         """Add messages; of several with the same number, the last one counts."""
-        sent = self._sent.followed_by(sent)
-        if (np.diff(sent.sequences) < 0).any():
-            sent = sent.at(np.argsort(sent.sequences, kind="stable"))
+        if len(self._sent):
+            sent = np.concatenate([self._sent, sent])
+        if (np.diff(sent[:, SEQUENCE]) < 0).any():
+            sent = sent[np.argsort(sent[:, SEQUENCE], kind="stable")]
         self._sent = sent
+
+    def _places(self, sequences: Numbers) -> tuple[Numbers, NDArray[np.bool_]]:
+        """Return the place of each received number among the sent ones, and whether it is there."""
+        sent = np.append(self._sent[:, SEQUENCE], 0)
+        places = np.searchsorted(sent[:-1], sequences, "right") - 1
+        return places, (places >= 0) & (sent[places] == sequences)
 
     def _compare_vectors(self) -> None:
         """Compare sequence number, time and vector of the received messages."""
-        rows = self._rows
-        vectors, entries = received_vectors(self._table, rows)
-        numbers = rows["sequence"]
+        words, entries = received_words(self._table, self._rows)
+        numbers = words[:, SEQUENCE]
         newest = np.maximum.accumulate(np.append(self._newest, numbers))
-        sent = self._sent
-        places = np.searchsorted(sent.sequences, numbers, "right") - 1
-        known = np.flatnonzero((places >= 0) & (np.append(sent.sequences, 0)[places] == numbers))
-        self._compared += len(known)
-        equal = np.zeros(len(rows), np.bool_)
-        if len(known):
-            at = places[known]
-            same = (vectors[known].view(np.int64) == sent.vectors[at].view(np.int64)).all(axis=1)
-            same &= rows["t_ns"][known] == sent.t_ns[at]
-            equal[known] = same & (numbers > newest[:-1])[known]
+        places, known = self._places(numbers)
+        self._compared += int(known.sum())
         self._newest = int(newest[-1])
-        for row in np.flatnonzero(~equal).tolist():
-            sequence, t_ns = int(numbers[row]), int(rows["t_ns"][row])
-            if sequence <= newest[row]:
+        is_newer, sent = numbers > newest[:-1], self._sent[places] if known.any() else words
+        if known.all() and is_newer.all() and (words == sent).all():
+            return
+        for row in np.flatnonzero(~(known & is_newer & (words == sent).all(axis=1))).tolist():
+            sequence, t_ns = words[row, :VECTOR].tolist()
+            if not is_newer[row]:
                 self._differs(row, "not newer than the message before", "sequence", sequence)
-            message = self._find(row, sequence, "sequence", sequence)
-            if message is None:
-                continue
-            if t_ns != message.t_ns:
-                self._differs(row, "differs from the message sent", "t_ns", t_ns, message.t_ns)
-            elif entry := first_entry(vectors[row], message.vector):
+            if not known[row]:
+                kind = _CONTENT if sequence < 0 else _SENT
+                self._differs(row, "was never sent", "sequence", sequence, kind=kind)
+            elif t_ns != (sent_ns := int(sent[row, TIME])):
+                self._differs(row, "differs from the message sent", "t_ns", t_ns, sent_ns)
+            elif entry := first_entry(*(of[row, VECTOR:].view(np.float64) for of in (words, sent))):
                 place, *values = entry
                 self._differs(row, "differs from the message sent", entries[place], *values)
 
@@ -253,19 +255,18 @@ class _Hop:
             self._run = kinds[np.argmax(counts)]
         sequences = np.where(is_valid, headers["sequence"].view(np.int64), -1)
         self._newest = int(max(self._newest, sequences.max(initial=-1)))
-        sent = self._sent
-        places = np.searchsorted(sent.sequences, sequences, "right") - 1
-        known = (places >= 0) & (np.append(sent.sequences, 0)[places] == sequences)
+        places, known = self._places(sequences)
         self._compared += int(known.sum())
-        expected, at = np.zeros(len(headers), HEADER_ROW), places[known]
+        entries = self._sent.shape[1] - VECTOR
+        expected, sent = np.zeros(len(headers), HEADER_ROW), self._sent[places[known]]
         if known.any():
             own = expected[known]
             own["magic"], own["flow"] = MAGIC, self._flow
-            own["dimension"], own["loop"] = sent.vectors.shape[1], self._loop
+            own["dimension"], own["loop"] = entries, self._loop
             own["version"], own["run_id"] = (0, 0) if self._run is None else self._run.tolist()
-            own["sequence"], own["t_ns"] = sent.sequences[at], sent.t_ns[at]
+            own["sequence"], own["t_ns"] = sent[:, SEQUENCE], sent[:, TIME]
             expected[known] = own
-        size_bytes = datagram_bytes(sent.vectors.shape[1])
+        size_bytes = datagram_bytes(entries)
         differs = first_bytes(headers) != first_bytes(expected)
         for row in np.flatnonzero(differs.any(axis=1) | (sizes != size_bytes)).tolist():
             head, size = self._rows["head"][row].tobytes(), int(sizes[row])
@@ -291,17 +292,6 @@ class _Hop:
             if sequence not in self._survivors:
                 what = "netem did not forward it"
                 self._differs(row, what, "sequence", sequence, kind=_FORWARDED)
-
-    def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
-        """Return the message of a number if its sender was replayed that far and sent it."""
-        place = int(np.searchsorted(self._sent.sequences, sequence, "right")) - 1
-        if place >= 0 and self._sent.sequences[place] == sequence:
-            return Message(
-                self._flow, sequence, int(self._sent.t_ns[place]), self._sent.vectors[place]
-            )
-        kind = _CONTENT if sequence < 0 else _SENT
-        self._differs(row, "was never sent", column, value, kind=kind)
-        return None
 
     def _differs(
         self, row: int, what: str, column: str, recorded: object, replayed: object = None,

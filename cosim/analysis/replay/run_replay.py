@@ -19,13 +19,8 @@ def replay(record: RunRecord) -> Replay:
     the network, or that of a loop, whose network is not replayed. The record is read part by part,
     so that memory does not grow with the length of the run.
     """
-    roles = ("netem",) if record.is_network else LOOP_ROLES
-    machines = {
-        role: MachineReplay(role, record)
-        for role in roles
-        if record.number is None or role != "netem"
-    }
-    messages = None if record.is_network else MessageComparison(record, machines)
+    machines = {role: MachineReplay(role, record) for role in record.roles}
+    messages = MessageComparison(record, machines) if "sensor" in machines else None
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         for part in record.slices():
             for machine in machines.values():

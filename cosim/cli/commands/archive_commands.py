@@ -2,17 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.record.run_directory import chosen_run
 from noack.core.errors import ExitStatus
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @cli.command(cli.RUNS, 92, [
@@ -23,24 +20,21 @@ def archive(
     run_dir: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", help="File of the archive; NAME.noack.zip in this folder by default."
-        ),
-    ] = None,
+    out: cli.OutOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Archive a run: one file with everything that its repetition needs.
 
     `noack reproduce` repeats it.
+
+    Options:
+        out: File of the archive; NAME.noack.zip in this folder by default.
     """
-    from cosim.live.progress import PatientConsole
     from cosim.studies.run_archive import SUFFIX, write_archive
 
     chosen = chosen_run(run_dir, runs)
     path = out or Path(f"{chosen.resolve().name}{SUFFIX}")
-    with PatientConsole(stderr=True).status("archiving"):
+    with cli.status("archiving"):
         manifest = write_archive(chosen, path)
     if json:
         cli.print_json({"archive": str(path)} | manifest.model_dump(mode="json"))
@@ -54,39 +48,29 @@ def archive(
     ("noack reproduce result.noack.zip --into again --json", "keep both runs; print JSON"),
 ])  # fmt: skip
 def reproduce(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Archive of a run.")],
+    file: Annotated[Path, Argument(metavar="FILE")],
     *,
-    run_code: Annotated[
-        bool,
-        typer.Option(
-            "--run-code",
-            help="Run the code that the archive contains, if its plant, trigger or controller is "
-            "a Python class or an FMU.",
-        ),
-    ] = False,
-    long: Annotated[
-        bool,
-        typer.Option("--long", help="Repeat a run of more than a million steps, too."),
-    ] = False,
-    into: Annotated[
-        Path | None,
-        typer.Option("--into", help="Keep the archived run and its repetition in this new folder."),
-    ] = None,
+    run_code: Annotated[bool, Option("--run-code")] = False,
+    long: Annotated[bool, Option("--long")] = False,
+    into: Path | None = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Repeat an archived run: simulate it again, or replay its record, bit for bit.
 
     Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
+
+    Options:
+        file: Archive of a run.
+        run_code: Run the code that the archive contains, if its plant, trigger or controller is a
+            Python class or an FMU.
+        long: Repeat a run of more than a million steps, too.
+        into: Keep the archived run and its repetition in this new folder.
     """
-    from cosim.live.progress import PatientConsole
     from cosim.studies.run_repetition import print_repetition, repeat_archive
 
-    with PatientConsole(stderr=True).status("repeating"):
+    with cli.status("repeating"):
         found = repeat_archive(file, run_code=run_code, long=long, into=into)
-    if json:
-        cli.print_json(found.to_json())
-    else:
-        print_repetition(cli.console(), found)
+    cli.show(json, found.to_json, print_repetition, found)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
@@ -95,11 +79,8 @@ def reproduce(
     ("noack collect runs/latest copy", "from a folder that was copied here"),
 ])  # fmt: skip
 def collect(
-    run_dir: Annotated[Path, typer.Argument(help="Run directory.")],
-    sources: Annotated[
-        list[str],
-        typer.Argument(help="Folders named by the processes: FOLDER, or HOST:FOLDER for scp."),
-    ],
+    run_dir: Annotated[Path, Argument()],
+    sources: Annotated[list[str], Argument()],
     *,
     json: cli.JsonOption = False,
 ) -> int:
@@ -107,6 +88,10 @@ def collect(
 
     A process that was invited keeps its rows on its host when the recorder is out of reach at the
     end. It then prints their folder.
+
+    Options:
+        run_dir: Run directory.
+        sources: Folders named by the processes: FOLDER, or HOST:FOLDER for scp.
     """
     from cosim.live.finalize import reopen
     from cosim.output.run_verdict import print_outcome
@@ -120,10 +105,7 @@ def collect(
         merged, roles = collection.collect(run_dir, source, reopen)
         outcome = replace(merged, run_dir=run_dir)
         print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
-    if json:
-        cli.print_json(outcome.summary.to_json())
-    else:
-        print_outcome(cli.console(), outcome)
+    cli.show(json, outcome.summary.to_json, print_outcome, outcome)
     return ExitStatus.OK
 
 
@@ -135,29 +117,23 @@ def collect(
 ])  # fmt: skip
 def compare(
     directories: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN...",
-            help="Two to seven run directories, live or simulated; RUN:NAME is a loop.",
-            autocompletion=completion.run_directories,
-        ),
+        list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)
     ],
     *,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            help="File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).",
-        ),
-    ] = cli.DEFAULT_RUNS / "comparison.html",
+    out: Path = cli.DEFAULT_RUNS / "comparison.html",
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
-    """Compare runs: key numbers, settings that differ, curves overlaid."""
-    from cosim.live.progress import PatientConsole
+    """Compare runs: key numbers, settings that differ, curves overlaid.
+
+    Options:
+        directories: Two to seven run directories, live or simulated; RUN:NAME is a loop.
+        out: File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).
+    """
+    from cosim.output.result_tables import ResultTable, terminal_table
     from cosim.studies.run_comparison import compare_runs
 
-    with PatientConsole(stderr=True).status("comparing"):
+    with cli.status("comparing"):
         found = compare_runs(directories)
         found.save(out, width)
     if json:
@@ -168,21 +144,10 @@ def compare(
         console.print(f"{run.label}  {run.title}  {run.directory}",
                       markup=False, highlight=False, soft_wrap=True)  # fmt: skip
     labels = [run.label for run in found.runs]
-    console.print(_table("key numbers (in brackets: difference to A)", labels, found.rows))
+    tables = {"key numbers (in brackets: difference to A)": found.rows}
     if found.settings:
-        console.print(_table("settings that differ", labels, found.setting_rows))
+        tables["settings that differ"] = found.setting_rows
+    for title, rows in tables.items():
+        console.print(terminal_table(ResultTable("", title, ("", *labels), rows)))
     console.print(f"overlay: {out}", markup=False, highlight=False, soft_wrap=True)
     return ExitStatus.OK
-
-
-def _table(title: str, labels: list[str], rows: list[tuple[str, ...]]) -> "Table":
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=title)
-    table.add_column("")
-    for label in labels:
-        table.add_column(label, justify="right")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table

@@ -5,74 +5,19 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
+from noack.runtime.command_line import print_to_stderr
 
 if TYPE_CHECKING:
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
     from noack.config.scenario import Scenario
     from noack.core.linear_systems import Matrix
-
-Draws = Annotated[
-    int | None,
-    typer.Option(help="Runs at each grid point; the campaign file's number by default.", min=1),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(metavar="tcp://HOST:PORT", help="Run on the Dask cluster of this scheduler."),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option("--out", help="Folder of the campaign; runs/campaigns/NAME by default."),
-]
-Settling = Annotated[float, typer.Option(metavar="SECONDS", help="Largest settling time allowed.")]
-Quantile = Annotated[float, typer.Option(help="Share of the draws that must settle in time.")]
-Settle = Annotated[
-    float, typer.Option(help="A run has settled when ‖x‖ stays below this share of ‖x(0)‖.")
-]
-BoundOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="state=X|error=X",
-        help="Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.",
-    ),
-]
-Under = Annotated[
-    str,
-    typer.Option(
-        help="Conditions of the certificates: the `paper`'s, or the scenario's `schedule`."
-    ),
-]
-Weights = Annotated[
-    str,
-    typer.Option(help="Norms to try: `identity`, `given` in the scenario, `chosen` by noack."),
-]
-Gain = Annotated[
-    str, typer.Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
-]
-StateCost = Annotated[
-    str | None, typer.Option("--Q", help="LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.")
-]
-InputCost = Annotated[str | None, typer.Option("--R", help="LQR input cost: rows, or a diagonal.")]
-DesignDraws = Annotated[
-    int,
-    typer.Option(
-        help="Draws that choose the trigger; the same number of new draws confirm it.", min=20
-    ),
-]
-Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
-DesignOut = Annotated[
-    Path | None, typer.Option("--out", help="Write the chosen scenario to this file (TOML).")
-]
-Page = Annotated[
-    Path | None,
-    typer.Option("--page", help="File of the page (HTML); runs/design/NAME.html by default."),
-]
 
 
 @cli.command(cli.CAMPAIGNS, 10, [
@@ -81,18 +26,12 @@ Page = Annotated[
     ("noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786", "on a Dask cluster"),
 ])  # fmt: skip
 def campaign(
-    file: Annotated[
-        str,
-        typer.Argument(
-            help="Campaign file (TOML), or the name of a shipped campaign.",
-            autocompletion=completion.campaigns,
-        ),
-    ],
+    file: Annotated[str, Argument(autocompletion=completion.campaigns)],
     *,
-    draws: Draws = None,
+    draws: Annotated[int | None, Option(min=1)] = None,
     workers: Workers = None,
-    scheduler: Scheduler = None,
-    out: Out = None,
+    scheduler: Annotated[str | None, Option(metavar="tcp://HOST:PORT")] = None,
+    out: cli.OutOption = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
     tables: cli.TablesOption = None,
@@ -103,8 +42,14 @@ def campaign(
     An interrupted campaign is continued if it is started again with the same folder.
 
     Exit status 1: a run exceeded a certified bound.
+
+    Options:
+        file: Campaign file (TOML), or the name of a shipped campaign.
+        draws: Runs at each grid point; the campaign file's number by default.
+        scheduler: Run on the Dask cluster of this scheduler.
+        out: Folder of the campaign; runs/campaigns/NAME by default.
     """
-    from cosim.live.progress import PatientConsole
+    from cosim.live.progress import error_console
     from cosim.output.figure_format import figure_files
     from cosim.shipped_files import find_shipped
     from cosim.studies.campaign.campaign_file import load
@@ -112,49 +57,60 @@ def campaign(
 
     start = worker_pool(workers, scheduler)
     files_of_figures = figure_files(figure_format, width)
-    console = PatientConsole(stderr=True)
+    console = error_console()
     path = find_shipped(file, "campaigns")
     plan = load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, _, made, files = execute_campaign(
         console, plan, path, start, folder=folder, draws=draws, figure_files=files_of_figures
     )
-    if json:
-        cli.print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
-    else:
-        print_summary(cli.console(), summary)
-        for written in files:
-            print(written)
+    document = summary.document() | {"made": made, "files": [str(file) for file in files]}
+    cli.show(json, lambda: document, print_summary, summary)
+    cli.print_paths(files, json=json)
     cli.write_tables(campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
 
 
 @cli.command(cli.THEORY, 30, [
-    ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
+    ("noack paper", "1,000 draws into runs/paper"),
     ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
     *,
-    draws: Annotated[
-        int, typer.Option(help="Number of random plants, losses and initial states.")
-    ] = 1000,
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for paper.md and its figures.")
-    ] = cli.DEFAULT_RUNS / "paper",
+    draws: Annotated[int | None, Option(min=1)] = None,
+    out: Path = cli.DEFAULT_RUNS / "paper",
     json: cli.JsonOption = False,
 ) -> int:
-    """Reproduce the paper's Section V: a page with figures, tables and verdicts."""
-    from cosim.live.progress import PatientConsole, draws_bar
-    from cosim.studies.paper import paper_run
+    """Reproduce the paper's Section V: a page with figures, tables and verdicts.
 
-    paper_run.make_folder(out)
-    with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = paper_run.reproduce(draws, cli.cores(), progress)
-    found = paper_run.document(results, paper_run.write_page(results, out))
+    The runs are those of the campaign paper, in runs/campaigns/paper.
+
+    Options:
+        draws: Number of random plants, losses and initial states; 1,000 by default.
+        out: Folder for paper.md and its figures.
+    """
+    from cosim.live.progress import error_console
+    from cosim.output.result_tables import terminal_table
+    from cosim.shipped_files import find_shipped
+    from cosim.studies.campaign.campaign_file import load
+    from cosim.studies.campaign.campaign_report import claims_table
+    from cosim.studies.paper import paper_page
+
+    paper_page.make_folder(out)
+    path, console = find_shipped("paper", "campaigns"), error_console()
+    folder = cli.DEFAULT_RUNS / "campaigns" / "paper"
+    done = execute_campaign(
+        console, load(path), path, worker_pool(None), folder=folder, draws=draws
+    )
+    with console.status("computing the examples"):
+        found, files = paper_page.write_page(done, out)
+    names = [str(file) for file in files]
     if json:
-        cli.print_json(found)
+        shown = {"draws": done.summary.draws, "representative": found["representative"]}
+        cli.print_json(shown | {"claims": found["summary"]["claims"], "files": names})
     else:
-        paper_run.print_claims(cli.console(), found)
+        cli.console().print(terminal_table(claims_table(done.summary), left=range(3)))
+        print(*names, sep="\n")
     return ExitStatus.OK
 
 
@@ -166,20 +122,20 @@ def paper(
 def design(
     scenario: cli.ScenarioArgument,
     *,
-    settling: Settling,
-    quantile: Quantile = 0.95,
-    settle: Settle = 0.02,
-    bound: BoundOption = None,
-    under: Under = "paper",
-    weights: Weights = "identity,chosen",
-    gain: Gain = "given",
-    Q: StateCost = None,
-    R: InputCost = None,
-    draws: DesignDraws = 2000,
-    seed: Seed = 0,
+    settling: Annotated[float, Option(metavar="SECONDS")],
+    quantile: float = 0.95,
+    settle: float = 0.02,
+    bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None,
+    under: str = "paper",
+    weights: str = "identity,chosen",
+    gain: str = "given",
+    Q: Annotated[str | None, Option("--Q")] = None,
+    R: Annotated[str | None, Option("--R")] = None,
+    draws: Annotated[int, Option(min=20)] = 2000,
+    seed: cli.SeedOption = 0,
     settings: cli.SetOption = None,
-    out: DesignOut = None,
-    page: Page = None,
+    out: cli.OutOption = None,
+    page: Path | None = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
@@ -187,6 +143,20 @@ def design(
     """Choose α, β and the norm: the fewest transmissions that meet your limits.
 
     Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
+
+    Options:
+        settling: Largest settling time allowed.
+        quantile: Share of the draws that must settle in time.
+        settle: A run has settled when ‖x‖ stays below this share of ‖x(0)‖.
+        bound: Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.
+        under: Conditions of the certificates: the `paper`'s, or the scenario's `schedule`.
+        weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
+        gain: Gain K: `given` in the scenario, or `lqr` of the nominal model.
+        Q: LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.
+        R: LQR input cost: rows, or a diagonal.
+        draws: Draws that choose the trigger; the same number of new draws confirm it.
+        out: Write the chosen scenario to this file (TOML).
+        page: File of the page (HTML); runs/design/NAME.html by default.
     """
     from cosim.live.progress import work_bar
     from cosim.output.figure_format import figure_files
@@ -210,21 +180,18 @@ def design(
     written = pages.write_page(found, path, files_of_figures)
     if out is not None and found.feasible:
         written.append(write_whole(out, dumps(found.scenario)))
-    if json:
-        cli.print_json(found.document() | {"files": [str(path) for path in written]})
-    else:
-        pages.print_found(cli.console(), found)
-        for path in written:
-            print(path)
+    document = found.document() | {"files": [str(path) for path in written]}
+    cli.show(json, lambda: document, pages.print_found, found)
+    cli.print_paths(written, json=json)
     if not found.confirmed:
-        typer.echo(f"noack: {found.verdict()}", err=True)
+        print_to_stderr(f"noack: {found.verdict()}")
     return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
 
 
 def _limits(
     settling: float, quantile: float, settle: float, bounds: list[str], under: str
 ) -> "DesignLimits":
-    from cosim.studies.design.candidates import DesignLimits
+    from cosim.studies.design.design_search import DesignLimits
 
     for option, value, most in (
         ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),

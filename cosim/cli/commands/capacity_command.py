@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
@@ -17,81 +17,6 @@ if TYPE_CHECKING:
 
     from cosim.studies.capacity.capacity_plan import CapacityPlan, Depth, Kind
 
-Loops = Annotated[
-    str | None,
-    typer.Option(
-        metavar="N,N,...",
-        help="Numbers of loops in all; by default around the number of periodic loops that fit. "
-        "Of different loops, multiples of the smallest number with their proportions.",
-    ),
-]
-RateBps = Annotated[
-    int | None,
-    typer.Option(
-        help="Rate of the bottleneck, bits per second; by default the scenario's.",
-        min=1,
-        max=10**12,
-    ),
-]
-Period = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="Period of the periodic loops; by default 0.3 / the fastest eigenvalue of A + BK.",
-    ),
-]
-Deadline = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="Largest delay of an update in the network; by default certificate.network_delay_s, "
-        "or the period.",
-    ),
-]
-PolicyOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--policy",
-        metavar="NAME=TRIGGER",
-        help="Compare another trigger, too, e.g. fast='{ policy = \"periodic\", period_s = 0.1 }'.",
-    ),
-]
-Disturbance = Annotated[
-    float | None,
-    typer.Option(
-        help="Amplitude of a pulse of 0.5 s on the inputs of all loops at once; 0: no such runs, "
-        "the default. With --thorough 1.",
-    ),
-]
-Draws = Annotated[
-    int | None,
-    typer.Option(
-        help="Runs at each number of loops; 1 by default, 10 with --thorough.", min=1, max=10_000
-    ),
-]
-Thorough = Annotated[
-    bool,
-    typer.Option(
-        help="More numbers of loops, 10 draws, and runs with a common disturbance: about 50 times "
-        "as long."
-    ),
-]
-Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
-Live = Annotated[
-    str | None,
-    typer.Option(
-        "--confirm",
-        metavar="POLICY=N,...",
-        help="Confirm these points by live runs, e.g. model=20.",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--out", help="Folder of the study; runs/capacity/NAME by default, or NAME-thorough."
-    ),
-]
-
 
 @cli.command(cli.CAMPAIGNS, 30, [
     ("noack capacity shared_bottleneck", "periodic, ZOH-ET and MB-ET: below a minute on two cores"),
@@ -102,19 +27,19 @@ Out = Annotated[
 def capacity(
     scenario: cli.ScenarioArgument,
     *,
-    thorough: Thorough = False,
-    loops: Loops = None,
-    rate_bps: RateBps = None,
-    update_period: Period = None,
-    late_after: Deadline = None,
-    policy: PolicyOption = None,
-    disturbance: Disturbance = None,
-    draws: Draws = None,
-    seed: Seed = 0,
-    confirm: Live = None,
+    thorough: bool = False,
+    loops: Annotated[str | None, Option(metavar="N,N,...")] = None,
+    rate_bps: Annotated[int | None, Option(min=1, max=10**12)] = None,
+    update_period: Annotated[float | None, Option(metavar="SECONDS")] = None,
+    late_after: Annotated[float | None, Option(metavar="SECONDS")] = None,
+    policy: Annotated[list[str] | None, Option("--policy", metavar="NAME=TRIGGER")] = None,
+    disturbance: float | None = None,
+    draws: Annotated[int | None, Option(min=1, max=10_000)] = None,
+    seed: cli.SeedOption = 0,
+    confirm: Annotated[str | None, Option("--confirm", metavar="POLICY=N,...")] = None,
     workers: Workers = None,
     settings: cli.SetOption = None,
-    out: Out = None,
+    out: cli.OutOption = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
@@ -128,11 +53,27 @@ def capacity(
     the same folder.
 
     Exit status 1: a live run failed, or does not agree with the simulation.
+
+    Options:
+        thorough: More numbers of loops, 10 draws, and runs with a common disturbance: about 50
+            times as long.
+        loops: Numbers of loops in all; by default around the number of periodic loops that fit. Of
+            different loops, multiples of the smallest number with their proportions.
+        rate_bps: Rate of the bottleneck, bits per second; by default the scenario's.
+        update_period: Period of the periodic loops; by default 0.3 / the fastest eigenvalue of
+            A + BK.
+        late_after: Largest delay of an update in the network; by default
+            certificate.network_delay_s, or the period.
+        policy: Compare another trigger, too, e.g. fast='{ policy = "periodic", period_s = 0.1 }'.
+        disturbance: Amplitude of a pulse of 0.5 s on the inputs of all loops at once; 0: no such
+            runs, the default. With --thorough 1.
+        draws: Runs at each number of loops; 1 by default, 10 with --thorough.
+        confirm: Confirm these points by live runs, e.g. model=20.
+        out: Folder of the study; runs/capacity/NAME by default, or NAME-thorough.
     """
-    from cosim.live.progress import PatientConsole
+    from cosim.live.progress import error_console
     from cosim.output.figure_format import figure_files
-    from cosim.studies.capacity import capacity_live, capacity_page
-    from cosim.studies.capacity.capacity_criteria import capacities
+    from cosim.studies.capacity import capacity_page, capacity_result
     from cosim.studies.capacity.capacity_plan import QUICK, THOROUGH
 
     start = worker_pool(workers)
@@ -148,32 +89,26 @@ def capacity(
         cli.find_scenario(scenario), settings or [], policy or [], depth, loops=loops,
         rate_bps=rate_bps, period_s=update_period, deadline_s=late_after, seed=seed,
     )  # fmt: skip
-    chosen = capacity_live.chosen_points(confirm, plan)
+    chosen = capacity_result.chosen_points(confirm, plan)
     name = f"{plan.scenario.name}-thorough" if thorough else plan.scenario.name
     folder = out or cli.DEFAULT_RUNS / "capacity" / name
-    console = PatientConsole(stderr=True)
+    console = error_console()
     estimated_s = _announce(plan, folder, workers or cli.cores(), len(chosen), thorough=thorough)
     done = execute_campaign(console, plan.campaign(), Path("noack capacity"), start, folder=folder)
     points = []
     for policy_name, count in chosen:
         with console.status(f"live: {policy_name}, {count} loops"):
             at = policy_name, count
-            points.append(capacity_live.live_point(at, done.summary.found, folder / "live"))
+            points.append(capacity_result.live_point(at, done.summary.found, folder / "live"))
     result = capacity_page.CapacityResult(
-        plan, done.summary, capacities(plan, done.summary, done.store), points
+        plan, done.summary, capacity_result.capacities(plan, done.summary, done.store), points
     )
     files = [*capacity_page.write(result, folder, files_of_figures), *done.files]
-    if json:
-        cli.print_json(
-            result.document()
-            | {"thorough": thorough, "estimated_s": estimated_s, "made": done.made}
-            | {"files": [str(f) for f in files]}
-        )
-    else:
-        capacity_page.print_result(cli.console(), result)
-        for file in files:
-            print(file)
-    agree = all(one.status == ExitStatus.OK and not one.outside for one in points)
+    about = {"thorough": thorough, "estimated_s": estimated_s, "made": done.made}
+    document = result.document() | about | {"files": [str(file) for file in files]}
+    cli.show(json, lambda: document, capacity_page.print_result, result)
+    cli.print_paths(files, json=json)
+    agree = all(point.status == ExitStatus.OK and not point.outside for point in points)
     return ExitStatus.OK if agree else ExitStatus.FAILED
 
 
@@ -182,24 +117,24 @@ def _announce(
 ) -> float:
     """Print on standard error what is computed and about how long it takes; return the seconds."""
     from cosim.studies.campaign.campaign_grid import grid
-    from cosim.studies.capacity import capacity_criteria
+    from cosim.studies.capacity import capacity_result
     from cosim.studies.capacity.capacity_plan import THOROUGH
 
     points = grid(plan.campaign(), Path("noack capacity"))
     longer = plan if thorough else plan.with_depth(THOROUGH)
-    missing = capacity_criteria.missing_loops(plan, points, folder)
+    missing = capacity_result.missing_loops(plan, points, folder)
     if not missing:
         return 0.0
-    cpu_s = capacity_criteria.cpu_per_loop_s(points)
-    estimated_s = capacity_criteria.estimated_s(missing, cpu_s, workers)
-    longer_s = capacity_criteria.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
+    cpu_s = capacity_result.cpu_per_loop_s(points)
+    estimated_s = capacity_result.estimated_s(missing, cpu_s, workers)
+    longer_s = capacity_result.estimated_s(sum(longer.sizes) * longer.draws, cpu_s, workers)
     of_live = f", and {live} live" if live else ""
     idle = "an idle core" if workers == 1 else f"{workers} idle cores"
     print_to_stderr(
         f"noack capacity: {len(plan.sizes) * plan.draws:,} runs of {plan.scenario.horizon_s:g} s "
         f"with {min(plan.sizes):,} to {max(plan.sizes):,} loops{of_live}; the simulation takes "
-        f"about {capacity_criteria.time_text(estimated_s)} on {idle}"
-        + ("" if longer == plan else f"; --thorough: {capacity_criteria.time_text(longer_s)}")
+        f"about {capacity_result.time_text(estimated_s)} on {idle}"
+        + ("" if longer == plan else f"; --thorough: {capacity_result.time_text(longer_s)}")
     )
     return estimated_s
 
@@ -219,7 +154,8 @@ def _plan(
     if rate_bps is not None:
         given = plans.with_rate(given, rate_bps)
         stages = [
-            one.model_dump(mode="json", exclude_none=True) for one in given.network.impairments
+            impairment.model_dump(mode="json", exclude_none=True)
+            for impairment in given.network.impairments
         ]
         settings["network.impairments"] = stages
     plans.bottleneck(given)
@@ -263,6 +199,6 @@ def _more_policies(policies: list[str], kinds: "Sequence[Kind]") -> dict[str, di
 
 def _counts(text: str) -> list[int]:
     try:
-        return [int(one) for one in text.split(",")]
+        return [int(count) for count in text.split(",")]
     except ValueError:
         raise CallerError(f"--loops {text}: write it as N,N,..., e.g. 5,10,20") from None

@@ -5,10 +5,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from cosim.cli import command as cli
-from cosim.cli.completion import scenarios
 from noack.core.errors import CallerError, ExitStatus
 
 
@@ -18,23 +17,10 @@ from noack.core.errors import CallerError, ExitStatus
     ("noack doctor --seconds 10 --json", "measure longer; all numbers as JSON"),
 ])  # fmt: skip
 def doctor(
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            help="Scenario file or shipped scenario, for its rates, ports and allowed lateness.",
-            autocompletion=scenarios,
-        ),
-    ] = "lane_following",
+    scenario: cli.ScenarioArgument = "lane_following",
     *,
     settings: cli.SetOption = None,
-    seconds: Annotated[
-        float,
-        typer.Option(
-            help="Seconds of each measurement of wake-ups: without and with real-time settings.",
-            min=0.1,
-            max=3600,
-        ),
-    ] = 2.0,
+    seconds: Annotated[float, Option(min=0.1, max=3600)] = 2.0,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     json: cli.JsonOption = False,
 ) -> int:
@@ -43,21 +29,21 @@ def doctor(
     Each finding is good, limited or bad, with its meaning for a run and a remedy.
 
     Exit status 1: a finding is bad, so that no run is possible.
+
+    Options:
+        scenario: Scenario file or shipped scenario, for its rates, ports and allowed lateness.
+        seconds: Seconds of each measurement of wake-ups: without and with real-time settings.
     """
     from cosim.doctor.findings import FindingStatus, document, judge, print_findings, worst
     from cosim.doctor.machine_measures import measure, requirements_of
-    from cosim.live.progress import PatientConsole
     from noack.config.resolution import resolve
 
     resolved = resolve(cli.load_scenario(scenario, settings))
     wanted = requirements_of(resolved)
-    with PatientConsole(stderr=True).status("measuring"):
+    with cli.status("measuring"):
         machine = measure(resolved, wanted, runs, seconds)
     findings = judge(machine, wanted)
-    if json:
-        cli.print_json(document(machine, wanted, findings))
-    else:
-        print_findings(cli.console(), wanted, findings)
+    cli.show(json, lambda: document(machine, wanted, findings), print_findings, wanted, findings)
     return ExitStatus.FAILED if worst(findings) is FindingStatus.BAD else ExitStatus.OK
 
 
@@ -71,17 +57,17 @@ def lab(
     *,
     settings: cli.SetOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0: a free one.")
-    ] = 0,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
-    ] = True,
+    port: Annotated[int, Option(min=0, max=65535)] = 0,
+    browser: bool = True,
     json: cli.JsonOption = False,
 ) -> int:
     """Open a page in the browser: drag settings, watch the loop, run it live.
 
     The page is on 127.0.0.1, at an address with a secret. Ctrl-C ends it.
+
+    Options:
+        port: Port on 127.0.0.1; 0: a free one.
+        browser: Open the page in a browser.
     """
     if find_spec("nicegui") is None:
         raise CallerError(

@@ -4,7 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
@@ -16,85 +16,6 @@ if TYPE_CHECKING:
     from cosim.measurement.network_measurement import MeasurementOptions
     from cosim.measurement.trace_sources import SourceOptions
 
-Sources = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="FILE...|ADDRESS",
-        help="A packet trace, the name of a shipped one, captures of both ends, a fate file, a "
-        "run directory, delivery opportunities; or the address of a listener, to which a probe "
-        "is sent.",
-    ),
-]
-Listen = Annotated[
-    str | None,
-    typer.Option(metavar="ADDRESS", help="Receive one probe there, e.g. 0.0.0.0:9100."),
-]
-Rate = Annotated[str, typer.Option(metavar="RATE", help="Datagrams of the probe.")]
-Duration = Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the probe.")]
-Size = Annotated[
-    int, typer.Option(metavar="BYTES", help="Size of the probe's datagrams, at least 100.")
-]
-RoundTrip = Annotated[
-    bool, typer.Option("--round-trip", help="The listener sends each datagram back.")
-]
-Silence = Annotated[
-    str,
-    typer.Option(
-        metavar="TIME",
-        help="Once a probe has begun, a listener ends after so long without a datagram. It waits "
-        "for a probe until Ctrl-C.",
-    ),
-]
-Save = Annotated[
-    Path | None, typer.Option(help="Write the raw trace to this file while probing (.csv).")
-]
-Flow = Annotated[
-    int, typer.Option(help="Flow of a capture or a fate file; 1 is the largest.", min=1)
-]
-SequenceAt = Annotated[
-    str | None,
-    typer.Option(
-        metavar="OFFSET:BYTES[:little]",
-        help="Where the payloads of a capture of the receiver's end have sequence numbers.",
-    ),
-]
-Deadline = Annotated[
-    str | None,
-    typer.Option(metavar="TIME", help="Packets that take longer count as lost, e.g. 100ms."),
-]
-Shares = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="SHARE",
-        help="Share of loss bursts and packets for which M is given, e.g. 99%; repeatable.",
-    ),
-]
-Windows = Annotated[
-    list[int] | None,
-    typer.Option(help="K of the (m, K) table; repeatable.", min=1, max=100_000_000),
-]
-Outage = Annotated[
-    str | None,
-    typer.Option(
-        metavar="TIME",
-        help="Loss bursts of this duration or more are outages; by default a test decides.",
-    ),
-]
-ForScenario = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SCENARIO",
-        help="Report for which share of the time its certificate would have been void.",
-        autocompletion=completion.scenarios,
-    ),
-]
-Page = Annotated[
-    Path | None, typer.Option("--out", help="Write a page with tables and figures (.html).")
-]
-NetworkFile = Annotated[
-    Path | None,
-    typer.Option(help="Write a [network] section that reproduces the network (.toml)."),
-]
 _TRACE = "rural_n8_10kmh"
 
 
@@ -112,18 +33,6 @@ class ClockRelation(StrEnum):
     DIFFERENT = "different"
 
 
-Clocks = Annotated[
-    ClockRelation | None,
-    typer.Option(help="Whether both times of a file were read on the same clock."),
-]
-
-
-Form = Annotated[
-    NetworkForm,
-    typer.Option("--as", help="Write the network as the trace itself, or as a fitted model."),
-]
-
-
 @cli.command(cli.MEASURING, 10, [
     (f"noack measure {_TRACE} --deadline 100ms", "a recorded trace"),
     (f"noack measure {_TRACE} --deadline 100ms --out measured.html", "with a page of figures"),
@@ -134,32 +43,59 @@ Form = Annotated[
     (f"noack measure {_TRACE} --write network.toml", "the network for a scenario file"),
 ])  # fmt: skip
 def measure(
-    sources: Sources = None,
+    sources: Annotated[list[str] | None, Argument(metavar="FILE...|ADDRESS")] = None,
     *,
-    listen: Listen = None,
-    rate: Rate = "50hz",
-    duration: Duration = "60s",
-    size: Size = 128,
-    round_trip: RoundTrip = False,
-    silence: Silence = "30s",
-    save: Save = None,
-    flow: Flow = 1,
-    sequence_at: SequenceAt = None,
-    clocks: Clocks = None,
-    deadline: Deadline = None,
-    share: Shares = None,
-    window: Windows = None,
-    outage: Outage = None,
-    for_scenario: ForScenario = None,
+    listen: Annotated[str | None, Option(metavar="ADDRESS")] = None,
+    rate: Annotated[str, Option(metavar="RATE")] = "50hz",
+    duration: Annotated[str, Option("--for", metavar="TIME")] = "60s",
+    size: Annotated[int, Option(metavar="BYTES")] = 128,
+    round_trip: Annotated[bool, Option("--round-trip")] = False,
+    silence: Annotated[str, Option(metavar="TIME")] = "30s",
+    save: Path | None = None,
+    flow: Annotated[int, Option(min=1)] = 1,
+    sequence_at: Annotated[str | None, Option(metavar="OFFSET:BYTES[:little]")] = None,
+    clocks: ClockRelation | None = None,
+    deadline: Annotated[str | None, Option(metavar="TIME")] = None,
+    share: Annotated[list[str] | None, Option(metavar="SHARE")] = None,
+    window: Annotated[list[int] | None, Option(min=1, max=100_000_000)] = None,
+    outage: Annotated[str | None, Option(metavar="TIME")] = None,
+    for_scenario: Annotated[
+        str | None, Option(metavar="SCENARIO", autocompletion=completion.scenarios)
+    ] = None,
     settings: cli.SetOption = None,
-    out: Page = None,
+    out: cli.OutOption = None,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
-    write: NetworkFile = None,
-    form: Form = NetworkForm.TRACE,
+    write: Path | None = None,
+    form: Annotated[NetworkForm, Option("--as")] = NetworkForm.TRACE,
     json: cli.JsonOption = False,
 ) -> int:
-    """Measure a network: losses, bursts, M, delays, outages, and models that fit."""
+    """Measure a network: losses, bursts, M, delays, outages, and models that fit.
+
+    Options:
+        sources: A packet trace, the name of a shipped one, captures of both ends, a fate file, a
+            run directory, delivery opportunities; or the address of a listener, to which a probe
+            is sent.
+        listen: Receive one probe there, e.g. 0.0.0.0:9100.
+        rate: Datagrams of the probe.
+        duration: Duration of the probe.
+        size: Size of the probe's datagrams, at least 100.
+        round_trip: The listener sends each datagram back.
+        silence: Once a probe has begun, a listener ends after so long without a datagram. It waits
+            for a probe until Ctrl-C.
+        save: Write the raw trace to this file while probing (.csv).
+        flow: Flow of a capture or a fate file; 1 is the largest.
+        sequence_at: Where the payloads of a capture of the receiver's end have sequence numbers.
+        clocks: Whether both times of a file were read on the same clock.
+        deadline: Packets that take longer count as lost, e.g. 100ms.
+        share: Share of loss bursts and packets for which M is given, e.g. 99%; repeatable.
+        window: K of the (m, K) table; repeatable.
+        outage: Loss bursts of this duration or more are outages; by default a test decides.
+        for_scenario: Report for which share of the time its certificate would have been void.
+        out: Write a page with tables and figures (.html).
+        write: Write a [network] section that reproduces the network (.toml).
+        form: Write the network as the trace itself, or as a fitted model.
+    """
     from rich.console import Console
 
     from cosim.measurement.live.live_measurement import LiveOptions, period_ns_of
@@ -236,8 +172,8 @@ def _result(
 def _is_one_way_sender(sources: list[str] | None, listen: str | None, live: "LiveOptions") -> bool:
     from cosim.measurement.live.live_measurement import is_address
 
-    one = sources is not None and len(sources) == 1 and is_address(sources[0])
-    return one and listen is None and not live.round_trip
+    is_probe = sources is not None and len(sources) == 1 and is_address(sources[0])
+    return is_probe and listen is None and not live.round_trip
 
 
 def _share(text: str) -> float:

@@ -1,10 +1,12 @@
 """``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: one terminal per process."""
 
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli.execute_run import RunOutput, run_processes
@@ -12,7 +14,7 @@ from noack.core.errors import CallerError
 
 InvitationOption = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--invitation",
         metavar="FILE",
         help="Join a run on another host, by the file that `noack record --listen` wrote.",
@@ -53,28 +55,22 @@ def record(
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
     _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS[:PORT]",
-            help="Let processes on other hosts join, at this address of this host.",
-        ),
-    ] = None,
-    invitation: Annotated[
-        Path, typer.Option(metavar="FILE", help="With --listen: where the invitation is written.")
-    ] = Path("invitation.json"),
-    invite: Annotated[
-        Invited, typer.Option(help="With --listen: which process the invitation is for.")
-    ] = Invited.ALL,
-    valid_minutes: Annotated[
-        float,
-        typer.Option(min=0.01, max=525_600, help="With --listen: how long one can join by it."),
-    ] = 60.0,
+    listen: Annotated[str | None, Option(metavar="ADDRESS[:PORT]")] = None,
+    invitation: Annotated[Path, Option(metavar="FILE")] = Path("invitation.json"),
+    invite: Invited = Invited.ALL,
+    valid_minutes: Annotated[float, Option(min=0.01, max=525_600)] = 60.0,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Open a run and record it; the other four processes join from other terminals or hosts."""
+    """Open a run and record it; the other four processes join from other terminals or hosts.
+
+    Options:
+        listen: Let processes on other hosts join, at this address of this host.
+        invitation: With --listen: where the invitation is written.
+        invite: With --listen: which process the invitation is for.
+        valid_minutes: With --listen: how long one can join by it.
+    """
     from noack.protocol.topology import RECORDER
 
     output, listening = RunOutput(report, verbose, json), None
@@ -94,46 +90,29 @@ def record(
     )  # fmt: skip
 
 
-@cli.command(cli.PROCESSES, 20, _examples("plant"))
-def plant(
-    *,
-    session: cli.SessionOption = "default",
-    invitation: InvitationOption = None,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    json: cli.JsonOption = False,
-) -> int:
-    """Join the open run as the plant: integrates the state, sends measurements."""
-    from plant_server.__main__ import main
+def _join(role: str, place: int, module: str, about: str) -> None:
+    """Declare the command that joins the open run as a process."""
 
-    return main(_process_arguments(session, invitation, runs, json=json))
+    def join(
+        *,
+        session: cli.SessionOption = "default",
+        invitation: InvitationOption = None,
+        runs: cli.RunsOption = cli.DEFAULT_RUNS,
+        json: cli.JsonOption = False,
+    ) -> int:
+        invited = [] if invitation is None else ["--invitation", str(invitation)]
+        chosen = [] if session == "default" and invited else ["--session", session]
+        arguments = [*chosen, *invited, "--runs", str(runs), *(["--json"] if json else [])]
+        status: int = import_module(module).main(arguments)
+        return status
 
-
-@cli.command(cli.PROCESSES, 30, _examples("sensor"))
-def sensor(
-    *,
-    session: cli.SessionOption = "default",
-    invitation: InvitationOption = None,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    json: cli.JsonOption = False,
-) -> int:
-    """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
-    from sensor_node.__main__ import main
-
-    return main(_process_arguments(session, invitation, runs, json=json))
+    join.__doc__ = f"Join the open run as the {role}: {about}"
+    cli.command(cli.PROCESSES, place, _examples(role), name=role)(join)
 
 
-@cli.command(cli.PROCESSES, 40, _examples("controller"))
-def controller(
-    *,
-    session: cli.SessionOption = "default",
-    invitation: InvitationOption = None,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    json: cli.JsonOption = False,
-) -> int:
-    """Join the open run as the controller: runs x_c, sends u = K x_c."""
-    from controller_node.__main__ import main
-
-    return main(_process_arguments(session, invitation, runs, json=json))
+_join("plant", 20, "plant_server.__main__", "integrates the state, sends measurements.")
+_join("sensor", 30, "sensor_node.__main__", "runs x_s and the trigger, sends updates.")
+_join("controller", 40, "controller_node.__main__", "runs x_c, sends u = K x_c.")
 
 
 @cli.command(
@@ -155,11 +134,3 @@ def _require_none_of(context: typer.Context, *options: str) -> None:
         if source is not None and source.name == "COMMANDLINE":
             name = "--" + option.replace("_", "-")
             raise CallerError(f"{name} needs --listen: processes of this host need no invitation")
-
-
-def _process_arguments(
-    session: str, invitation: Path | None, runs: Path, *, json: bool
-) -> list[str]:
-    invited = [] if invitation is None else ["--invitation", str(invitation)]
-    chosen = [] if session == "default" and invited else ["--session", session]
-    return [*chosen, *invited, "--runs", str(runs), *(["--json"] if json else [])]

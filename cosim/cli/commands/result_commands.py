@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from cosim.cli import command as cli
-from cosim.cli import completion
 from cosim.output.export import FORMATS
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import ExitStatus
@@ -37,10 +37,7 @@ def summary(
     from cosim.output.run_verdict import print_outcome
 
     outcome = outcome_of_loop(reopen(chosen_run(run_dir, runs)), loop)
-    if json:
-        cli.print_json(outcome.summary.to_json())
-    else:
-        print_outcome(cli.console(), outcome, verbose=verbose)
+    cli.show(json, outcome.summary.to_json, print_outcome, outcome, verbose=verbose)
     cli.write_tables(summary_tables(outcome.summary), tables, json=json)
     return ExitStatus.OK
 
@@ -51,44 +48,35 @@ def summary(
     ("noack view --loop pendulum-07", "one loop of a run of several, in detail"),
 ])  # fmt: skip
 def view(
-    recording: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Run directory or .rrd file; the last run by default.",
-            autocompletion=completion.run_directories,
-        ),
-    ] = None,
+    recording: cli.RunArgument = None,
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
-    web: Annotated[
-        bool, typer.Option("--web", help="Show it in a browser on this machine.")
-    ] = False,
+    web: Annotated[bool, Option("--web")] = False,
     json: cli.JsonOption = False,
 ) -> int:
     """Show a run in the rerun viewer.
 
     A missing recording, as that of one loop alone, is written first.
+
+    Options:
+        recording: Run directory or .rrd file; the last run by default.
+        web: Show it in a browser on this machine.
     """
     from cosim.output.viewer.live_viewer import view_recording
 
     path = chosen_run(recording, runs)
     path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
     if (path.parent / SCENARIO_FILE).is_file() and not path.is_file():
-        _write(path.parent, loop)
+        from cosim.live.finalize import write_recording
+
+        with cli.status("writing the recording"):
+            write_recording(path.parent, loop)
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
     view_recording(path, native=False if web else None)
     return ExitStatus.OK
-
-
-def _write(run_dir: Path, loop: str | None) -> None:
-    from cosim.live.finalize import write_recording
-    from cosim.live.progress import PatientConsole
-
-    with PatientConsole(stderr=True).status("writing the recording"):
-        write_recording(run_dir, loop)
 
 
 @cli.command(cli.RUNS, 90, [
@@ -101,14 +89,16 @@ def report(
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Write the report again, even if there is one.")
-    ] = False,
+    again: Annotated[bool, Option("--again")] = False,
     figure_format: cli.FormatOption = None,
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
-    """Print the path of a run's report (one HTML page with all figures); write it if missing."""
+    """Print the path of a run's report (one HTML page with all figures); write it if missing.
+
+    Options:
+        again: Write the report again, even if there is one.
+    """
     from cosim.api.runs import open_run
     from cosim.live.finalize import run_report
     from cosim.output.figure_format import figure_files
@@ -121,7 +111,7 @@ def report(
         shown = opened if loop is None else opened.loops[loop]
         figures = shown.save_figures(figure_format, width)
     if json:
-        written = {"figures": [str(one) for one in figures]} if figures else {}
+        written = {"figures": [str(figure) for figure in figures]} if figures else {}
         cli.print_json({"report": str(path)} | written)
     else:
         print(path, *figures, sep="\n")
@@ -142,18 +132,16 @@ def replay(
     """Replay a run's recorded inputs; compare the outputs bit for bit."""
     from cosim.analysis.replay.replay_result import print_replay
     from cosim.analysis.replay.run_replay import replay_run
-    from cosim.live.progress import PatientConsole
     from cosim.record.run_directory import changed_since
     from cosim.record.run_record import load_run
 
     path = chosen_run(run_dir, runs)
-    with PatientConsole(stderr=True).status("replaying"):
+    with cli.status("replaying"):
         found = replay_run(load_run(path), loop)
     changed = changed_since(path)
-    if json:
-        cli.print_json(found.document() | {"changed_since": changed})
-    else:
-        print_replay(cli.console(), found, changed)
+    cli.show(
+        json, lambda: found.document() | {"changed_since": changed}, print_replay, found, changed
+    )
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
@@ -167,33 +155,27 @@ def fidelity(
     *,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            help="Write a figure of the differences over time (.svg, .png, .pdf).",
-        ),
-    ] = None,
+    out: cli.OutOption = None,
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
 ) -> int:
-    """Compare a run with the ideal loop in continuous time, effect by effect."""
+    """Compare a run with the ideal loop in continuous time, effect by effect.
+
+    Options:
+        out: Write a figure of the differences over time (.svg, .png, .pdf).
+    """
     from cosim.analysis.fidelity import compute_fidelity
-    from cosim.live.progress import PatientConsole
     from cosim.output.figure_files import save_figure
     from cosim.output.run_verdict import print_fidelity
     from cosim.output.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)
-    with PatientConsole(stderr=True).status("comparing"):
+    with cli.status("comparing"):
         found = compute_fidelity(load_record(path, loop))
         if out is not None:
             save_figure(fidelity_figure(found), out, width)
-    if json:
-        cli.print_json(found.as_json())
-    else:
-        print_fidelity(cli.console(), found)
+    cli.show(json, found.as_json, print_fidelity, found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED
 
 
@@ -213,41 +195,37 @@ def export(
     *,
     file_format: Annotated[
         str,
-        typer.Option(
+        Option(
             "--format",
             parser=_known_format,
             metavar="|".join(FORMATS),
             autocompletion=lambda: [*FORMATS],
-            help="Format of the file, or of the folder's files.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="File, or folder of CSV; RUN.mat and so on by default."),
-    ] = None,
+    out: cli.OutOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     loop: cli.LoopOption = None,
-    certificates: Annotated[
-        bool,
-        typer.Option(
-            help="Certificates of each loop in a file of MATLAB; about a second for each loop."
-        ),
-    ] = True,
+    certificates: bool = True,
     json: cli.JsonOption = False,
 ) -> int:
-    """Export a run for other programs: its tables, its summary and its certificates."""
+    """Export a run for other programs: its tables, its summary and its certificates.
+
+    Options:
+        file_format: Format of the file, or of the folder's files.
+        out: File, or folder of CSV; RUN.mat and so on by default.
+        certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
+    """
     from cosim.live.finalize import reopen
-    from cosim.live.progress import PatientConsole
     from cosim.output.export import export_run, export_suffix
 
     chosen = chosen_run(run_dir, runs)
     reopen(chosen)
     name = chosen.resolve().name if loop is None else loop
     path = out or Path(f"{name}{export_suffix(file_format)}")
-    with PatientConsole(stderr=True).status("exporting"):
+    with cli.status("exporting"):
         written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
     if json:
-        cli.print_json({"files": [str(one) for one in written]})
+        cli.print_json({"files": [str(path) for path in written]})
     else:
         print(*written, sep="\n")
     return ExitStatus.OK

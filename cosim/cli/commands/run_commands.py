@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from cosim.simulation.continuous import ContinuousRun
     from noack.config.scenario import Scenario
+    from noack.runtime.control_messages import ChangeReply
 
 _EVENTS_SHOWN = 40
 
@@ -35,15 +37,16 @@ def run(
     live: cli.LiveOption = False,
     metrics: cli.MetricsOption = None,
     _log_format: cli.LogFormatOption = cli.LogFormat.TEXT,
-    hosts: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="TOML file that places processes on other hosts."),
-    ] = None,
+    hosts: Annotated[Path | None, Option(metavar="FILE")] = None,
     report: cli.ReportOption = True,
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Run a scenario live: start all processes and record everything."""
+    """Run a scenario live: start all processes and record everything.
+
+    Options:
+        hosts: TOML file that places processes on other hosts.
+    """
     output, listening = RunOutput(report, verbose, json), None
     if hosts is not None:
         from cosim.live.remote_access import listening_for
@@ -63,9 +66,7 @@ def run(
 def demo(
     context: typer.Context,
     *,
-    zoh: Annotated[
-        bool, typer.Option("--zoh", help="Hold the last update (ZOH) instead of using a model.")
-    ] = False,
+    zoh: Annotated[bool, Option("--zoh")] = False,
     settings: cli.SetOption = None,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     live: cli.LiveOption = False,
@@ -75,7 +76,11 @@ def demo(
     verbose: cli.VerboseOption = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Run the paper's lane-following example live."""
+    """Run the paper's lane-following example live.
+
+    Options:
+        zoh: Hold the last update (ZOH) instead of using a model.
+    """
     wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
     output = RunOutput(report, verbose, json)
     return run_processes(
@@ -110,10 +115,10 @@ def simulate(
     warn_of_violations(loaded)
     if trigger is cli.TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)
-    from cosim.live.progress import PatientConsole, simulation_bar
+    from cosim.live.progress import error_console, simulation_bar
     from cosim.live.simulated_run import simulate_run
 
-    with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
+    with simulation_bar(error_console(), loaded.horizon_s) as progress:
         ending = simulate_run(loaded, runs, progress)
     return finalize_run(ending, RunOutput(report, verbose, json))
 
@@ -121,12 +126,11 @@ def simulate(
 def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
     import numpy as np
 
-    from cosim.live.progress import PatientConsole
     from cosim.simulation.continuous import document, run_continuous, summary
     from noack.config.resolution import resolve
 
     resolved = resolve(scenario)
-    with PatientConsole(stderr=True).status("simulating"):
+    with cli.status("simulating"):
         run = run_continuous(resolved)
     found = summary(run, resolved)
     if json:
@@ -140,10 +144,10 @@ def _simulate_continuously(scenario: "Scenario", *, json: bool) -> int:
 def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np
-    from rich.table import Table
     from rich.text import Text
 
     from cosim.analysis.summary_model import ExitPart
+    from cosim.output.result_tables import ResultTable, terminal_table
     from cosim.output.run_tables import (
         interval_rows,
         longest_burst,
@@ -169,20 +173,21 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
     )
     title = title_of(found["scenario"], found["mode"], mansd, (), found["kind"])
     print_numbers(console, title, rows)
-    table = Table(title="events")
-    for heading in ("event", "t, s", "inter-event time, s", "fate", "‖x‖", "‖e_c‖ before"):
-        table.add_column(heading, justify="right")
     since_s = np.diff(run.event_s, prepend=0.0)
-    for i, state in enumerate(run.before[:_EVENTS_SHOWN]):
-        table.add_row(
+    events = [
+        (
             str(i),
             f"{state.t_s:.9f}",
             f"{since_s[i]:.9f}" if i else "",
-            "delivered" if run.delivered[i] else "[red]lost[/]",
             number(float(np.linalg.norm(state.x)), 4),
             number(float(run.system.norms(state.e_c[None])[0]), 4),
+            "delivered" if run.delivered[i] else "lost",
         )
-    console.print(table)
+        for i, state in enumerate(run.before[:_EVENTS_SHOWN])
+    ]
+    headings = ("event", "t, s", "inter-event time, s", "‖x‖", "‖e_c‖ before", "fate")
+    table = ResultTable("events", "events", headings, events)
+    console.print(terminal_table(table, left=(), styles={"lost": "red"}))
     if len(run.before) > _EVENTS_SHOWN:
         console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
 
@@ -200,39 +205,31 @@ def _print_run(console: "Console", run: "ContinuousRun", found: dict[str, Any]) 
 def set_(
     settings: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[KEY VALUE]...",
-            help="Keys of the scenario, or their short forms, with new values: loss.p 0.9 mansd 2. "
-            "Without keys, list the runtime parameters.",
-            autocompletion=completion.runtime_parameters,
-        ),
+        Argument(metavar="[KEY VALUE]...", autocompletion=completion.runtime_parameters),
     ] = None,
     *,
     session: Annotated[str | None, cli.SESSION] = None,
-    run: Annotated[
-        Path | None,
-        typer.Option(
-            "--run",
-            help="Directory of the run; needed if several runs are active.",
-            autocompletion=completion.run_directories,
-        ),
-    ] = None,
+    run: Annotated[Path | None, Option(autocompletion=completion.run_directories)] = None,
     json: cli.JsonOption = False,
 ) -> int:
-    """Change a live run: losses, M, trigger, set point."""
+    """Change a live run: losses, M, trigger, set point.
+
+    Options:
+        settings: Keys of the scenario, or their short forms, with new values: loss.p 0.9 mansd 2.
+            Without keys, list the runtime parameters.
+        run: Directory of the run; needed if several runs are active.
+    """
     from noack.config.runtime_parameters import text_of
     from noack.runtime.run_registry import find, request_change
 
     wanted = parsed(settings or ())
     answer = request_change(find(session, run), wanted)
     if json:
-        cli.print_json(answer)
+        cli.print_json(answer.fields())
     elif wanted:
-        console = cli.console()
-        console.print(
-            f"{answer['name']}: {text_of(wanted)} from {answer['from_s']:.3f} s on",
-            markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
+        loops, entries = answer.changed_loops, answer.loops
+        which = "" if len(entries) == 1 else f"; changed: {', '.join(loops) or 'no loop'}"
+        print(f"{answer.name}: {text_of(wanted)} from {answer.from_s or 0.0:.3f} s on{which}")
     else:
         _print_parameters(cli.console(), answer)
     return ExitStatus.OK
@@ -241,8 +238,7 @@ def set_(
 def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
     """Return the settings that words give as KEY VALUE or KEY=VALUE.
 
-    Raises:
-        CallerError: a value is missing, or a key is given twice.
+    Raise CallerError if a value is missing, or a key is given twice.
     """
     found: dict[str, Any] = {}
     from noack.config.runtime_parameters import full_key
@@ -263,18 +259,21 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
     return found
 
 
-def _print_parameters(console: "Console", answer: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
+def _print_parameters(console: "Console", answer: "ChangeReply") -> None:
+    from cosim.output.result_tables import ResultTable, terminal_table
     from noack.config.runtime_parameters import SHORT, text_of
 
     short = {key: name for name, key in SHORT.items()}
-    table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
-    for heading in ("key", "short", "value"):
-        table.add_column(heading)
-    for key, value in answer["runtime_parameters"].items():
-        shown = text_of({"": value}).removeprefix(" = ")
-        table.add_row(key, short.get(key, ""), escape(shown))
-    console.print(table)
-    console.print(f"[dim]{escape(answer['run_dir'])}[/]", soft_wrap=True)
+    entries, rows = answer.loops, []
+    for key in dict.fromkeys(key for values in entries.values() for key in values):
+        names: dict[str, list[str]] = {}
+        for name, values in entries.items():
+            if key in values:
+                names.setdefault(text_of({"": values[key]}).removeprefix(" = "), []).append(name)
+        for value, loops in names.items():
+            which = "all" if len(loops) == len(entries) else ", ".join(loops)
+            rows.append((key, short.get(key, ""), which, value))
+    title = f"{answer.name}, at {answer.t_s:.1f} s"
+    table = ResultTable("", title, ("key", "short", "loops", "value"), rows)
+    console.print(terminal_table(table, left=range(4)))
+    console.print(answer.run_dir, style="dim", markup=False, soft_wrap=True)

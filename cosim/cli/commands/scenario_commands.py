@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
@@ -26,14 +26,15 @@ _COMMENT = "# "
     ("noack scenarios --json", "list them as JSON"),
 ])  # fmt: skip
 def scenarios(
-    name: Annotated[
-        str | None,
-        typer.Argument(help="Print this scenario or campaign.", autocompletion=completion.shipped),
-    ] = None,
+    name: Annotated[str | None, Argument(autocompletion=completion.shipped)] = None,
     *,
     json: cli.JsonOption = False,
 ) -> int:
-    """List the shipped scenarios and campaigns, or print one of them."""
+    """List the shipped scenarios and campaigns, or print one of them.
+
+    Options:
+        name: Print this scenario or campaign.
+    """
     if name is not None:
         text = text_of(name)
         cli.print_json({"name": name, "toml": text}) if json else print(text, end="")
@@ -41,7 +42,7 @@ def scenarios(
     shipped = {kind: all_shipped(kind) for kind in KINDS}
     if json:
         cli.print_json({
-            kind: [one._asdict() | {"path": str(one.path)} for one in some]
+            kind: [file._asdict() | {"path": str(file.path)} for file in some]
             for kind, some in shipped.items()
         })  # fmt: skip
         return ExitStatus.OK
@@ -54,18 +55,18 @@ def scenarios(
 
 def _print_shipped(console: "Console", some: Sequence[ShippedFile]) -> None:
     """Print one line per file to a pipe, or a wrapped table to a terminal."""
-    width = max(len(one.name) for one in some)
+    width = max(len(file.name) for file in some)
     if not console.is_terminal:
-        for one in some:
-            print(f"{one.name:{width}}  {one.description}")
+        for file in some:
+            print(f"{file.name:{width}}  {file.description}")
         return
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2))
     table.add_column(min_width=width, no_wrap=True, style="cyan")
     table.add_column()
-    for one in some:
-        table.add_row(one.name, one.description)
+    for file in some:
+        table.add_row(file.name, file.description)
     console.print(table)
 
 
@@ -211,15 +212,16 @@ def _dependent_defaults(resolved: "Scenario") -> Iterator[str]:
 ])  # fmt: skip
 def schema(
     *,
-    netem: Annotated[
-        bool, typer.Option("--netem", help="Print the schema of the emulator's links files.")
-    ] = False,
-    campaign: Annotated[
-        bool, typer.Option("--campaign", help="Print the schema of campaign files.")
-    ] = False,
+    netem: Annotated[bool, Option("--netem")] = False,
+    campaign: Annotated[bool, Option("--campaign")] = False,
     json: cli.JsonOption = False,
 ) -> int:
-    """Print the JSON Schema of scenario files, for editors."""
+    """Print the JSON Schema of scenario files, for editors.
+
+    Options:
+        netem: Print the schema of the emulator's links files.
+        campaign: Print the schema of campaign files.
+    """
     if campaign:
         from cosim.studies.campaign.campaign_file import json_schema as campaign_schema
 

@@ -1,10 +1,10 @@
 """``noack certify``, ``margin``, ``adversary``: bounds for all patterns of losses; bad patterns."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from cosim.cli import command as cli
 from noack.core.errors import CallerError, ExitStatus
@@ -19,30 +19,20 @@ def certify(
     scenario: cli.ScenarioArgument,
     *,
     settings: cli.SetOption = None,
-    weight: Annotated[
-        str,
-        typer.Option(
-            help="Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack."
-        ),
-    ] = "given",
-    late: Annotated[
-        int | None,
-        typer.Option(
-            help="Allowed lateness in steps of the plant; certificate.late_periods by default.",
-            min=0,
-            max=1000,
-        ),
-    ] = None,
+    weight: str = "given",
+    late: Annotated[int | None, Option(min=0, max=1000)] = None,
     tables: cli.TablesOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Write the certificates for MATLAB and Octave (.mat)."),
-    ] = None,
+    out: cli.OutOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
 
     Exit status 1: nothing can be certified.
+
+    Options:
+        weight: Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack.
+        late: Allowed lateness in steps of the plant; certificate.late_periods by default.
+        out: Write the certificates for MATLAB and Octave (.mat).
     """
     from cosim.output.certificate_report import certificate_tables, print_certificates
     from cosim.output.certificates import certificates_of
@@ -55,10 +45,7 @@ def certify(
             found = certificates_of(loaded, weight, late, progress)
     else:
         found = certificates_of(loaded, weight, late)
-    if json:
-        cli.print_json(found.to_json())
-    else:
-        print_certificates(cli.console(), found)
+    cli.show(json, found.to_json, print_certificates, found)
     cli.write_tables(certificate_tables(found), tables, json=json)
     if out is not None:
         from cosim.output.export.mat_export import save_mat
@@ -78,17 +65,10 @@ def margin(
     scenario: cli.ScenarioArgument,
     *,
     settings: cli.SetOption = None,
-    most: Annotated[int, typer.Option(help="Largest M to examine.", min=1, max=1000)] = 16,
-    accuracy: Annotated[
-        float,
-        typer.Option(help="Wanted ratio of the bounds, minus 1; finer where they include 1."),
-    ] = 2e-4,
-    period: Annotated[
-        bool, typer.Option(help="Search for the longest period with the scenario's own M, too.")
-    ] = True,
-    play: Annotated[
-        bool, typer.Option("--play", help="Play the destabilising pattern in a live run.")
-    ] = False,
+    most: Annotated[int, Option(min=1, max=1000)] = 16,
+    accuracy: float = 2e-4,
+    period: bool = True,
+    play: Annotated[bool, Option("--play")] = False,
     runs: cli.RunsOption = cli.DEFAULT_RUNS,
     tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
@@ -99,24 +79,26 @@ def margin(
     The verdict holds for all times of events that the policy
     allows. Exit status 1: the loop is not proven stable for
     any M.
+
+    Options:
+        most: Largest M to examine.
+        accuracy: Wanted ratio of the bounds, minus 1; finer where they include 1.
+        period: Search for the longest period with the scenario's own M, too.
+        play: Play the destabilising pattern in a live run.
     """
     from cosim.analysis.margin_search import find_margin
-    from cosim.live.progress import PatientConsole
     from cosim.output.certificate_report import margin_tables, print_margin
     from noack.config.resolution import resolve
 
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
     resolved = resolve(cli.load_scenario(scenario, settings))
-    with PatientConsole(stderr=True).status("examining") as status:
+    with cli.status("examining") as status:
         found = find_margin(
             resolved, most_m=most, accuracy=accuracy, with_period=period,
             progress=lambda text: status.update(f"examining {text}"),
         )  # fmt: skip
-    if json:
-        cli.print_json(found.to_json())
-    else:
-        print_margin(cli.console(), found)
+    cli.show(json, found.to_json, print_margin, found)
     cli.write_tables(margin_tables(found), tables, json=json)
     if not play:
         return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
@@ -151,25 +133,10 @@ class AdversaryAim(StrEnum):
 def adversary(
     scenario: cli.ScenarioArgument,
     *,
-    objective: Annotated[
-        AdversaryAim,
-        typer.Option(
-            help="Maximise the controller's error ‖e_c‖, the state ‖x‖ or the cost ∫‖x‖² dt, or "
-            "minimise the inter-event time."
-        ),
-    ] = AdversaryAim.ALL,
-    horizon: Annotated[
-        float | None, typer.Option(help="Seconds to search; the scenario's horizon by default.")
-    ] = None,
-    nodes: Annotated[
-        int,
-        typer.Option(
-            help="Limit of the exhaustive search, in segments between events; at the limit, the "
-            "result of the beam search may be better.",
-            min=0,
-        ),
-    ] = 500_000,
-    beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
+    objective: AdversaryAim = AdversaryAim.ALL,
+    horizon: float | None = None,
+    nodes: Annotated[int, Option(min=0)] = 500_000,
+    beam: Annotated[int, Option(min=0)] = 512,
     trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
     settings: cli.SetOption = None,
     json: cli.JsonOption = False,
@@ -178,6 +145,14 @@ def adversary(
 
     The loop is that of the processes; with --trigger continuous it is the paper's, without delays.
     Exit status 1: a certified bound was exceeded.
+
+    Options:
+        objective: Maximise the controller's error ‖e_c‖, the state ‖x‖ or the cost ∫‖x‖² dt, or
+            minimise the inter-event time.
+        horizon: Seconds to search; the scenario's horizon by default.
+        nodes: Limit of the exhaustive search, in segments between events; at the limit, the result
+            of the beam search may be better.
+        beam: Width of the beam search, in runs.
     """
     from cosim.analysis.adversary import Objective, conditions_of, find_worst
     from cosim.analysis.adversary.worst_run import document, print_worst
@@ -198,8 +173,6 @@ def adversary(
             )
             for aim in aims
         ]  # fmt: skip
-    if json:
-        cli.print_json(document(found, resolved, certificate, trigger.value))
-    else:
-        print_worst(cli.console(), found, resolved, certificate, trigger.value)
+    about = found, resolved, certificate, trigger.value
+    cli.show(json, lambda: document(*about), print_worst, *about)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

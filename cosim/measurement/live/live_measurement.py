@@ -4,10 +4,13 @@ It drives a sender or a receiver (``probe_ends.py``) from a socket and the monot
 trace is written meanwhile, so that a killed process loses nothing.
 """
 
+import errno
+import hashlib
 import os
 import re
 import secrets
 import select
+import socket as sockets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +19,8 @@ from pathlib import Path
 from typing import Self
 
 from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeResult, ProbeSender
-from cosim.measurement.live.stamped_socket import StampedSocket, host_number
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, NeverStartedError, PeerError, why
+from noack.core.errors import CallerError, MachineError, NeverStartedError, PeerError, why
 from noack.core.file_access import open_growing
 from noack.impairments.words import OWN_TIME_S
 from noack.protocol.probe_format import (
@@ -28,8 +30,10 @@ from noack.protocol.probe_format import (
     PROBE_BYTES,
     SHORTEST_PERIOD_NS,
 )
-from noack.runtime.address import Address, parse_address, parse_destination, text_of
+from noack.runtime.address import Address, family_of, parse_address, parse_destination, text_of
 from noack.runtime.command_line import Signals, print_to_stderr
+from noack.runtime.time_exchange import Arrival, ArrivalSocket, HostClocks
+from noack.runtime.udp_sockets import drops_of, enlarge_buffer
 
 _ADDRESS = re.compile(r".*:[0-9]{1,5}")
 _RATE = re.compile(r"([0-9]+(?:\.[0-9]+)?)(k?)(?:hz)?", re.IGNORECASE)
@@ -112,6 +116,81 @@ def _log(line: str) -> None:
 
 _LONGEST_WAIT_S = 0.1
 _BATCH = 256
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+def host_number() -> int:
+    """Return a number of this machine since its last boot: equal numbers mean the same clock.
+
+    0 if the system has none.
+    """
+    try:
+        return int.from_bytes(hashlib.sha256(_BOOT.read_bytes()).digest()[:8], "little")
+    except OSError:
+        return 0
+
+
+class ProbeSocket:
+    """A socket that listens on ``listen``, or is connected to ``to``.
+
+    Raises:
+        CallerError: the address cannot be used.
+    """
+
+    def __init__(self, *, listen: Address | None = None, to: Address | None = None) -> None:
+        address = listen or to
+        assert address is not None
+        self.endpoint = sockets.socket(family_of(address), sockets.SOCK_DGRAM)
+        try:
+            (self.endpoint.connect if listen is None else self.endpoint.bind)(address)
+        except OSError as error:
+            self.endpoint.close()
+            verb = "send to" if listen is None else "listen on"
+            raise CallerError(f"cannot {verb} {text_of(address)}: {why(error)}") from None
+        enlarge_buffer(self.endpoint)
+        self.arrivals = ArrivalSocket(self.endpoint, MAX_PROBE_BYTES, HostClocks())
+        self.receive(1)  # compares the clocks before the first arrival
+        self._send_errors = 0
+        self.last_send_error = os.strerror(errno.ECONNREFUSED)
+        """The system's text; that of an error that only the next read reports is this one."""
+
+    @property
+    def send_errors(self) -> int:
+        """Number of sends that failed, as the sends or later reads reported."""
+        return self._send_errors + self.arrivals.errors
+
+    def receive(self, most: int = _BATCH) -> list[Arrival]:
+        """Return the datagrams that wait, with the kernel's times of arrival."""
+        return self.arrivals.receive(most)
+
+    def send(self, data: bytes, to: Address | None = None) -> None:
+        """Send a datagram; a failure is counted.
+
+        Raises:
+            CallerError: the datagram is too large for the path.
+            MachineError: the system does not permit it.
+        """
+        for _ in range(2):  # the first error may belong to the datagram before
+            try:
+                if to is None:
+                    self.endpoint.send(data)
+                else:
+                    self.endpoint.sendto(data, to)
+                return
+            except OSError as error:
+                if isinstance(error, PermissionError):
+                    raise MachineError(f"cannot send: {why(error)}") from None
+                if len(data) > MAX_PROBE_BYTES or error.errno == errno.EMSGSIZE:
+                    raise CallerError(f"--size {len(data)}: {why(error)}") from None
+                self._send_errors += 1
+                self.last_send_error = why(error)
+                if not isinstance(error, ConnectionRefusedError):
+                    return
+
+    @property
+    def kernel_drops(self) -> int | None:
+        """Datagrams dropped by the kernel because the receive buffer was full."""
+        return drops_of(self.endpoint)
 
 
 def listen(
@@ -128,7 +207,7 @@ def listen(
     Raises:
         NoackError: the address or the file cannot be used, or nothing was received.
     """
-    socket = StampedSocket(listen=address)
+    socket = ProbeSocket(listen=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
         log(f"listening on {text_of(socket.endpoint.getsockname())}")
         receiver = ProbeReceiver(
@@ -136,15 +215,13 @@ def listen(
         )
         while signals.received is None:
             select.select([socket.endpoint], (), (), _LONGEST_WAIT_S)
-            read = 0
-            while read < _BATCH and (arrival := socket.receive()) is not None:
-                read += 1
-                source = arrival.source
-                answer = receiver.handle(arrival.data, text_of(source), arrival.received_ns)
+            arrivals = socket.receive()
+            for data, source, received_ns in arrivals:
+                answer = receiver.handle(data, text_of(source), received_ns)
                 if answer is not None:
                     socket.send(answer, source)
             rows.flush()
-            if not read and receiver.is_over(time.monotonic_ns()):
+            if not arrivals and receiver.is_over(time.monotonic_ns()):
                 break
         result = _consistent(receiver.finish, socket)
         if result is None:
@@ -166,7 +243,7 @@ def send(
     Raises:
         NoackError: the address or the file cannot be used, or no process listens there.
     """
-    socket = StampedSocket(to=address)
+    socket = ProbeSocket(to=address)
     with socket.endpoint, ProbeRows(save, log) as rows, Signals().handled() as signals:
         sender = ProbeSender(
             plan, secrets.randbits(64), host_number(), time.monotonic_ns(), rows.add
@@ -182,10 +259,8 @@ def send(
                         log(f"{socket.last_send_error}: is a listener running there?")
                     refused = min(socket.send_errors, sender.sent)
             select.select([socket.endpoint], (), (), min(wait_ns * 1e-9, _LONGEST_WAIT_S))
-            for _ in range(_BATCH):
-                if (arrival := socket.receive()) is None:
-                    break
-                sender.handle(arrival.data, arrival.received_ns)
+            for arrival in socket.receive():
+                sender.handle(arrival.data, arrival.latest_ns)
             rows.flush()
             if signals.received is not None:
                 sender.stop(time.monotonic_ns())
@@ -200,7 +275,7 @@ def send(
 
 
 def _consistent(
-    finish: Callable[[int | None], ProbeResult | None], socket: StampedSocket
+    finish: Callable[[int | None], ProbeResult | None], socket: ProbeSocket
 ) -> ProbeResult | None:
     """Return the result, with what the socket found."""
     try:
@@ -210,9 +285,9 @@ def _consistent(
     if result is None:
         return None
     notes = list(result.notes)
-    if socket.clock_sets:
+    if clock_sets := socket.arrivals.clock_sets:
         notes.append(
-            f"this host's real-time clock was set {socket.clock_sets} times; "
+            f"this host's real-time clock was set {clock_sets} times; "
             "the probe uses the monotonic clock"
         )
     if result.kernel_drops:

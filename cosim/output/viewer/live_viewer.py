@@ -39,6 +39,7 @@ from cosim.analysis.summary_model import read_summary
 from cosim.output.viewer.pictures.picture import TIMELINE
 from cosim.output.viewer.rerun_program import (
     HOST,
+    OWN_HOST,
     WebViewer,
     end_process,
     logged_port,
@@ -63,7 +64,6 @@ _START_S = 10.0
 _DRAIN_S = 2.0
 _SECRET_BYTES = 32
 _PATH = re.compile(r"/([^/]+)/(.*)")
-_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
 class RecordingServer:
@@ -201,7 +201,7 @@ class _Handler(BaseHTTPRequestHandler):
         found = _PATH.fullmatch(path)
         if not (self.path.isascii() and self.path.isprintable()):
             self.send_error(400)
-        elif not _OWN_HOST.fullmatch(self.headers.get("Host", "")):
+        elif not OWN_HOST.fullmatch(self.headers.get("Host", "")):
             self.send_error(403)  # DNS rebinding: a foreign name that resolves to loopback
         elif found is None or not recording.admits(found[1], lambda: peer_user(self.connection)):
             self.send_error(404)

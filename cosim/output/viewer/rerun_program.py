@@ -107,6 +107,8 @@ def _path() -> str:
 
 
 HOST = "127.0.0.1"
+OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
+"""The host in a request's header; another name would be that of a foreign page (DNS rebinding)."""
 
 _WEB_START_S = 10.0
 _TIMEOUT_S = 10.0

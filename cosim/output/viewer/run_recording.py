@@ -35,6 +35,8 @@ from numpy.typing import NDArray
 
 from cosim.analysis.network_summary import (
     QUANTILES,
+    LoopOverTime,
+    LoopsOverTime,
     WorstLoop,
     loops_over_time,
     quantiles,
@@ -328,8 +330,16 @@ def loop_view(
     )
 
 
-def write_view(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> None:
+def write_view(
+    run: RecordedRun,
+    summary: RunSummary,
+    run_dir: Path,
+    loop: str | None,
+    known: Sequence[LoopOverTime] | None = None,
+) -> None:
     """Write the recording of a run, or of one of its loops, from its record and its summary.
+
+    ``known`` is how each loop of the run went, if that is known.
 
     Raises:
         ViewError: the recording cannot be written.
@@ -337,7 +347,7 @@ def write_view(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str |
     require_space(run_dir)
     run_id = secrets.randbits(64)  # the viewer knows recordings by it
     if loop is None and len(run.loops) > 1:
-        _write_network_view(run, summary, run_dir, run_id)
+        _write_network_view(run, summary, run_dir, run_id, loops_over_time(run, known))
         return
     write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop), run_id)
 
@@ -349,8 +359,10 @@ def write_loop_view(record: RunRecord, path: Path, run_id: int) -> None:
         _feed_record(record, view, path.parent)
 
 
-def _write_network_view(run: RecordedRun, summary: RunSummary, run_dir: Path, run_id: int) -> None:
-    over_time, worst = loops_over_time(run), worst_loop(summary.loops)
+def _write_network_view(
+    run: RecordedRun, summary: RunSummary, run_dir: Path, run_id: int, over_time: LoopsOverTime
+) -> None:
+    worst = worst_loop(summary.loops)
     few = len(run.loops) <= PICTURED
     records = {
         number: run.loops[number] for number in (range(len(run.loops)) if few else [worst.number])

@@ -13,6 +13,7 @@ from cosim.output.figure_description import (
     Axis,
     Band,
     ColourScale,
+    Dash,
     FigureDescription,
     Heat,
     Item,
@@ -24,6 +25,7 @@ from cosim.output.figure_description import (
     plain,
     series_colour,
 )
+from cosim.output.palette import Colour
 from cosim.studies.campaign import campaign_file
 from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
@@ -43,9 +45,6 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescriptio
     for i, wanted in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(wanted.where))
         found = [one for one in summary.found if one.point.place in places]
-        where = "".join(
-            f", {axis} = {campaign_file.label_of(v)}" for axis, v in wanted.where.items()
-        )
         match wanted:
             case campaign_file.Pareto():
                 figure, caption = _pareto(summary, found, wanted)
@@ -55,8 +54,9 @@ def figures(summary: CampaignSummary, store: Store) -> Iterator[FigureDescriptio
                 figure, caption = _heat_map(summary, found, wanted)
             case campaign_file.Distribution():
                 figure, caption = _distribution(summary, found, wanted, store)
+        where = [f"{axis} = {campaign_file.label_of(v)}" for axis, v in wanted.where.items()]
         name = f"{wanted.kind.replace('_', '-')}-{i + 1}"
-        yield replace(figure, name=name, caption=f"{caption}{where}.")
+        yield replace(figure, name=name, caption=f"{', '.join([caption, *where])}.")
 
 
 def pareto_figure(
@@ -68,11 +68,11 @@ def pareto_figure(
         (xs, dx), (ys, dy) = map(_means, pair)
         finite = np.isfinite(xs) & np.isfinite(ys)
         front = np.flatnonzero(finite)[undominated(xs[finite], ys[finite])]
+        colour, marker, dash = _look(i)
         items += [
-            Marks(x=xs, y=ys, x_error=dx, y_error=dy, colour=series_colour(i), reduced=False,
-                  marker=MARKERS[i % len(MARKERS)], label=_name(name)),
-            Line(x=xs[front], y=ys[front], colour=series_colour(i), steps="post",
-                 dash=DASHES[i % len(DASHES)]),
+            Marks(x=xs, y=ys, x_error=dx, y_error=dy, colour=colour, reduced=False, marker=marker,
+                  label=_name(name)),
+            Line(x=xs[front], y=ys[front], colour=colour, steps="post", dash=dash),
         ]  # fmt: skip
     means_x, means_y = ([e.mean for pair in series.values() for e in pair[k]] for k in (0, 1))
     return one_panel("pareto", Panel(items=items, x=_axis(x, means_x), y=_axis(y, means_y)),
@@ -105,10 +105,11 @@ def curve_figure(
     items: list[Item] = []
     for i, (name, estimates) in enumerate(series.items()):
         mean, half = (values[order] for values in _means(estimates))
+        colour, marker, dash = _look(i)
         items += [
-            Line(x=at[order], y=mean, label=_name(name), colour=series_colour(i), size=4,
-                 marker=MARKERS[i % len(MARKERS)], dash=DASHES[i % len(DASHES)]),
-            Band(x=at[order], low=mean - half, high=mean + half, colour=series_colour(i)),
+            Line(x=at[order], y=mean, label=_name(name), colour=colour, size=4, marker=marker,
+                 dash=dash),
+            Band(x=at[order], low=mean - half, high=mean + half, colour=colour),
         ]  # fmt: skip
     ticks = dict(zip(at.tolist(), map(plain, labels), strict=True)) if x is None else None
     means = [e.mean for estimates in series.values() for e in estimates if e]
@@ -159,8 +160,9 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> FigureD
     for i, (name, values) in enumerate(series.items()):
         at = np.quantile(values, share, method="inverted_cdf")
         seen = np.isfinite(at)
-        items.append(Line(x=at[seen], y=share[seen], label=_name(name), colour=series_colour(i),
-                          dash=DASHES[i % len(DASHES)], steps="post"))  # fmt: skip
+        colour, _, dash = _look(i)
+        items.append(Line(x=at[seen], y=share[seen], label=_name(name), colour=colour, dash=dash,
+                          steps="post"))  # fmt: skip
     x = _axis(metric, np.concatenate(list(series.values())))
     panel = Panel(items=items, x=x, y=Axis(label="share of runs", ends=(0, 1.02)))
     return one_panel("distribution", panel, _HEIGHT_IN)
@@ -245,6 +247,11 @@ def _series(
         )  # fmt: skip
         groups.setdefault(label, []).append(one)
     return groups
+
+
+def _look(i: int) -> tuple[Colour, str, Dash]:
+    """Return colour, marker and dashes of the i-th series."""
+    return series_colour(i), MARKERS[i % len(MARKERS)], DASHES[i % len(DASHES)]
 
 
 def _name(text: str) -> str:

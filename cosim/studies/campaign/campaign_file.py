@@ -6,10 +6,11 @@ Settings have the keys of a scenario, as in ``--set``. A key with dots, in quote
 
 import itertools
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, cast
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
@@ -229,6 +230,67 @@ AnyFigure = Pareto | Curve | HeatMap | Distribution
 Figure = Annotated[AnyFigure, Field(discriminator="kind")]
 
 
+class Term(NamedTuple):
+    """One side of a condition of a claim: a metric, or a number."""
+
+    metric: Metric | None
+    label: str | None
+    """Label of the value of the claim's axis at which the metric is taken."""
+    number: float = math.nan
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read ``METRIC``, ``METRIC @ VALUE`` or a number; ValueError if it is none of them."""
+        name, at, label = (part.strip() for part in text.partition("@"))
+        if name in METRICS:
+            return cls(cast(Metric, name), label if at else None)
+        try:
+            return cls(None, None, float(text))
+        except ValueError:
+            known = ", ".join(METRICS)
+            raise ValueError(
+                f"holds: {text.strip()}: should be a number or one of {known}"
+            ) from None
+
+
+class Claim(ScenarioSection):
+    """A statement about the runs; the draws give its verdict."""
+
+    says: Annotated[str, Field(min_length=1)]
+    """The statement."""
+    source: str = ""
+    """Where it is made."""
+    holds: Annotated[tuple[str, ...], Field(min_length=1)]
+    """The conditions, ``A < B`` or ``A > B``; all of them hold in a draw in which the statement is
+    true. A and B are metrics or numbers; ``METRIC @ VALUE`` is the metric at this value of the
+    axis, in the same draw."""
+    axis: Identifier | None = None
+    """The axis of these values."""
+    where: dict[str, Value] = Field({})
+    """Only grid points with these values of these axes."""
+    medians: bool = False
+    """Compare the medians over the draws instead of the draws."""
+
+    @cached_property
+    def conditions(self) -> list[tuple[Term, Term]]:
+        """The smaller and the larger side of each condition."""
+        found = []
+        for text in self.holds:
+            sides = re.split("([<>])", text)
+            if len(sides) != 3:
+                raise ValueError(f"holds: {text}: write a condition as A < B or A > B")
+            left, right = Term.parse(sides[0]), Term.parse(sides[2])
+            found.append((left, right) if sides[1] == "<" else (right, left))
+        return found
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        labels = {term.label for pair in self.conditions for term in pair if term.metric}
+        if (self.axis is None) != (labels == {None}) or (self.axis and None in labels):
+            raise ValueError("axis: give an axis, and a value of it after each metric, or neither")
+        return self
+
+
 class Campaign(ScenarioSection):
     """Many runs over a grid of settings."""
 
@@ -257,6 +319,12 @@ class Campaign(ScenarioSection):
     compare: PairedComparison | None = None
     figures: tuple[Figure, ...] = ()
     """The figures of the page."""
+    claims: tuple[Claim, ...] = ()
+    """Statements that are checked. A claim is confirmed if it holds in at least 95 % of the draws
+    at each grid point, or group of them, that it is about. It is partly confirmed if it holds in
+    at least half of the draws at the first of them."""
+    claims_at: dict[str, tuple[Value, ...]] = Field({})
+    """Values of axes at which claims are judged that do not name them; by default all."""
 
     @cached_property
     def by_name(self) -> Mapping[str, Axis]:
@@ -265,11 +333,14 @@ class Campaign(ScenarioSection):
 
     @property
     def measured_metrics(self) -> set[Metric]:
-        """The metrics of the tables and the figures."""
+        """The metrics of the tables, the figures and the claims."""
         of_figures = {
             getattr(figure, key, None) for figure in self.figures for key in ("metric", "x", "y")
         }
-        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures)}
+        of_claims = {
+            term.metric for claim in self.claims for pair in claim.conditions for term in pair
+        }
+        return {*self.metrics.shown, *(one for one in METRICS if one in of_figures | of_claims)}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -292,15 +363,20 @@ class Campaign(ScenarioSection):
             self._require_value("compare.reference", self.compare.axis, self.compare.reference)
         for i, figure in enumerate(self.figures):
             self._check_figure(f"figures.{i}", figure)
+        for i, claim in enumerate(self.claims):
+            self._require_values(f"claims.{i}.where", claim.where.items())
+            for term in (term for pair in claim.conditions for term in pair):
+                if claim.axis is not None and term.label is not None:
+                    self._require_values(f"claims.{i}.holds", [(claim.axis, term.label)])
+        for name, values in self.claims_at.items():
+            self._require_values("claims_at", ((name, value) for value in values))
         return self
 
     def _check_figure(self, place: str, figure: AnyFigure) -> None:
         own = [getattr(figure, key) for key in figure.spanned]
         for key, name in zip(figure.spanned, own, strict=True):
             self._require_axis(f"{place}.{key}", name)
-        for name, value in figure.where.items():
-            self._require_axis(f"{place}.where.{name}", name)
-            self._require_value(f"{place}.where.{name}", name, value)
+        self._require_values(f"{place}.where", figure.where.items())
         if len(set(own)) < len(own):
             raise ValueError(f"{place}.y: a map needs two different axes")
         if isinstance(figure, Pareto):
@@ -317,6 +393,11 @@ class Campaign(ScenarioSection):
     def _require_axis(self, place: str, name: str) -> None:
         if name not in self.by_name:
             raise ValueError(f"{place}: no such axis; the axes are {', '.join(self.by_name)}")
+
+    def _require_values(self, place: str, values: Iterable[tuple[str, Value]]) -> None:
+        for axis, value in values:
+            self._require_axis(f"{place}.{axis}", axis)
+            self._require_value(f"{place}.{axis}", axis, value)
 
     def _require_value(self, place: str, axis: str, value: Value) -> None:
         labels = self.by_name[axis].labels

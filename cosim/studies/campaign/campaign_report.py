@@ -1,8 +1,8 @@
 """The results of a campaign as a page, as JSON, and as tables for a terminal."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import tomli_w
 from pydantic_core import to_json
@@ -14,9 +14,9 @@ from rich.table import Table
 from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
 from cosim.output.page_kit import templates
-from cosim.output.result_tables import ResultTable
+from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult
+from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.metrics import METRICS, Estimate
 from noack.core.file_access import write_whole
@@ -28,13 +28,6 @@ _MOST_ROWS = 40
 _APART = 3
 """Largest distance between columns, margins included."""
 _MOST_REMARKS = 5
-
-
-class SummaryRow(NamedTuple):
-    """A row of a table of grid points."""
-
-    labels: Sequence[str]
-    cells: Sequence[str]
 
 
 def write_report(
@@ -57,18 +50,42 @@ def write_report(
     ]  # fmt: skip
 
 
-def campaign_tables(summary: CampaignSummary) -> Iterator[ResultTable]:
-    """Yield the means of all grid points, and their paired differences to the reference."""
-    campaign = summary.campaign
-    headings = [axis.called for axis in campaign.axes]
-    headings += [METRICS[name].heading for name in campaign.metrics.shown]
-    tables = [("campaign", f"{summary.draws:,} draws; mean ± half-width", _rows(summary))]
+def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterator[ResultTable]:
+    """Yield the means of all grid points, their paired differences, and the claims.
+
+    With ``shares``, the differences have the share of draws in which a metric is smaller, too.
+    """
+    campaign, shown = summary.campaign, summary.campaign.metrics.shown
+    headings = [
+        *(axis.called for axis in campaign.axes),
+        *(METRICS[name].heading for name in shown),
+    ]
+    means = [
+        (*found.point.labels.values(), *(written(found.estimates.get(name)) for name in shown))
+        for found in summary.found
+    ]
+    what = f"{campaign.name}: {summary.draws:,} draws; mean ± half-width"
+    yield ResultTable("campaign", what, headings, means)
     if campaign.compare is not None:
-        what = f"paired difference to {_reference(summary)}"
-        tables.append(("differences", what, _differences(summary)))
-    for name, what, rows in tables:
-        cells = [(*row.labels, *row.cells) for row in rows]
-        yield ResultTable(name, f"{campaign.name}: {what}", headings, cells)
+        differences = []
+        for compared in summary.compared:
+            cells = []
+            for found in map(compared.differences.get, shown):
+                cells.append(written(found.estimate if found and found.estimate.finite else None))
+                if found and shares:
+                    cells[-1] += f", smaller in {100 * found.smaller:.3g} %"
+            differences.append((*compared.point.labels.values(), *cells))
+        what = f"{campaign.name}: paired difference to {_reference(summary)}"
+        yield ResultTable("differences", what, headings, differences)
+    if summary.claims:
+        yield claims_table(summary)
+
+
+def claims_table(summary: CampaignSummary) -> ResultTable:
+    """Return the claims with their verdicts."""
+    what = f"{summary.campaign.name}: claims, over {summary.draws:,} draws"
+    rows = [(one.says, one.source, one.reason, one.verdict) for one in summary.claims]
+    return ResultTable("claims", what, ("claim", "where", "draws", "verdict"), rows)
 
 
 def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:
@@ -79,6 +96,7 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str
     campaign = summary.campaign
     content = campaign.model_dump(mode="json", exclude_none=True)
     remarks = list(_unfinished(summary))
+    tables = {table.name: table for table in campaign_tables(summary, shares=True)}
     return templates(Path(__file__).parent).get_template("campaign.html.jinja").render(
         title=campaign.name,
         description=campaign.description,
@@ -88,11 +106,9 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str
         tone="bad" if summary.breaches else "doubt" if remarks else "good",
         remarks=[*remarks, *_bursts(summary)],
         figures=list(figures(summary, store)),
-        axes=[axis.called for axis in campaign.axes],
-        metrics=[METRICS[name].heading for name in campaign.metrics.shown],
-        rows=[(*row.labels, *row.cells) for row in _rows(summary)],
+        tables=tables,
+        axes=len(campaign.axes),
         reference=_reference(summary),
-        differences=[(*row.labels, *row.cells) for row in _differences(summary, shares=True)],
         campaign_toml=tomli_w.dumps(content, indent=2),
         scenario_toml=tomli_w.dumps(base, indent=2),
     )  # fmt: skip
@@ -101,16 +117,15 @@ def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str
 def print_summary(console: Console, summary: CampaignSummary) -> None:
     """Print the tables of a summary."""
     campaign = summary.campaign
-    tables = [(f"{campaign.name}: {summary.draws:,} draws", _rows(summary))]
-    if campaign.compare is not None:
-        tables.append((f"paired difference to {_reference(summary)}", _differences(summary)))
-    axes = [axis.called for axis in campaign.axes]
-    headings = [METRICS[metric].heading for metric in campaign.metrics.shown]
-    for title, rows in tables:
-        for table in tables_of(title, axes, headings, rows[:_MOST_ROWS], console.width):
-            console.print(table)
-        if len(rows) > _MOST_ROWS:
-            console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
+    for whole in campaign_tables(summary):
+        if whole.name == "claims":
+            console.print(terminal_table(whole, left=range(3)))
+            continue
+        table = whole._replace(rows=whole.rows[:_MOST_ROWS])
+        for part in split_table(table, len(campaign.axes), console.width):
+            console.print(part)
+        if (more := len(whole.rows) - _MOST_ROWS) > 0:
+            console.print(f"and {more} more grid points: see the page")
     if campaign.time == "continuous":
         console.print(
             "continuous time: the trigger acts at once and the network has no delay; with "
@@ -126,44 +141,37 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
     console.print(_verdict(summary), style="bold red" if summary.breaches else "bold")
 
 
-def tables_of(
-    title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[SummaryRow], width: int
-) -> Iterator[Table]:
+def split_table(table: ResultTable, names: int, width: int) -> Iterator[Table]:
     """Split a table into as many tables as a terminal of this width needs; nothing is truncated.
 
-    Each table repeats the label columns, whose headings are ``axes``.
+    Each has the first ``names`` columns, which are labels.
     """
-    axis_widths = [_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes)]
-    widths = [_width(words, [row.cells[i] for row in rows]) for i, words in enumerate(headings)]
-    labels, begin = sum(axis_widths), 0
-    while begin < len(headings):
+    columns = list(zip(table.headings, *table.rows, strict=True))
+    # A heading may break between words.
+    widths = [max(map(len, (*head.split(), *cells))) + _APART for head, *cells in columns]
+    begin = names
+    while begin < len(columns):
         end = begin + 1
-        while end < len(headings) and labels + sum(widths[begin : end + 1]) <= width:
+        while end < len(columns) and sum(widths[:names]) + sum(widths[begin : end + 1]) <= width:
             end += 1
-        table = Table(
-            title=escape(title) if begin == 0 else None, title_justify="left", box=SIMPLE_HEAD,
-            pad_edge=False, collapse_padding=True,
+        shown = Table(
+            title=escape(table.caption) if begin == names else None, title_justify="left",
+            box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
         )  # fmt: skip
-        columns = [*zip(axes, axis_widths, strict=True)]
-        columns += zip(headings[begin:end], widths[begin:end], strict=True)
-        unbroken = sum(max(len(words) + _APART, least) for words, least in columns)
-        for place, (words, least) in enumerate(columns):
-            table.add_column(
-                escape(words),
-                justify="right" if place >= len(axes) else "left",
+        places = [*range(names), *range(begin, end)]
+        unbroken = sum(max(len(table.headings[i]) + _APART, widths[i]) for i in places)
+        for i in places:
+            shown.add_column(
+                escape(table.headings[i]),
+                justify="left" if i < names else "right",
                 overflow="fold",
-                min_width=least - _APART if place >= len(axes) else None,
-                max_width=least - _APART if unbroken > width else None,
+                min_width=None if i < names else widths[i] - _APART,
+                max_width=widths[i] - _APART if unbroken > width else None,
             )
-        for row in rows:
-            table.add_row(*map(escape, row.labels), *row.cells[begin:end])
-        yield table
+        for row in table.rows:
+            shown.add_row(*(escape(row[i]) for i in places))
+        yield shown
         begin = end
-
-
-def _width(heading: str, cells: Sequence[str]) -> int:
-    """Return the width of a column; its heading may break between words."""
-    return max(map(len, (*heading.split(), *cells))) + _APART
 
 
 def _verdict(summary: CampaignSummary) -> str:
@@ -178,31 +186,6 @@ def _verdict(summary: CampaignSummary) -> str:
         )
     where = "all" if certified == len(summary.found) else f"{certified} of {len(summary.found)}"
     return f"{runs:,} runs; {where} grid points have a certified bound; none was exceeded."
-
-
-def _rows(summary: CampaignSummary) -> list[SummaryRow]:
-    """Return each grid point's means with their intervals."""
-    return [
-        SummaryRow(
-            list(found.point.labels.values()),
-            [written(found.estimates.get(metric)) for metric in summary.campaign.metrics.shown],
-        )
-        for found in summary.found
-    ]
-
-
-def _differences(summary: CampaignSummary, *, shares: bool = False) -> list[SummaryRow]:
-    """Return mean differences, optionally with the share of draws with a smaller metric."""
-    rows = []
-    for compared in summary.compared:
-        cells = []
-        for metric in summary.campaign.metrics.shown:
-            found = compared.differences.get(metric)
-            cells.append(written(found.estimate if found and found.estimate.finite else None))
-            if found and shares:
-                cells[-1] += f", smaller in {100 * found.smaller:.3g} %"
-        rows.append(SummaryRow(list(compared.point.labels.values()), cells))
-    return rows
 
 
 def _reference(summary: CampaignSummary) -> str | None:
@@ -230,15 +213,15 @@ def _unfinished(summary: CampaignSummary) -> Iterator[str]:
         others = {how: count for how, count in found.ended.items() if how != "finished"}
         if others:
             counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
-            yield f"{_at(found)} not all runs reached the horizon: {counts}"
+            yield f"{_at(found.point.labels)} not all runs reached the horizon: {counts}"
 
 
 def _bursts(summary: CampaignSummary) -> Iterator[str]:
     """Return, for each grid point without an enforced guarantee, how often it was exceeded."""
     for found in summary.found:
         if found.bursts is not None:
-            yield f"{_at(found)} {found.bursts.text}"
+            yield f"{_at(found.point.labels)} {found.bursts.text}"
 
 
-def _at(found: GridPointResult) -> str:
-    return "At " + ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())
+def _at(labels: Mapping[str, str]) -> str:
+    return "At " + ", ".join(f"{axis} {label}" for axis, label in labels.items())

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.studies.campaign.campaign_claims import JudgedClaim, judge_claims
 from cosim.studies.campaign.campaign_file import Campaign, label_of
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
@@ -58,6 +59,7 @@ class CampaignSummary(NamedTuple):
     draws: int
     found: Sequence[GridPointResult]
     compared: Sequence[ComparedResult]
+    claims: Sequence[JudgedClaim] = ()
 
     @property
     def breaches(self) -> int:
@@ -92,13 +94,22 @@ class CampaignSummary(NamedTuple):
                 }
                 for compared in self.compared
             ],
+            "claims": [
+                {**claim._asdict(), "verdict": claim.verdict, "reason": claim.reason}
+                for claim in self.claims
+            ],
         }
 
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
-    """Estimate all metrics; the runs of at most two grid points are read at a time."""
+    """Estimate all metrics and judge the claims; the runs of a few grid points are in memory."""
     found = [_found(point, store) for point in store.points]
-    return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)))
+
+    def values(point: Point) -> Mapping[Metric, Vector]:
+        return runs_at(point, store)[0]
+
+    claims = list(judge_claims(campaign, store.points, values))
+    return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)), claims)
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:

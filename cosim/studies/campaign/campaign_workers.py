@@ -82,10 +82,8 @@ def _code() -> str:
 
 
 def _rounding() -> str:
-    entries = np.arange(1, 50) * 7919 % 101 - 50
-    matrix = (
-        entries.reshape(7, 7) / 64
-    )  # exact entries, rank 6; the computed rank depends on the processor
+    # Exact entries, rank 6; the computed rank depends on the processor.
+    matrix = (np.arange(1, 50) * 7919 % 101 - 50).reshape(7, 7) / 64
     regular = matrix + 8 * np.eye(7)  # diagonally dominant
     parts = (
         expm(matrix),

@@ -198,7 +198,8 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
 def _identity(campaign: Campaign) -> dict[str, Any]:
     """Return the settings on which the results depend."""
     content = campaign.model_dump(
-        mode="json", exclude={"draws", "description", "figures", "compare"}
+        mode="json",
+        exclude={"draws", "description", "figures", "compare", "claims", "claims_at"},
     )
     del content["metrics"]["shown"]
     for axis in content["axes"]:

@@ -125,7 +125,7 @@ def certified_error(resolved: Scenario) -> float | None:
         return None
     models = error_gains(loop_of(resolved), trigger.alpha_per_s)
     try:
-        missing = models.missing(Output.WEIGHTED, network.longest_burst, 0.0)
+        missing = float(models.missing(Output.WEIGHTED, network.longest_burst, 0.0))
     except NotDecayingError:
         return None
     return (models.now(Output.WEIGHTED) + missing) * trigger.beta

@@ -8,27 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic_core import to_json
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from cosim.output import palette
 from cosim.output.figure_description import FigureDescription, Item, Marks, Rule, series_colour
 from cosim.output.figure_files import save_figure
 from cosim.output.figure_format import SCREEN_IN, FigureFiles, FigureFormat
 from cosim.output.page_kit import templates
+from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.campaign.campaign_figures import curve_figure
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.metrics import METRICS
-from cosim.studies.capacity.capacity_criteria import (
-    COST_FACTOR,
-    LATE,
-    LIMITS,
-    Capacity,
-    Limit,
-    PolicyCapacity,
-)
-from cosim.studies.capacity.capacity_live import LivePoint
 from cosim.studies.capacity.capacity_plan import (
     COMMON,
     DISTURBANCE,
@@ -37,6 +27,15 @@ from cosim.studies.capacity.capacity_plan import (
     PERIODIC,
     POLICY,
     CapacityPlan,
+)
+from cosim.studies.capacity.capacity_result import (
+    COST_FACTOR,
+    LATE,
+    LIMITS,
+    Capacity,
+    Limit,
+    LivePoint,
+    PolicyCapacity,
 )
 from noack.core.file_access import write_whole
 from noack.core.number_format import number
@@ -72,7 +71,7 @@ class CapacityResult(NamedTuple):
             ],
             "loops": list(plan.counts), "draws": plan.draws, "disturbance": plan.amplitude,
             "seed": plan.seed,
-            "capacities": [one.document() | _as_mixture(plan, one) for one in self.capacities],
+            "capacities": [one.document(plan) for one in self.capacities],
             "comparisons": list(comparisons(self)),
             "points": self.summary.document()["points"],
             "live": [one.document() for one in self.live],
@@ -174,14 +173,6 @@ def caveats(plan: CapacityPlan) -> Iterator[str]:
         yield "no runs with a common disturbance, after which event-triggered loops carry fewer"
 
 
-def _as_mixture(plan: CapacityPlan, one: PolicyCapacity) -> dict[str, Any]:
-    """Return a finite median capacity as a multiple of the given mixture, and loops by kind."""
-    median = one.any_limit.median
-    if math.isinf(median):
-        return {"factor": None, "loops_by_kind": None}
-    return {"factor": plan.factor(median), "loops_by_kind": plan.composition(median)}
-
-
 def _listed(composition: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in composition.items())
 
@@ -232,15 +223,20 @@ def _figure(result: CapacityResult, limit: Limit, disturbance: str) -> FigureDes
         np.array(counts, dtype=np.float64), [*map(str, counts)], series, "number of loops", metric
     )
     ((panel,),) = (row.panels for row in figure.rows)
-    fitting = Rule(at=result.plan.periodic_loops, colour=palette.CERTIFIED, vertical=True, order=0)
-    live: list[Item] = [
-        Marks(x=np.array([float(one.loops)]), y=np.array([one.values[metric]]), marker="x",
-              size=9, stroke=2.2, colour=series_colour(policies.index(one.policy)))
-        for one in (result.live if _is_live(result, disturbance) else ())
-    ]  # fmt: skip
+    items: list[Item] = [
+        Rule(at=result.plan.periodic_loops, colour=palette.CERTIFIED, vertical=True, order=0),
+        *panel.items,
+    ]
+    if _is_live(result, disturbance):
+        items += [
+            Marks(x=np.array([float(one.loops)]), y=np.array([one.values[metric]]), marker="x",
+                  size=9, stroke=2.2, colour=series_colour(policies.index(one.policy)))
+            for one in result.live
+        ]  # fmt: skip
     y = panel.y if limit == "cost" else replace(panel.y, ends=(-0.02, 1.02))
-    panel = replace(panel, items=[fitting, *panel.items, *live], y=y)
-    return replace(figure, rows=[replace(figure.rows[0], panels=[panel])])
+    return replace(
+        figure, rows=[replace(figure.rows[0], panels=[replace(panel, items=items, y=y)])]
+    )
 
 
 def _is_live(result: CapacityResult, disturbance: str) -> bool:
@@ -268,20 +264,13 @@ def _shown(one: Capacity, last: int) -> str:
 
 def print_result(console: Console, result: CapacityResult) -> None:
     """Print the capacities, the comparisons and the live runs."""
-    plan = result.plan
-    table = Table(
-        title=f"{plan.scenario.name}: loops on {plan.rate_bps / 1000:g} kbit/s",
-        title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False,
-    )  # fmt: skip
-    shown = HEADINGS[:4]  # the table must fit into 80 columns
-    for heading in shown:
-        table.add_column(heading)
-    shown_counts = ", ".join(map(str, plan.counts))
-    for row in rows(result):
-        table.add_row(*row[: len(shown)])
-    console.print(table)
+    plan, columns = result.plan, slice(4)  # the table must fit into 80 columns
+    title = f"{plan.scenario.name}: loops on {plan.rate_bps / 1000:g} kbit/s"
+    shown = [row[columns] for row in rows(result)]
+    table = ResultTable("capacity", title, HEADINGS[columns], shown)
+    console.print(terminal_table(table, left=range(4)))
     lines = [
-        f"loops carried: median [95 % interval] of {shown_counts} loops",
+        f"loops carried: median [95 % interval] of {', '.join(map(str, plan.counts))} loops",
         by_rate(plan),
         *mixtures(result),
         *comparisons(result),

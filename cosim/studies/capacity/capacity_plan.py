@@ -106,19 +106,14 @@ def policies_of(kinds: Sequence[Kind]) -> dict[str, dict[str, Any]]:
     """Return the settings of the policies that are always compared."""
 
     def settings(mode: str, *, periodic: bool = False) -> dict[str, Any]:
-        changes = [
-            {"mode": None} | ({"trigger": _periodic(kind)} if periodic else {}) for kind in kinds
-        ]
+        triggers = [{"policy": "periodic", "period_s": kind.period_s} for kind in kinds]
+        changes = [{"mode": None} | ({"trigger": one} if periodic else {}) for one in triggers]
         loops = [kind.under(change) for kind, change in zip(kinds, changes, strict=True)]
         return {"mode": mode, "loops": loops}
 
     return {
         PERIODIC: settings("zoh", periodic=True), ZOH: settings("zoh"), MODEL: settings("model"),
     }  # fmt: skip
-
-
-def _periodic(kind: Kind) -> dict[str, Any]:
-    return {"policy": "periodic", "period_s": kind.period_s}
 
 
 def sampling_period_s(loop: Scenario) -> float:

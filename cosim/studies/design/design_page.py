@@ -3,9 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from cosim.output import palette
 from cosim.output.figure_description import (
@@ -24,7 +22,8 @@ from cosim.output.figure_description import (
 from cosim.output.figure_files import save_figures
 from cosim.output.figure_format import FigureFiles
 from cosim.output.page_kit import templates
-from cosim.studies.design.candidates import WORDS, DesignResult, certified, seconds
+from cosim.output.result_tables import ResultTable, terminal_table
+from cosim.studies.design.design_search import WORDS, DesignResult, certified
 from noack.config.scenario_file import dumps
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
@@ -47,8 +46,7 @@ def write_page(
     Raises:
         MachineError: they cannot be written.
     """
-    figures = save_figures([trade_off(found)], path, figure_files)
-    return [write_whole(path, page(found)), *figures]
+    return [write_whole(path, page(found)), *save_figures([trade_off(found)], path, figure_files)]
 
 
 def page(found: DesignResult) -> str:
@@ -60,7 +58,7 @@ def page(found: DesignResult) -> str:
         *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
     ]
     return templates(Path(__file__).parent).get_template("design.html.jinja").render(
-        title=found.space.families[0].scenario.name,
+        title=found.name,
         subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
         f"seed {found.seed}",
         verdict=found.verdict(),
@@ -117,7 +115,7 @@ def rows(found: DesignResult) -> list[tuple[str, ...]]:
     return [
         (
             plus_minus(trial.measured.transmissions, trial.measured.halfwidth),
-            seconds(trial.measured),
+            trial.measured.settling,
             f"{trial.candidate.alpha_per_s:.4g}",
             f"{trial.candidate.beta:.4g}",
             found.space.families[trial.candidate.family].weight,
@@ -129,19 +127,12 @@ def rows(found: DesignResult) -> list[tuple[str, ...]]:
 
 def print_found(console: Console, found: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{found.space.families[0].scenario.name}: trade-off of transmissions and settling time"
-    # The table must fit into 80 columns.
-    table = Table(
-        title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
-    )
-    for heading in HEADINGS:
-        words = heading in HEADINGS[-2:]
-        table.add_column(heading, justify="left" if words else "right", no_wrap=True)
+    title = f"{found.name}: trade-off of transmissions and settling time"
     every = rows(found)
-    for row in every[:: -(-len(every) // _MOST_ROWS) or 1]:
-        table.add_row(*row)
+    shown = every[:: -(-len(every) // _MOST_ROWS) or 1]
     if every:
-        console.print(table)
+        words = range(len(HEADINGS) - 2, len(HEADINGS))
+        console.print(terminal_table(ResultTable("design", title, HEADINGS, shown), left=words))
     lines = []
     if found.feasible:
         lines = [

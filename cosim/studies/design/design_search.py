@@ -1,40 +1,390 @@
-"""The search: few draws for all candidates, more for the best ones; all use the same draws.
+"""The search for a trigger: few draws for all candidates, more for the best ones; and its result.
 
-A candidate is screened with few draws. If it then ranks first, it is measured with all draws and
-certified; after this another candidate may rank first. So no tried candidate that meets the limits
-has fewer transmissions than the chosen one. With few draws the quantile itself must meet its limit,
-with all draws the upper end of its interval.
+All candidates use the same draws. A candidate is screened with few of them. If it then ranks first,
+it is measured with all draws and certified; after this another candidate may rank first. So no
+tried candidate that meets the limits has fewer transmissions than the chosen one. With few draws
+the quantile itself must meet its limit, with all draws the upper end of its interval.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch import Population
+from cosim.simulation.batch import Population, run_batch, setting_of
 from cosim.studies.campaign.campaign_figures import undominated
+from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.campaign.random_draws import Box, box_of
-from cosim.studies.design.candidates import (
-    CandidateMeasures,
-    DesignLimits,
-    DesignResult,
-    Trial,
-    bounds_of,
-    measure,
-    require_certifiable,
-    require_draws,
-)
 from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
+from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
+from noack.core.number_format import plus_minus
+from noack.theory.certificates.certified_bounds import ScenarioCertificate
+from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
+from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box
 
+Bounded = Literal["state", "error"]
+Bounds = Mapping[Bounded, float]
+"""Certified sup‖x‖ and sup‖e_c‖, Euclidean; infinite if there is no bound."""
+WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
+Progress = Callable[[float], None]
+"""Called with the approximate share of the work that is done."""
 _SMALLEST_STEP = 0.04
 """Smallest step of the refinement, as a share of the grid's steps."""
 _MOST_ROUNDS = 24
 _SCREENING = 4
 """Screening uses the number of draws divided by this."""
+_DESIGNED = "_designed"
 
-Progress = Callable[[float], None]
-"""Called with the approximate share of the work that is done."""
+
+@dataclass(frozen=True)
+class DesignLimits:
+    """The limits of a design.
+
+    Args:
+        settling_s: upper limit of the quantile of the settling times.
+        quantile: the share of draws that must settle within this limit.
+        settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
+        bounds: upper limits of the certified bounds.
+        schedule: whether bounds are certified under the scenario's schedule; else under the paper's
+            conditions.
+    """
+
+    settling_s: float
+    quantile: float
+    settle: float
+    bounds: Bounds
+    schedule: bool = False
+
+    def excess(self, settling_s: float, bounds: Bounds) -> float:
+        """Return 0 if all limits are met, else the largest 1 − limit/value."""
+        pairs = [(settling_s, self.settling_s)]
+        pairs += [(bounds[name], limit) for name, limit in self.bounds.items() if name in bounds]
+        return max(0.0, *(1.0 - limit / value if value > 0 else 0.0 for value, limit in pairs))
+
+
+class CandidateMeasures(NamedTuple):
+    """Measures of a candidate over k draws; intervals have 95 % confidence."""
+
+    draws: int
+    transmissions: float
+    """Mean number of transmissions."""
+    halfwidth: float
+    """Half-width of the mean's confidence interval."""
+    settling_s: float
+    """Quantile of the settling times; infinite if too many runs do not settle."""
+    settling_low_s: float
+    settling_high_s: float
+    """Upper end of the quantile's interval, by order statistics."""
+    settled: float
+    """The share of runs that settle within the limit."""
+
+    @property
+    def settling(self) -> str:
+        """The quantile of the settling times with its interval, as text."""
+        low, at, high = (
+            f"{value:.4g}" if math.isfinite(value) else "∞"
+            for value in (self.settling_low_s, self.settling_s, self.settling_high_s)
+        )
+        return f"{at} s [{low}, {high}]"
+
+
+@dataclass
+class Trial:
+    """A candidate with its measures and bounds."""
+
+    candidate: Candidate
+    measured: CandidateMeasures
+    full: bool = False
+    """Whether it was measured with all draws."""
+    bounds: Bounds = field(default_factory=dict)
+    """Certified bounds; empty until they are computed."""
+
+    def excess(self, limits: DesignLimits) -> float:
+        """Return by how much the candidate misses the limits, from the measures so far."""
+        settling_s = self.measured.settling_high_s if self.full else self.measured.settling_s
+        return limits.excess(settling_s, self.bounds)
+
+
+def measure(scenario: Scenario, limits: DesignLimits, population: Population) -> CandidateMeasures:
+    """Run a scenario over draws; the settling time of a failed run is infinite.
+
+    Raises:
+        CallerError: the engine cannot run the scenario.
+    """
+    rows = run_batch(replace(setting_of(resolve(scenario)), settle=limits.settle), population)
+    sent = estimate(rows["transmissions"].astype(np.float64))
+    settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
+    quantile_s = float(np.quantile(settling_s, limits.quantile, method="inverted_cdf"))
+    low_s, high_s = quantile_interval(settling_s, limits.quantile)
+    settled = float(np.mean(settling_s <= limits.settling_s))
+    return CandidateMeasures(
+        len(rows), sent.mean, sent.halfwidth, quantile_s, max(low_s, 0.0), high_s, settled
+    )
+
+
+def require_draws(draws: int, quantile: float) -> None:
+    """Require enough draws for an interval of the quantile.
+
+    Raises:
+        CallerError: there are too few draws.
+    """
+    enough = draws
+    while interval_ranks(enough, quantile)[1] == enough:
+        enough += max(enough // 50, 1)
+    if enough > draws:
+        raise CallerError(
+            f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough"
+        )
+
+
+def _require_certifiable(scenario: Scenario) -> None:
+    """Raise CallerError if no certificate covers all plants and initial states that are drawn."""
+    if scenario.plant.initial_state_halfwidth is not None:
+        raise CallerError("--bound: needs one x(0); leave out plant.initial_state_halfwidth")
+    if (outside := outside_box(resolve(scenario))) is not None:
+        raise CallerError(f"--bound: {outside}")
+
+
+def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertificate:
+    """Return the certificate of all plants in the box, or of the plant if there is no box."""
+    resolved = resolve(scenario)
+    late = resolved.certificate.late_periods
+    conditions = (
+        nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
+    )
+    return certify_box(resolved, conditions) or certify(resolved, conditions)
+
+
+def _bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
+    """Return certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
+    found = certificate_of(scenario, limits)
+    if found.constants is None:
+        return {"state": math.inf, "error": math.inf}
+    t_s = np.array([0.0, found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0])
+    weight = loop_of(resolve(scenario)).weight
+    shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
+    return {
+        "state": float(found.state(t_s).max()),
+        "error": shrinks * float(found.controller_error(t_s).max()),
+    }
+
+
+class Search:
+    """All trials of a space on common draws; the draws after them confirm the choice."""
+
+    def __init__(
+        self, space: DesignSpace, limits: DesignLimits, box: Box, seed: int, draws: int
+    ) -> None:
+        self.space, self.limits = space, limits
+        self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
+        self._all = box.population(seed, range(draws))
+        self._fresh = box.population(seed, range(draws, 2 * draws))
+        self._trials: dict[Candidate, Trial] = {}
+
+    @property
+    def trials(self) -> list[Trial]:
+        """All trials, in the order in which they were made."""
+        return list(self._trials.values())
+
+    def scenario(self, trial: Trial) -> Scenario:
+        """Return the scenario of a trial."""
+        return self.space.families[trial.candidate.family].with_trigger(trial.candidate)
+
+    def run(self, progress: Progress) -> Trial:
+        """Return the trial with the fewest transmissions within the limits, or the closest."""
+        grid, families = list(self.space.grid()), len(self.space.families)
+        for i, candidate in enumerate(grid):
+            self._try([candidate])
+            progress(0.5 * (i + 1) / len(grid))
+        for family in range(families):
+            self._refine(family)
+            progress(0.5 + 0.4 * (family + 1) / families)
+        self.front()
+        best = self._best(self.trials)
+        progress(1.0)
+        return best
+
+    def front(self) -> list[Trial]:
+        """Return the trade-off: no other trial has fewer transmissions and also settles earlier.
+
+        All its trials are within the bounds and measured with all draws.
+        """
+        while True:
+            limits = self.limits.bounds.items()
+            known = [
+                trial for trial in self.trials
+                if all(trial.bounds.get(name, 0.0) <= limit for name, limit in limits)
+            ]  # fmt: skip
+            sent = np.array([t.measured.transmissions for t in known])
+            settling_s = np.array([t.measured.settling_s for t in known])
+            front = [known[i] for i in undominated(sent, settling_s)]
+            front = [t for t in front if np.isfinite(t.measured.settling_s)]
+            rough = [t for t in front if not self._is_exact(t)]
+            if not rough:
+                return front
+            for trial in rough:
+                self._measure_more(trial)
+
+    def confirm(self, trial: Trial) -> CandidateMeasures:
+        """Measure a trial on new draws, which the search did not use."""
+        return measure(self.scenario(trial), self.limits, self._fresh)
+
+    def _refine(self, family: int) -> None:
+        """Try the neighbours of a family's best trial, in steps that become smaller."""
+
+        def best_of_family() -> Trial:
+            return self._best([t for t in self.trials if t.candidate.family == family])
+
+        share, rounds, best = 0.5, 0, best_of_family()
+        while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
+            self._try(self.space.around(best.candidate, share))
+            before, best = best, best_of_family()
+            if best is before:
+                share /= 2
+            rounds += 1
+
+    def _try(self, candidates: Iterable[Candidate]) -> None:
+        for candidate in candidates:
+            if candidate not in self._trials:
+                scenario = self.space.families[candidate.family].with_trigger(candidate)
+                measured = measure(scenario, self.limits, self._few)
+                self._trials[candidate] = Trial(candidate, measured)
+
+    def _best(self, trials: list[Trial]) -> Trial:
+        while not self._is_exact(best := min(trials, key=self._rank)):
+            self._measure_more(best)
+        return best
+
+    def _rank(self, trial: Trial) -> tuple[float, float, float, Candidate]:
+        excess, measured = trial.excess(self.limits), trial.measured
+        unsettled = 1.0 - measured.settled if excess > 0 else 0.0
+        return excess, unsettled, measured.transmissions, trial.candidate
+
+    def _is_exact(self, trial: Trial) -> bool:
+        return trial.full and (not self.limits.bounds or bool(trial.bounds))
+
+    def _measure_more(self, trial: Trial) -> None:
+        """Measure a trial with all draws; if this is already done, certify its bounds."""
+        if not trial.full:
+            trial.measured = measure(self.scenario(trial), self.limits, self._all)
+            trial.full = True
+        elif not trial.bounds:
+            trial.bounds = _bounds_of(self.scenario(trial), self.limits)
+
+
+@dataclass(frozen=True)
+class DesignResult:
+    """The result of a design."""
+
+    space: DesignSpace
+    limits: DesignLimits
+    trials: Sequence[Trial]
+    """All candidates that were tried."""
+    front: Sequence[Trial]
+    """The trade-off curve, by ascending transmissions."""
+    best: Trial
+    """The candidate with the fewest transmissions within the limits, or the closest to them."""
+    fresh: CandidateMeasures
+    """Measures of the best candidate on new draws, which the search did not use."""
+    bounds: Bounds | None
+    """Certified bounds of the best candidate; None if there are none."""
+    seed: int
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the best candidate meets the limits with the upper end of its interval."""
+        return self.best.excess(self.limits) == 0
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the quantile itself also meets the limit on the new draws."""
+        return self.feasible and self.fresh.settling_s <= self.limits.settling_s
+
+    @property
+    def name(self) -> str:
+        """Name of the scenario for which the trigger is chosen."""
+        return self.space.families[0].scenario.name
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of the best candidate, under a new name."""
+        chosen = self.space.families[self.best.candidate.family].with_trigger(self.best.candidate)
+        return chosen.model_copy(
+            update={
+                "name": f"{chosen.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}",
+                "description": f"{chosen.name} with the trigger that transmits least while "
+                f"{100 * self.limits.quantile:g} % of draws settle within "
+                f"{self.limits.settling_s:g} s.",
+            }
+        )
+
+    @property
+    def conditions(self) -> str:
+        """The conditions of the certified bounds."""
+        kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
+        return f"under {kind}, for the whole box"
+
+    def verdict(self) -> str:
+        """The verdict in one line."""
+        limits, share = self.limits, f"in {100 * self.limits.quantile:g} % of draws"
+        candidate = self.best.candidate
+        weight = self.space.families[candidate.family].name
+        at = f"α = {candidate.alpha_per_s:.4g} /s, β = {candidate.beta:.4g}, weight {weight}"
+        if self.confirmed:
+            sent = plus_minus(self.fresh.transmissions, self.fresh.halfwidth)
+            return f"{sent} transmissions, settled after {self.fresh.settling} {share}: {at}"
+        if self.feasible:
+            return (
+                f"not confirmed: on fresh draws it takes {self.fresh.settling} {share}, "
+                f"{limits.settling_s:g} s are allowed; take more --draws"
+            )
+        measured, missed = self.best.measured, []
+        if measured.settling_high_s > limits.settling_s:
+            allowed = f"({limits.settling_s:g} s allowed)"
+            missed.append(f"a settling time of {measured.settling} {share} {allowed}")
+        for name, limit in limits.bounds.items():
+            if self.best.bounds[name] > limit:
+                missed.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
+        return f"no design meets the limits; the closest has {' and '.join(missed)}, at {at}"
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as JSON."""
+        limits = asdict(self.limits)
+        limits["under"] = "schedule" if limits.pop("schedule") else "paper"
+        best = self._row(self.best) | {
+            "W": self.scenario.decaying.weight,
+            "K": self.scenario.model.gain,
+            "fresh": self.fresh._asdict(),
+            "bounds": None if self.bounds is None else dict(self.bounds),
+        }
+        return {
+            "scenario": self.name,
+            "limits": limits,
+            "seed": self.seed,
+            "tried": len(self.trials),
+            "feasible": self.feasible,
+            "confirmed": self.confirmed,
+            "verdict": self.verdict(),
+            "best": best,
+            "front": [self._row(trial) for trial in self.front],
+        }
+
+    def _row(self, trial: Trial) -> dict[str, Any]:
+        number, alpha_per_s, beta = trial.candidate
+        family = self.space.families[number]
+        chosen = {"gain": family.gain, "weight": family.weight}
+        return chosen | {"alpha_per_s": alpha_per_s, "beta": beta} | trial.measured._asdict()
+
+
+def certified(name: Bounded, value: float) -> str:
+    """Return a certified bound as text."""
+    if not math.isfinite(value):
+        return f"no certified bound of {WORDS[name]}"
+    return f"{WORDS[name]} ≤ {value:.4g}"
 
 
 def design(
@@ -61,127 +411,16 @@ def design(
         )
     require_draws(draws, limits.quantile)
     if limits.bounds:
-        require_certifiable(first)
+        _require_certifiable(first)
     space = space_of(families)
-    search = Search(space, limits, box_of(first), seed, draws, progress)
-    best = search.run()
-    scenario = space.families[best.candidate.family].with_trigger(best.candidate)
+    search = Search(space, limits, box_of(first), seed, draws)
+    best = search.run(progress)
+    scenario = search.scenario(best)
     try:
-        require_certifiable(scenario)
-        bounds = best.bounds or bounds_of(scenario, limits)
+        _require_certifiable(scenario)
+        bounds = best.bounds or _bounds_of(scenario, limits)
     except CallerError:  # a bound is not required here
         bounds = None
     return DesignResult(
         space, limits, search.trials, search.front(), best, search.confirm(best), bounds, seed
     )
-
-
-class Search:
-    """All trials of a space on common draws; the draws after them confirm the choice."""
-
-    def __init__(
-        self,
-        space: DesignSpace,
-        limits: DesignLimits,
-        box: Box,
-        seed: int,
-        draws: int,
-        progress: Progress,
-    ) -> None:
-        self.space, self.limits = space, limits
-        self._few = box.population(seed, range(max(draws // _SCREENING, 1)))
-        self._all = box.population(seed, range(draws))
-        self._fresh = box.population(seed, range(draws, 2 * draws))
-        self._trials: dict[Candidate, Trial] = {}
-        self._progress = progress
-
-    @property
-    def trials(self) -> list[Trial]:
-        """All trials, in the order in which they were made."""
-        return list(self._trials.values())
-
-    def run(self) -> Trial:
-        """Return the trial with the fewest transmissions within the limits, or the closest."""
-        grid, families = list(self.space.grid()), len(self.space.families)
-        for i, candidate in enumerate(grid):
-            self._try([candidate])
-            self._progress(0.5 * (i + 1) / len(grid))
-        for family in range(families):
-            self._refine(family)
-            self._progress(0.5 + 0.4 * (family + 1) / families)
-        self.front()
-        best = self._best(self.trials)
-        self._progress(1.0)
-        return best
-
-    def front(self) -> list[Trial]:
-        """Return the trade-off: no other trial has fewer transmissions and also settles earlier.
-
-        All its trials are within the bounds and measured with all draws.
-        """
-        while True:
-            known = [t for t in self.trials if self._within_bounds(t)]
-            sent = np.array([t.measured.transmissions for t in known])
-            settling_s = np.array([t.measured.settling_s for t in known])
-            front = [known[i] for i in undominated(sent, settling_s)]
-            front = [t for t in front if np.isfinite(t.measured.settling_s)]
-            open_ = [t for t in front if not self._settled(t)]
-            if not open_:
-                return front
-            for trial in open_:
-                self._settle(trial)
-
-    def confirm(self, trial: Trial) -> CandidateMeasures:
-        """Measure a trial on new draws, which the search did not use."""
-        return self._measure(trial.candidate, self._fresh)
-
-    def _refine(self, family: int) -> None:
-        """Try the neighbours of a family's best trial, in steps that become smaller."""
-        share, rounds = 0.5, 0
-        best = self._best(self._of(family))
-        while share > _SMALLEST_STEP and rounds < _MOST_ROUNDS:
-            self._try(self.space.around(best.candidate, share))
-            before, best = best, self._best(self._of(family))
-            if best is before:
-                share /= 2
-            rounds += 1
-
-    def _of(self, family: int) -> list[Trial]:
-        return [trial for trial in self.trials if trial.candidate.family == family]
-
-    def _try(self, candidates: Iterable[Candidate]) -> None:
-        for one in candidates:
-            if one not in self._trials:
-                self._trials[one] = Trial(one, self._measure(one, self._few))
-
-    def _best(self, trials: list[Trial]) -> Trial:
-        while True:
-            best = min(trials, key=self._rank)
-            if self._settled(best):
-                return best
-            self._settle(best)
-
-    def _rank(self, trial: Trial) -> tuple[float, float, float, Candidate]:
-        excess, measured = trial.excess(self.limits), trial.measured
-        unsettled = 1.0 - measured.settled if excess > 0 else 0.0
-        return excess, unsettled, measured.transmissions, trial.candidate
-
-    def _settled(self, trial: Trial) -> bool:
-        return trial.full and (not self.limits.bounds or bool(trial.bounds))
-
-    def _settle(self, trial: Trial) -> None:
-        """Measure a trial with all draws; if this is already done, certify its bounds."""
-        if not trial.full:
-            trial.measured, trial.full = self._measure(trial.candidate, self._all), True
-        elif not trial.bounds:
-            family = self.space.families[trial.candidate.family]
-            trial.bounds = bounds_of(family.with_trigger(trial.candidate), self.limits)
-
-    def _within_bounds(self, trial: Trial) -> bool:
-        return all(
-            trial.bounds.get(name, 0.0) <= limit for name, limit in self.limits.bounds.items()
-        )
-
-    def _measure(self, candidate: Candidate, population: Population) -> CandidateMeasures:
-        family = self.space.families[candidate.family]
-        return measure(family.with_trigger(candidate), self.limits, population)

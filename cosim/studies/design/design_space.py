@@ -77,36 +77,24 @@ class DesignSpace:
         for family, decay_per_s in enumerate(self.decay_per_s):
             for step, level in itertools.product(range(RATE_STEPS), LEVELS):
                 alpha_per_s = MOST_RATE * decay_per_s / RATE_STEP**step
-                one = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
-                if self.contains(one):
-                    yield one
+                candidate = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
+                if self.contains(candidate):
+                    yield candidate
 
     def around(self, centre: Candidate, share: float) -> Iterator[Candidate]:
         """Return a candidate's neighbours, at a distance of this share of the grid's steps."""
         family, alpha_per_s, beta = centre
         for i, j in itertools.product((-share, 0, share), repeat=2):
-            one = Candidate(family, alpha_per_s * RATE_STEP**i, beta * LEVEL_STEP**j)
-            if (i or j) and self.contains(one):
-                yield one
+            candidate = Candidate(family, alpha_per_s * RATE_STEP**i, beta * LEVEL_STEP**j)
+            if (i or j) and self.contains(candidate):
+                yield candidate
 
-    def contains(self, one: Candidate) -> bool:
+    def contains(self, candidate: Candidate) -> bool:
         """Whether a candidate is within the ranges."""
         low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
         high = LEVELS[-1] * self.initial_norm * _WIDEST
-        return one.alpha_per_s < self.decay_per_s[one.family] and low < one.beta < high
-
-
-def with_gain(scenario: Scenario, K: Matrix) -> Scenario:
-    """Return the scenario with another gain, (m, n)."""
-    model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
-    return scenario.model_copy(update={"model": model})
-
-
-def with_norm(scenario: Scenario, weight: Matrix | None) -> Scenario:
-    """Return the scenario with another norm in the trigger, W or the identity."""
-    rows = None if weight is None else tuple(map(tuple, weight.tolist()))
-    trigger = scenario.decaying.model_copy(update={"weight": rows})
-    return scenario.model_copy(update={"trigger": trigger})
+        slow = candidate.alpha_per_s < self.decay_per_s[candidate.family]
+        return slow and low < candidate.beta < high
 
 
 def decay_rate(scenario: Scenario) -> float:
@@ -189,7 +177,8 @@ def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scen
     found = []
     for cost in COSTS_OF_INPUT:
         K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
-        found.append((f"lqr R × {cost:g}", with_gain(scenario, K)))
+        model = scenario.model.model_copy(update={"gain": tuple(map(tuple, K.tolist()))})
+        found.append((f"lqr R × {cost:g}", scenario.model_copy(update={"model": model})))
     return found
 
 
@@ -218,8 +207,12 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
 
 
 def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:
+    def with_norm(rows: tuple[tuple[float, ...], ...] | None) -> Scenario:
+        trigger = scenario.decaying.model_copy(update={"weight": rows})
+        return scenario.model_copy(update={"trigger": trigger})
+
     if norm == "identity":
-        return with_norm(scenario, None)
+        return with_norm(None)
     if norm == "given":
         if scenario.decaying.weight is None:
             raise CallerError("--weights given: the scenario has no trigger.weight")
@@ -240,4 +233,4 @@ def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) ->
         weight = choose_weight(nominal, beta, alpha_per_s, conditions, progress)
     except NotDecayingError as error:
         raise CallerError(f"--weights chosen: {error}") from None
-    return with_norm(scenario, weight)
+    return with_norm(tuple(map(tuple, weight.tolist())))

@@ -5,7 +5,8 @@ Each function returns numbers for the page, from the exact simulator or from lin
 
 import itertools
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import schur
@@ -19,18 +20,26 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.paper.paper_campaign import MODES, open_loop_eigenvalues, resolved_draw
+from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.config.named_models import lane_following
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
-from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1
+from noack.theory.bounds.terms import Constants
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, Any]
-
+Mode = Literal["model", "zoh"]
+MODES: tuple[Mode, ...] = ("model", "zoh")
+SEED = 0
+"""Seed of the campaign ``paper``."""
+_FEW, _SOME = 25, 100
+"""Number of draws with certificates, which take long, and with the states at deliveries."""
 _LONG_S = 300.0
 _SAMPLED_S = 20.0
 _SAMPLES = 101
@@ -40,15 +49,36 @@ _ZERO = 1e-6
 """An eigenvalue of smaller magnitude is taken as 0: the lane's double eigenvalue 0 is defective."""
 
 
-def evidence(scenario: Scenario, representative: int) -> Numbers:
+def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
+    """Return a draw of the campaign as a resolved scenario; draw i has the same plant in both."""
+    return drawn_scenario(scenario.model_copy(update={"mode": mode}), SEED, draw)
+
+
+def open_loop_eigenvalues(A: Matrix) -> Vector:
+    """Return the eigenvalues of A, (n,); eigenvalues that are 0 up to rounding are set to 0.
+
+    A defective double eigenvalue splits by about the square root of the rounding error.
+    """
+    eigenvalues = np.linalg.eigvals(A)
+    tolerance = math.sqrt(np.finfo(float).eps) * max(float(np.linalg.norm(A, 2)), 1.0)
+    return np.where(np.abs(eigenvalues) < tolerance, 0.0, eigenvalues)
+
+
+def evidence(scenario: Scenario, draws: int, representative: int) -> Numbers:
     """Return all numbers of the page's sections on assumptions and errors, as JSON.
 
-    The example is the representative draw of the base ensemble with this scenario.
+    Args:
+        scenario: that of the base; its plant and initial state are not yet drawn.
+        draws: number of draws.
+        representative: the draw that is the example.
     """
     M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
         "example": {"M": M, "beta": trigger.beta, "alpha_per_s": trigger.alpha_per_s},
         "eigenvalues": _eigenvalues(),
+        "plants": _plants(scenario, draws),
+        "growth": _growth(scenario, min(draws, _SOME)),
+        "certificates": _certificates(scenario, [*range(min(draws, _FEW)), representative]),
         "loss": _loss(M),
         "exact_model": _exact_model(scenario),
         "trapped": _trapped(scenario),
@@ -73,6 +103,87 @@ def _eigenvalues() -> Numbers:
     found["rank"] = int(np.linalg.matrix_rank(A))
     found["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
     return found
+
+
+def _plants(scenario: Scenario, draws: int) -> Numbers:
+    """Return the largest real parts of the eigenvalues of A and of A + BK over the plants."""
+    K = loop_of(resolved_draw(scenario, 0, "model")).K
+    plants = box_of(scenario).population(SEED, range(draws))
+    opened = np.array([open_loop_eigenvalues(A).real.max() for A in plants.A])
+    closed = np.array([spectral_abscissa(A + B @ K) for A, B in zip(*plants[:2], strict=True)])
+    return {
+        "not_unstable": float((opened <= 0).mean()),
+        "fastest_open_per_s": float(opened.max()),
+        "closed_per_s": [float(closed.min()), float(closed.max())],
+        "unstabilised": int((closed > -scenario.decaying.alpha_per_s).sum()),
+    }
+
+
+def _growth(scenario: Scenario, draws: int) -> Numbers:
+    """Return the number of stretches between deliveries, and in how many of them ‖x‖ grows."""
+    found: Numbers = {"draws": draws}
+    for mode in MODES:
+        runs = [run_continuous(resolved_draw(scenario, draw, mode)) for draw in range(draws)]
+        norms = [np.linalg.norm([state.x for state in run.before], axis=1) for run in runs]
+        rises = [np.diff(n[run.delivered]) > 0 for n, run in zip(norms, runs, strict=True)]
+        found[mode] = {
+            "stretches": sum(map(len, rises)), "growing": sum(int(one.sum()) for one in rises)
+        }  # fmt: skip
+    return found
+
+
+def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
+    """Return how near MB-ET comes to its certified bounds, and Theorem 2's δ̲; the last is ours."""
+    rows, theorems = list[Numbers](), list[Numbers]()
+    for draw in draws:
+        resolved = resolved_draw(scenario, draw, "model")
+        constants = certify(resolved, ideal_conditions(resolved)).constants
+        if constants is None:
+            continue
+        run, trigger = run_continuous(resolved), resolved.decaying
+        samples = run.at(np.linspace(0.0, run.reached_s, 4001))
+        growth = np.exp(trigger.alpha_per_s * samples.t_s)
+        # e_c jumps at a delivery, so its largest value may come just before.
+        before = np.array([state.e_c for state in run.before[1:]]).reshape(-1, run.system.loop.n)
+        at_events = run.system.norms(before) * np.exp(trigger.alpha_per_s * run.event_s[1:])
+        error = max((run.e_c_norm(samples) * growth).max(), at_events.max(initial=0.0))
+        rows.append({
+            "error": error / trigger.beta, "delta": constants.delta,
+            "state": (np.linalg.norm(samples.x, axis=1) * growth).max() / constants.state,
+            "inter_event": np.diff(run.event_s).min() / (constants.inter_event_s or math.nan),
+        })  # fmt: skip
+        theorems += _theorem_2(resolved, constants)
+    return {
+        "draws": len(rows) - 1,
+        "error": max(row["error"] / row["delta"] for row in rows),
+        "state": max(row["state"] for row in rows),
+        "inter_event": min(row["inter_event"] for row in rows),
+        "representative": rows[-1],
+        "theorem_2": {
+            "draws": len(theorems),
+            "negative": sum(row["negative"] for row in theorems),
+            **{name: [f(row[name] for row in theorems) for f in (min, max)]
+               for name in ("first_s", "inter_event_s")},
+        },
+    }  # fmt: skip
+
+
+def _theorem_2(resolved: Scenario, constants: Constants) -> list[Numbers]:
+    """Return Theorem 2 with the certified Δ: eq:tau at t_i = 0, and its smallest value.
+
+    ``negative`` is 1 if F̄ < 0, so that eq:tau falls with t_i. Without the theorem there is no row.
+    """
+    trigger = resolved.decaying
+    found = theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, constants.delta)
+    if found is None:
+        return []
+    start = found.a_tilde * (found.state_start - found.state_forced)  # F̄
+    gap = found.alpha_bar_per_s - trigger.alpha_per_s
+    forced = (gap / found.c + found.a_tilde) * found.state_forced  # F
+    rate = found.a_hat + found.alpha_bar_per_s
+    F = start / rate + forced / (found.a_hat + trigger.alpha_per_s)
+    first_s = math.log1p(trigger.beta / F) / rate if F > 0 else math.inf
+    return [{"inter_event_s": found.inter_event_s, "first_s": first_s, "negative": int(start < 0)}]
 
 
 def _loss(M: int) -> Numbers:

@@ -1,65 +1,230 @@
-"""The page ``paper.md``: the text of a template with the numbers of the results."""
+"""The page ``paper.md``: the text of a template with the numbers of the campaign ``paper``.
 
+``figures/paper.json`` has these numbers: the campaign's summary, and the evidence.
+"""
+
+import json
+import math
 import re
 import textwrap
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cosim.studies.campaign.metrics import paired, quartiles
-from cosim.studies.paper.paper_campaign import BASE, MODES, OTHER_EXAMPLES, STEP_S, settings_of
-from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
-from cosim.studies.paper.paper_results import HORIZON_S, Results, number, percent, spread
-from noack.core.linear_systems import Vector
+from cosim.output.figure_description import FigureDescription
+from cosim.output.figure_files import save_figure
+from cosim.output.signal_figures import states_figure
+from cosim.simulation.continuous import run_continuous, timeless
+from cosim.studies.campaign.campaign_claims import CONFIRMED_FROM, PARTLY_FROM, share_text
+from cosim.studies.campaign.campaign_figures import figures
+from cosim.studies.campaign.campaign_summary import runs_at
+from cosim.studies.campaign.finished_campaign import FinishedCampaign
+from cosim.studies.campaign.metrics import METRICS, Metric, quartiles
+from cosim.studies.paper.paper_evidence import MODES, evidence, resolved_draw
+from netem.channel import UPDATE_LINK
+from netem.link_state import LinkState
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps
+from noack.core.errors import MachineError, why
+from noack.core.file_access import write_whole
+from noack.protocol.record_tables import Fate, effective
 
+BASE = "base: Bernoulli 0.8"
+POLICIES = ("MB-ET", "ZOH-ET")
+"""The paper's names of the loops."""
+_OTHER_EXAMPLES = ("nothing lost", "box × 5", "box × 0: exact model")
+"""Variations that change the paper's example. The others vary only unspecified settings."""
+_REPRESENTED: tuple[Metric, ...] = (
+    "transmissions", "deliveries", "settling_s", "inter_event_min_s",
+)  # fmt: skip
+"""The metrics by which the representative draw is chosen."""
+_DIGITS = 5
+"""Number of significant digits in the file."""
+_SMALL, _LARGE = 1e-3, 1e6
+"""Numbers outside these limits are written with a power of ten."""
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SHOWN_S, _STEP_S = 20.0, 0.01
+"""A draw is shown up to this time; later values are too small to be visible."""
 _COLUMNS, _GLUE = 100, "\N{NO-BREAK SPACE}"
 _ITEM = re.compile(r"\* |\d+\. ")
 """The mark of a list item in Markdown."""
-_LOST = "lost"
-_MEASURES = (
-    ("transmissions", "events"),
-    ("deliveries", "deliveries"),
-    ("share lost", _LOST),
-    ("median time between transmissions, s", "gap_median_s"),
-    ("median time between deliveries, s", "reception_median_s"),
-    ("shortest inter-event time, s", "gap_min_s"),
-    ("settling time to 5 %, s", "settled_5_s"),
-    ("settling time to 1 %, s", "settled_1_s"),
-    ("sup ‖e_c‖e^(αt)/β", "controller_error"),
-    ("sup ‖x‖/‖x(0)‖", "peak"),
-    (f"‖x‖ at {HORIZON_S:g} s", "final_norm"),
-)
+
+Document = dict[str, Any]
 
 
-def render(results: Results) -> str:
-    """Return the page in Markdown."""
+def make_folder(folder: Path) -> Path:
+    """Make the folder of the page's figures before the simulations start; return it.
+
+    Raises:
+        MachineError: it cannot be made.
+    """
+    try:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
+    return folder / "figures"
+
+
+def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Path]]:
+    """Write page, figures and numbers; return the numbers and the written files.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    found, inner = numbers(done), make_folder(folder)
+    draw, scenario = found["representative"], _base(done)
+    described = {one.name: one for one in figures(done.summary, done.store)}
+    described |= {policy.lower(): draw_figure(scenario, draw, mode)
+                  for policy, mode in zip(POLICIES, MODES, strict=True)}  # fmt: skip
+    written = [
+        write_whole(folder / "paper.md", render(found)),
+        write_whole(inner / "paper.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n"),
+        write_whole(inner / "paper-draw.toml", dumps(resolved_draw(scenario, draw, "model"))),
+    ]
+    for name, figure in described.items():
+        written.append(inner / f"paper-{name}.svg")
+        save_figure(figure, written[-1])
+    return found, written
+
+
+def numbers(done: FinishedCampaign) -> Document:
+    """Return the content of ``paper.json``: rounded, null for infinity."""
+    draws, draw = done.summary.draws, _representative(done)
+    found = {
+        "representative": draw,
+        "evidence": evidence(_base(done), draws, draw),
+        "summary": done.summary.document(),
+    }
+    rounded: Document = _rounded(found)
+    return rounded
+
+
+def _base(done: FinishedCampaign) -> Scenario:
+    return done.store.points[0].scenario
+
+
+def _representative(done: FinishedCampaign) -> int:
+    """Return the draw nearest to the medians of the base, with both policies.
+
+    Distance is the sum of squares of (value − median) / (upper − lower quartile).
+    """
+    distance = np.zeros(done.summary.draws)
+    for point in (one for one in done.store.points if one.labels["variation"] == BASE):
+        metrics, _ = runs_at(point, done.store)
+        for name in _REPRESENTED:
+            low, middle, high = quartiles(metrics[name])
+            if math.isfinite(high) and high > low:
+                distance += ((metrics[name] - middle) / (high - low)) ** 2
+    return int(np.argmin(distance))
+
+
+def _rounded(value: Any) -> Any:
+    """Return values as in the JSON file: rounded, integers without a point, null for infinity."""
+    if isinstance(value, Mapping):
+        return {key: _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(entry) for entry in value]
+    if isinstance(value, str | bool | int) or value is None:
+        return value
+    if not math.isfinite(value):
+        return None
+    short = float(f"{value:.{_DIGITS}g}")
+    return int(short) if short == round(short) and abs(short) < 10**_DIGITS else short
+
+
+def draw_figure(scenario: Scenario, draw: int, mode: str) -> FigureDescription:
+    """Describe states, broadcasting and receiving intervals of one loop of a draw."""
+    resolved = resolved_draw(scenario, draw, "model" if mode == "model" else "zoh")
+    run = run_continuous(resolved)
+    event_s = run.event_s[run.event_s <= _SHOWN_S]
+    samples = run.at(np.linspace(0.0, _SHOWN_S, round(_SHOWN_S / _STEP_S) + 1))
+    link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
+    link.start_flow(0, 0)
+    fates = np.array([link.decide(0, 1, 0).fate for _ in event_s], dtype=np.int64)
+    return states_figure(
+        mode=resolved.mode,
+        t_s=samples.t_s,
+        x=samples.x,
+        x_s=samples.x_s,
+        x_c=samples.x_c,
+        state_names=run.system.loop.state_names,
+        broadcast_s=event_s,
+        dropped=~effective(fates),
+        received_s=event_s[effective(fates)],
+        forced=fates[effective(fates)] == Fate.FORCED,
+        title=f"draw {draw}",
+    )
+
+
+def render(found: Document) -> str:
+    """Return the page in Markdown, from the content of ``paper.json``."""
+    summary = found["summary"]
+    point = {tuple(one["axes"].values()): one["metrics"] for one in summary["points"]}
+    apart = {one["axes"]["variation"]: one["metrics"] for one in summary["differences"]}
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    templates.filters |= {"n": number, "percent": percent, "spread": spread}
-    text = templates.get_template("paper.md.jinja").render(
-        draws=results.count(),
-        representative=results.representative,
-        settings=settings_of(results.representative),
-        horizon_s=HORIZON_S,
-        step_s=STEP_S,
-        confirmed_from=CONFIRMED_FROM,
-        partly_from=PARTLY_FROM,
-        claims=list(claims(results)),
-        compared=list(_compared(results)),
-        varied=list(_varied(results)),
-        column=results.column,
-        certified=partial(results.column, table="certified"),
-        printed=partial(results.column, table="printed"),
-        **_shares(results),
-        **results.evidence,
+    templates.filters |= {"n": number, "percent": share_text}
+    return _wrapped(
+        templates.get_template("paper.md.jinja").render(
+            draws=summary["draws"],
+            representative=found["representative"],
+            confirmed_from=CONFIRMED_FROM,
+            partly_from=PARTLY_FROM,
+            claims=summary["claims"],
+            model=point[BASE, POLICIES[0]],
+            zoh=point[BASE, POLICIES[1]],
+            apart=apart[BASE],
+            compared=list(_compared(point, apart[BASE])),
+            varied=list(_varied(point, apart)),
+            **found["evidence"],
+        )
     )
-    return _wrapped(text)
+
+
+def _compared(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the main table: a metric of both loops."""
+    for name, difference in apart.items():
+        both = (_spread(point[BASE, policy][name]) for policy in POLICIES)
+        larger = share_text(difference["larger"])
+        yield METRICS[name].label, *both, _spread(difference), larger  # type: ignore[index]
+
+
+def _varied(point: Mapping[Any, Any], apart: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of the table of variations: medians of both loops."""
+    for name, differences in apart.items():
+        medians = (
+            " / ".join(number(point[name, policy][metric]["median"]) for policy in POLICIES)
+            for metric in ("transmissions", "lost_share", "inter_event_min_s", "settling_s")
+        )
+        larger = (share_text(differences[key]["larger"]) for key in ("transmissions", "settling_s"))
+        yield name + (" *" if name in _OTHER_EXAMPLES else ""), *medians, *larger
+
+
+def _spread(estimate: Mapping[str, float | None]) -> str:
+    """Return median and quartiles: 517 (493 … 547)."""
+    low, middle, high = (number(estimate[name]) for name in ("q25", "median", "q75"))
+    return f"{middle} ({low} … {high})"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number as text: 0.0123, 517, 2.8 · 10³³; ∞ for None."""
+    if value is None or not math.isfinite(value):
+        return "∞"
+    if value == round(value) and abs(value) < _LARGE:
+        text = f"{value:,.0f}"
+    elif _SMALL <= abs(value) < _LARGE:
+        short = float(f"{value:.{digits}g}")
+        text = f"{short:,.0f}" if abs(short) >= 10**digits else f"{short:g}"
+    else:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        power = f"10{str(int(exponent)).translate(_RAISED)}"
+        text = power if float(mantissa) == 1 else f"{float(mantissa):g} · {power}"
+    return text.replace("-", "−")
 
 
 def _wrapped(text: str) -> str:
@@ -92,62 +257,3 @@ def _filled(paragraph: str) -> list[str]:
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
     return [line.replace(_GLUE, " ") for line in lines]
-
-
-def _shares(results: Results) -> dict[str, Any]:
-    column = results.column
-    events, settled = _both(results, "events"), _both(results, "settled_5_s")
-    margin_per_s = results.evidence["example"]["alpha_per_s"]
-    return {
-        "fewer": (events[0] < events[1]).mean(),
-        "times": quartiles(events[1] / events[0]).median,
-        "later": (settled[1] > settled[0]).mean(),
-        "settle": np.isfinite(_both(results, "settled_1_s")).all(axis=0).mean(),
-        "unstabilised": int((column("slowest_closed") > -margin_per_s).sum()),
-        "not_unstable": (column("fastest_open") <= 0).mean(),
-        "stretches": {m: float((column(f"{m}.deliveries") - 1).sum()) for m in MODES},
-        "growing": {m: float(column(f"{m}.growing").sum()) for m in MODES},
-    }
-
-
-def _compared(results: Results) -> Iterator[dict[str, str]]:
-    """Return the rows of the main table: a measure of both loops."""
-    for what, name in _MEASURES:
-        model, zoh = _both(results, name)
-        yield {
-            "what": what,
-            "model": spread(model),
-            "zoh": spread(zoh),
-            "difference": spread(paired(zoh, model)),
-            "larger": percent((zoh > model).mean()),
-        }
-
-
-def _varied(results: Results) -> Iterator[dict[str, str]]:
-    """Return the rows of the table of variations."""
-    for name in results.variations:
-        events, settled, gap_min, lost = (
-            _both(results, measure, name)
-            for measure in ("events", "settled_5_s", "gap_min_s", _LOST)
-        )
-        yield {
-            "what": name + (" *" if name in OTHER_EXAMPLES else ""),
-            "draws": number(results.count(name)),
-            "events": _medians(events),
-            "lost": _medians(lost, percent),
-            "gap_min": _medians(gap_min),
-            "settled": _medians(settled),
-            "more": percent((events[1] > events[0]).mean()),
-            "later": percent((settled[1] > settled[0]).mean()),
-        }
-
-
-def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
-    """Return a measure of MB-ET and of ZOH-ET."""
-    if name == _LOST:
-        return [results.lost(mode, variation) for mode in MODES]
-    return [results.column(f"{mode}.{name}", variation) for mode in MODES]
-
-
-def _medians(both: list[Vector], written: Callable[[float], str] = number) -> str:
-    return " / ".join(written(quartiles(values).median) for values in both)

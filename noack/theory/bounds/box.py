@@ -12,7 +12,7 @@ solution holds for all plants of the box, including time-varying ones.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -20,8 +20,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from noack.core.cached_method import cached_method
-from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.contraction import logarithmic_norm
+from noack.core.linear_systems import Matrix, Vector, matrix_key
+from noack.theory.bounds.contraction import logarithmic_norm, spectral_norm
 from noack.theory.bounds.enclosure import NotDecayingError, Outputs, ResponseBounds, response
 from noack.theory.bounds.gains import Coefficients, Columns, Output, PlantGains
 
@@ -34,12 +34,13 @@ class BoxGains(PlantGains):
     halfwidth_B: Matrix
 
     is_one_plant: ClassVar = False
-    of_start: ClassVar = {
-        "states",
-        "results of BoxGains.start_up",
-        "_from_start",
-        "_free_model_error",
-    }
+
+    @property
+    def likeness(self) -> Hashable:
+        """See :attr:`PlantGains.likeness`: only x(0) may differ."""
+        matrices = self.A, self.B, self.halfwidth_A, self.halfwidth_B
+        like = super().likeness
+        return None if like is None else (like, *map(matrix_key, matrices))
 
     @cached_property
     def states(self) -> Mapping[str, Coefficients]:
@@ -51,43 +52,44 @@ class BoxGains(PlantGains):
         free, gain = self._free_model_error, self._forced_model_error
         states = {
             output: Coefficients(
-                self._from_start[output] + float(peaks.from_w @ free),
-                peaks.forced + float(peaks.from_w @ gain),
+                self._from_start[output] + free @ peaks.from_w,
+                peaks.forced + gain @ peaks.from_w,
             )
             for output, peaks in self._peaks.items()
         }
         nominal = states[Output.MISMATCH]
         # sup‖(R_E x, S w)‖ ≤ sup‖R_E x‖ + sup‖S w‖
         states[Output.MISMATCH] = Coefficients(
-            nominal.free + float(np.linalg.norm(self._scales * free)),
-            nominal.gain + float(np.linalg.norm(self._scales * gain)),
+            nominal.free + np.linalg.norm(self._scales * free, axis=-1),
+            nominal.gain + np.linalg.norm(self._scales * gain, axis=-1),
         )
         return states
 
     @cached_method
-    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
+    def start_up(self, start_s: float) -> tuple[Vector, Mapping[str, Vector]]:
         """Return the effect of zero input before ``start_s``: p = −K x, x' = A x for every A.
 
         With zero input w = Ã x, which the bound of w covers.
         """
         if start_s == 0:
-            return 0.0, dict.fromkeys(self.outputs, 0.0)
-        R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
+            return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
+        R, box = self.error.split_K[1], spectral_norm(self.halfwidth_A)
         # ‖e^{As}‖ ≤ e^{μs}; the logarithmic norm μ of a sum is at most the sum of both norms.
-        mu = max(logarithmic_norm(self.A) + box, 0.0) + self.alpha_per_s
+        mu = max(float(logarithmic_norm(self.A) + box), 0.0) + self.alpha_per_s
         pushes = self._forcing.limited
-        size = float(np.linalg.norm(self.start, 2) + start_s * np.linalg.norm(pushes, axis=0).sum())
-        size *= math.exp(mu * start_s)
-        rate = float(np.linalg.norm(R @ self.A, 2)) + float(np.linalg.norm(R, 2)) * box
-        first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
+        size = spectral_norm(self.start) + start_s * np.linalg.norm(pushes, axis=0).sum()
+        size = size * math.exp(mu * start_s)
+        rate = spectral_norm(R @ self.A) + spectral_norm(R) * box
+        first = spectral_norm(R @ self.start) * math.exp(self.alpha_per_s * start_s)
         error = first + start_s * (rate * size + np.linalg.norm(R @ pushes, axis=0).sum())
         impulse = error * start_s
-        w = self._bound_of_w(impulse * np.array([peaks.impulse for peaks in self._coordinates]))
+        peaks_of = np.array([peaks.impulse for peaks in self._coordinates])
+        w = self._bound_of_w(impulse[..., None] * peaks_of)
         states = {
-            output: impulse * peaks.impulse + float(peaks.from_w @ w)
+            output: impulse * peaks.impulse + w @ peaks.from_w
             for output, peaks in self._peaks.items()
         }
-        states[Output.MISMATCH] += float(np.linalg.norm(self._scales * w))
+        states[Output.MISMATCH] += np.linalg.norm(self._scales * w, axis=-1)
         return error, states
 
     @property
@@ -117,7 +119,7 @@ class BoxGains(PlantGains):
         return np.asarray(np.linalg.norm(self.error.weight @ self._directions, axis=0))
 
     @cached_property
-    def _from_start(self) -> Mapping[str, float]:
+    def _from_start(self) -> Mapping[str, Vector]:
         """sup‖C x‖ from x(0) and the disturbances, of every output and every coordinate."""
         started = response(self.closed_loop, self.start).through_each(self._stacked_signals)
         return {name: started[name].sup() + self.disturbed(C) for name, C in self._signals.items()}
@@ -139,8 +141,9 @@ class BoxGains(PlantGains):
         return [response(self.closed_loop, column[:, None]) for column in self._directions.T]
 
     def _peaks_at(self, C: Matrix) -> "_PeakGains":
-        forced, from_w = self._forced.through(C), [w.through(C).integral() for w in self._pushed]
-        return _PeakGains(forced.integral(), forced.sup(), np.array(from_w))
+        forced = self._forced.through(C)
+        from_w = [float(w.through(C).integral()) for w in self._pushed]
+        return _PeakGains(float(forced.integral()), float(forced.sup()), np.array(from_w))
 
     @cached_property
     def _peaks(self) -> Mapping[str, "_PeakGains"]:
@@ -157,20 +160,21 @@ class BoxGains(PlantGains):
         return np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1)[self._rows]
 
     def _bound_of_w(self, coordinates: Vector) -> Vector:
-        """Return sup|w| from bounds of |(x, K x)| that were computed without w."""
+        """Return sup|w|, (…, rows), from bounds of |(x, K x)| that were computed without w."""
         from_w = np.array([peaks.from_w for peaks in self._coordinates])
         loop = self._halfwidths @ from_w
         if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
             raise NotDecayingError("the uncertainty box is too large for the loop's gains")
-        solved: Vector = np.linalg.solve(np.eye(len(loop)) - loop, self._halfwidths @ coordinates)
-        return solved
+        known = (coordinates @ self._halfwidths.T)[..., None]
+        return np.asarray(np.linalg.solve(np.eye(len(loop)) - loop, known)[..., 0])
 
     @cached_property
     def _free_model_error(self) -> Vector:
         """sup|w_i| without an input error; with one, sup‖p‖ times the forced error is added."""
         from_start = self._from_start.items()
-        start = np.array([bound for name, bound in from_start if name not in self.outputs])
-        start[len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
+        bounds = [bound for name, bound in from_start if name not in self.outputs]
+        start = np.stack(bounds, axis=-1)
+        start[..., len(self.A) :] += self._forcing.at_input  # B̃ acts on u with its disturbance
         return self._bound_of_w(start)
 
     @cached_property

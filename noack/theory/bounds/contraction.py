@@ -4,14 +4,15 @@
 Lyapunov function. ν is computed from the final L, so rounding in the computation of L is harmless.
 """
 
-import math
+import contextlib
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, solve_lyapunov, spectral_abscissa
+from noack.core.linear_systems import Matrix, solve_lyapunov
 
 Stack = NDArray[np.float64]
 EPSILON = 8 * float(np.finfo(float).eps)
@@ -19,148 +20,178 @@ EPSILON = 8 * float(np.finfo(float).eps)
 
 
 class Decay(NamedTuple):
-    """A system's L and ν."""
+    """L and ν of a system, or of each of a stack of systems."""
 
     factor: Matrix
-    """L, (n, n)."""
+    """L, (…, n, n)."""
     inverse: Matrix
     """L^{−1}."""
-    rate_per_s: float
-    """ν > 0."""
+    rate_per_s: Stack
+    """ν, (…); not above 0 where no L was found."""
 
     @property
-    def stretch(self) -> float:
-        """Upper bound of ‖e^{Gs}‖ for s ≥ 0."""
-        return float(np.linalg.norm(self.factor, 2) * np.linalg.norm(self.inverse, 2))
+    def stretch(self) -> Stack:
+        """Upper bound of ‖e^{Gs}‖ for s ≥ 0, (…)."""
+        return spectral_norm(self.factor) * spectral_norm(self.inverse)
+
+    @property
+    def area_s(self) -> Stack:
+        """Upper bound of ∫‖e^{Gs}‖ds over all times, (…); infinite where no L was found."""
+        found = self.rate_per_s > 0
+        return np.where(found, self.stretch / np.where(found, self.rate_per_s, 1.0), np.inf)
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
-        """Return bounds of ‖C e^{Gs} Y‖ over all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
-        return self.seen(C) * self.sizes(states)
-
-    def seen(self, C: Matrix) -> float:
-        """Return ‖C L^{−1}‖."""
-        return float(np.linalg.norm(C @ self.inverse, 2))
+        """Return bounds of ‖C e^{Gs} Y‖ over all s ≥ 0, for stacks of Y, (…, k, n, r) → (…, k)."""
+        return spectral_norm(C @ self.inverse)[..., None] * self.sizes(states)
 
     def sizes(self, states: Stack) -> Stack:
-        """Return ‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
+        """Return ‖L Y‖ for stacks of Y, (…, k, n, r) → (…, k), in the Frobenius norm."""
         return frobenius_norms(product(self.factor, states))
 
 
 def find_decay(generator: Matrix) -> Decay | None:
-    """Return the better of two candidates for L; None if neither passes its check numerically."""
-    return _find_decay(np.asarray(generator, dtype=np.float64).tobytes(), len(generator))
+    """Return the better of two candidates for L, of each of a stack of generators, (…, n, n).
+
+    A candidate must pass its check numerically. None: no L was found for any of them.
+    """
+    generator = np.asarray(generator, dtype=np.float64)
+    return _find_decay(generator.tobytes(), generator.shape)
 
 
 @lru_cache(maxsize=8)
-def _find_decay(entries: bytes, n: int) -> Decay | None:
-    generator = np.frombuffer(entries).reshape(n, n)
-    rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
-    if not spectral_abscissa(generator) < -rounding:
+def _find_decay(entries: bytes, shape: tuple[int, ...]) -> Decay | None:
+    generator = np.frombuffer(entries).reshape(shape)
+    rounding = EPSILON * shape[-1] * np.linalg.norm(generator, axis=(-2, -1))
+    slowest = abscissas(generator)
+    candidates = (_lyapunov_factors(generator, slowest), _modal_factors(generator))
+    first, second = (_checked(generator, factor, slowest < -rounding) for factor in candidates)
+    better = second.area_s < first.area_s
+    rates = np.where(better, second.rate_per_s, first.rate_per_s)
+    if not (rates > 0).any():
         return None
-    candidates = (_lyapunov_factor(generator), _modal_factor(generator))
-    checked = [_checked(generator, factor) for factor in candidates if factor is not None]
-    decays = [decay for decay in checked if decay is not None]
-    return min(decays, key=lambda decay: decay.stretch / decay.rate_per_s, default=None)
+    which = better[..., None, None]
+    factor = np.where(which, second.factor, first.factor)
+    return Decay(factor, np.where(which, second.inverse, first.inverse), rates)
 
 
-def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
-    """Return L with ν, reduced by a bound of the rounding error; None if ν is not positive."""
-    try:
-        inverse = np.asarray(np.linalg.inv(factor))
-    except np.linalg.LinAlgError:
-        return None
+def _checked(generator: Matrix, factor: Matrix, may_decay: NDArray[np.bool_]) -> Decay:
+    """Return L with ν, reduced by a bound of the rounding error; ν = 0 if L is not suitable."""
+    inverse = _each(np.linalg.inv, factor)
     turned = factor @ generator @ inverse
     # Rounding of the products, and the deviation of L times its computed inverse from identity.
     product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
-    identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse)) * np.linalg.norm(turned)
-    rounding = EPSILON * len(generator) * float(np.linalg.norm(product) + identity)
-    if not math.isfinite(rounding):
-        return None
-    rate = -logarithmic_norm(turned) - rounding
-    return Decay(factor, inverse, rate) if rate > 0 else None
+    identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse), axis=(-2, -1))
+    identity = identity * np.linalg.norm(turned, axis=(-2, -1))
+    size = np.linalg.norm(product, axis=(-2, -1)) + identity
+    rounding = EPSILON * generator.shape[-1] * size
+    usable = may_decay & np.isfinite(rounding)
+    eye = np.eye(generator.shape[-1])
+    factor, inverse, turned = (
+        np.where(usable[..., None, None], one, eye) for one in (factor, inverse, turned)
+    )
+    rates = np.where(usable, -logarithmic_norm(turned) - rounding, 0.0)
+    return Decay(factor, inverse, rates)
 
 
-def _lyapunov_factor(generator: Matrix) -> Matrix | None:
-    """Return the factor of P, (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; smooth in G."""
-    n = len(generator)
-    shifted = generator - 0.5 * spectral_abscissa(generator) * np.eye(n)
-    try:
-        P = solve_lyapunov(shifted.T, -np.eye(n))
-        return np.asarray(np.linalg.cholesky(0.5 * (P + P.T)).T)
-    except (np.linalg.LinAlgError, ValueError):
-        return None
+def _lyapunov_factors(generator: Matrix, slowest: Stack) -> Matrix:
+    """Return the factor of P, (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; smooth in G.
+
+    NaN where there is none.
+    """
+    eye = np.eye(generator.shape[-1])
+    shifted = generator - 0.5 * slowest[..., None, None] * eye
+    P = _each(lambda M: solve_lyapunov(M.swapaxes(-1, -2), -eye), shifted)
+    return np.asarray(_each(np.linalg.cholesky, 0.5 * (P + P.swapaxes(-1, -2))).swapaxes(-1, -2))
 
 
-def _modal_factor(generator: Matrix) -> Matrix | None:
+def _modal_factors(generator: Matrix) -> Matrix:
     """Return the inverse of G's real eigenvectors, the best L for modes of very different speed."""
     values, vectors = np.linalg.eig(generator)
-    columns = np.where(values.imag < 0, vectors.imag, vectors.real)
-    try:
-        return np.asarray(np.linalg.inv(columns))
-    except np.linalg.LinAlgError:
-        return None
+    columns = np.where(values.imag[..., None, :] < 0, vectors.imag, vectors.real)
+    return _each(np.linalg.inv, columns)
 
 
-def logarithmic_norm(generator: Matrix) -> float:
-    """μ with ‖e^{Gs}‖ ≤ e^{μs}, for the Euclidean norm."""
-    return float(np.linalg.eigvalsh(0.5 * (generator + generator.T)).max())
+def _each(function: Callable[..., Any], stack: Matrix) -> Matrix:
+    """Return a function of each matrix of a stack; NaN where it fails."""
+    if np.isfinite(stack).all():
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return np.asarray(function(stack))
+    found = np.full(stack.shape, np.nan)
+    for place in np.ndindex(stack.shape[:-2]):
+        with contextlib.suppress(np.linalg.LinAlgError, ValueError):
+            found[place] = function(stack[place])
+    return found
+
+
+def abscissas(generator: Matrix) -> Stack:
+    """Return the largest real part of the eigenvalues of each matrix, (…, n, n) → (…)."""
+    return np.asarray(np.linalg.eigvals(generator).real.max(axis=-1))
+
+
+def logarithmic_norm(generator: Matrix) -> Stack:
+    """Return μ of each matrix, (…, n, n) → (…): ‖e^{Gs}‖ ≤ e^{μs}, for the Euclidean norm."""
+    symmetric = 0.5 * (generator + generator.swapaxes(-1, -2))
+    return np.asarray(np.linalg.eigvalsh(symmetric).max(axis=-1))
 
 
 def product(matrix: Matrix, stack: Stack) -> Stack:
-    """Return M Y for a stack of Y, (k, n, r) → (k, q, r), by one product of M with all columns."""
-    k, n, r = stack.shape
-    columns = stack.transpose(1, 0, 2).reshape(n, k * r)
-    return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
+    """Return M Y for stacks of Y, (…, k, n, r) → (…, k, q, r), by one product with all columns."""
+    *lead, k, n, r = stack.shape
+    columns = stack.swapaxes(-3, -2).reshape(*lead, n, k * r)
+    products = matrix @ columns
+    return np.asarray(products.reshape(*products.shape[:-1], k, r).swapaxes(-3, -2))
 
 
 def times(matrix: Matrix, values: Stack) -> Stack:
-    """Return M Y for matrices Y along the last axis, (n, r, k) → (q, r, k)."""
-    products = matrix @ values.reshape(len(values), -1)
-    return np.asarray(products.reshape(len(matrix), *values.shape[1:]))
+    """Return M Y for matrices Y along the last axis, (…, n, r, k) → (…, q, r, k)."""
+    *lead, r, k = values.shape
+    products = matrix @ values.reshape(*lead, r * k)
+    return np.asarray(products.reshape(*products.shape[:-1], r, k))
 
 
 def frobenius_norms(stack: Stack) -> Stack:
-    """Return the Frobenius norms of a stack of matrices, (k, q, r) → (k,)."""
-    return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))
+    """Return the Frobenius norms of stacks of matrices, (…, q, r) → (…)."""
+    return np.asarray(np.sqrt(np.einsum("...ij,...ij->...", stack, stack)))
 
 
-def spectral_norm(matrix: Matrix) -> float:
-    """Return the spectral norm of a matrix."""
-    return float(np.linalg.svd(matrix, compute_uv=False)[0])
+def spectral_norm(matrix: Matrix) -> Stack:
+    """Return the spectral norms of matrices, (…, q, r) → (…)."""
+    return np.asarray(np.linalg.svd(matrix, compute_uv=False)[..., 0])
 
 
 def spectral_norms(stack: Stack) -> Stack:
-    """Return the spectral norms of a stack of matrices, (k, q, r) → (k,)."""
+    """Return the spectral norms of a long stack of matrices, (k, q, r) → (k,)."""
     return largest_gains(np.ascontiguousarray(stack.transpose(1, 2, 0)))
 
 
 def sizes(values: Stack) -> Stack:
-    """Return the Frobenius norms of matrices along the last axis, (q, r, k) → (k,)."""
-    return np.asarray(np.sqrt(np.einsum("ijk,ijk->k", values, values)))
+    """Return the Frobenius norms of matrices along the last axis, (…, q, r, k) → (…, k)."""
+    return np.asarray(np.sqrt(np.einsum("...ijk,...ijk->...k", values, values)))
 
 
 def largest_gains(values: Stack) -> Stack:
-    """Return the spectral norms of matrices along the last axis, (q, r, k) → (k,).
+    """Return the spectral norms of matrices along the last axis, (…, q, r, k) → (…, k).
 
     They are roots of eigenvalues of Y Yᵀ, whose largest one has a small relative rounding error.
     """
-    q, r, _ = values.shape
+    q, r = values.shape[-3:-1]
     if min(q, r) == 1:
-        products = np.einsum("ijk,ijk->k", values, values)[None, None]
+        products = np.einsum("...ijk,...ijk->...k", values, values)[None, None]
     else:
-        products = np.einsum("ijk,ljk->ilk" if q < r else "jik,jlk->ilk", values, values)
+        pairs = "...ijk,...ljk->il...k" if q < r else "...jik,...jlk->il...k"
+        products = np.einsum(pairs, values, values)
     if not np.isfinite(products).all():  # the norm may be finite
-        return np.asarray(np.linalg.norm(values, 2, axis=(0, 1)))
+        return np.asarray(np.linalg.norm(values, 2, axis=(-3, -2)))
     return np.asarray(np.sqrt(np.maximum(_largest_eigenvalues(products), 0.0)))
 
 
 def largest_eigenvalues(stack: Stack) -> Stack:
     """Return the largest eigenvalues of Gram matrices, (k, n, n) → (k,)."""
-    return _largest_eigenvalues(stack.transpose(1, 2, 0))
+    return _largest_eigenvalues(np.moveaxis(stack, 0, -1))
 
 
 def _largest_eigenvalues(products: Stack) -> Stack:
-    """Return the largest eigenvalues of Gram matrices along the last axis, (n, n, k) → (k,)."""
+    """Return the largest eigenvalues of Gram matrices, (n, n, …, k) → (…, k)."""
     n = len(products)
     if n == 1:
         return np.asarray(products[0, 0])
@@ -168,7 +199,7 @@ def _largest_eigenvalues(products: Stack) -> Stack:
         (a, b), (_, d) = products
         return np.asarray(0.5 * (a + d) + np.hypot(0.5 * (a - d), b))
     if n > 3:
-        return np.asarray(np.linalg.eigvalsh(products.transpose(2, 0, 1))[:, -1])
+        return np.asarray(np.linalg.eigvalsh(np.moveaxis(products, (0, 1), (-2, -1)))[..., -1])
     # The largest root of the characteristic polynomial, of the matrix with the trace 3.
     (a, b, c), (_, d, e), (_, _, f) = products
     scale = (a + d + f) / 3

@@ -10,13 +10,17 @@ logarithmic norm −ν < 0 (:mod:`noack.theory.bounds.contraction`), ‖C e^{Gs}
 e^{−νs}. The second one also bounds the response beyond the grid. Steps become longer when fast
 modes have decayed, so a stiff system needs hardly more steps than others.
 
+G, D and C are matrices, or stacks of matrices with common leading axes "…", whose bounds are
+computed together. The grids of a stack have equally many nodes; where one ends earlier, its last
+cells have the width 0.
+
 Rounding: the error of the products C Y is bounded by n ε |C| |Y|, which matters if C and D are
 ill-conditioned. All other rounding errors, about 1e-12 of a value, are covered by a relative
 inflation of 1e-9.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
@@ -25,11 +29,12 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.linear_systems import Matrix, exponential, spectral_abscissa
+from noack.core.linear_systems import Matrix, exponential
 from noack.theory.bounds.contraction import (
     EPSILON,
     Decay,
     Stack,
+    abscissas,
     find_decay,
     frobenius_norms,
     largest_gains,
@@ -56,6 +61,8 @@ _MOST_ENTRIES = 4_000_000
 and the looser bound beyond the grid applies earlier."""
 _TAIL_SHARE = 1e-5
 Name = TypeVar("Name", bound=str)
+Groups = Sequence[slice]
+"""Groups of columns."""
 
 
 class NotDecayingError(ArithmeticError):
@@ -66,73 +73,124 @@ class NotDecayingError(ArithmeticError):
 class KernelBounds:
     """Upper bounds of k(τ) = ‖C e^{Gτ} D‖ (spectral norm) on a grid of cells, and beyond it."""
 
-    edges_s: NDArray[np.float64]
-    """(cells + 1,) nodes of the grid, from 0."""
-    highest: NDArray[np.float64]
-    """(cells,) bound of k over each cell."""
-    area: NDArray[np.float64]
-    """(cells,) bound of ∫k over each cell."""
-    tail_highest: float
-    """Bound of k beyond the grid; infinite if it was not requested."""
-    tail_area: float
-    """Bound of ∫k beyond the grid."""
-    tail_rate_per_s: float
-    """Decay rate of the bound of k beyond the grid."""
+    edges_s: Stack
+    """(…, cells + 1) nodes of the grid, from 0."""
+    highest: Stack
+    """(…, cells) bound of k over each cell."""
+    area: Stack
+    """(…, cells) bound of ∫k over each cell."""
+    tail_highest: Stack
+    """(…) Bound of k beyond the grid; infinite if it was not requested."""
+    tail_area: Stack
+    """(…) Bound of ∫k beyond the grid."""
+    tail_rate_per_s: Stack
+    """(…) Decay rate of the bound of k beyond the grid."""
 
-    def sup(self, after_s: float = 0.0) -> float:
-        """Sup of k(τ) over τ ≥ ``after_s``."""
-        return float(self.sups(np.array([after_s]))[0])
+    def sup(self, after_s: float = 0.0) -> Stack:
+        """Sup of k(τ) over τ ≥ ``after_s``, (…)."""
+        return self.sups(np.array([after_s]))[..., 0]
 
-    def sups(self, after_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sup of k(τ) over τ ≥ a for each a, (j,)."""
-        first = np.searchsorted(self.edges_s, after_s, side="right") - 1
-        beyond_s = np.maximum(after_s - self.edges_s[-1], 0.0)
-        return np.asarray(self._from_cell[first] * np.exp(-self.tail_rate_per_s * beyond_s))
+    def sups(self, after_s: Stack) -> Stack:
+        """Sup of k(τ) over τ ≥ a for each a, (…, j)."""
+        first = cells_at(self.edges_s, after_s)
+        beyond_s = np.maximum(after_s - self.edges_s[..., -1:], 0.0)
+        decayed = np.exp(-np.asarray(self.tail_rate_per_s)[..., None] * beyond_s)
+        return np.asarray(take_rows(self._from_cell, first) * decayed)
 
     @cached_property
-    def _from_cell(self) -> NDArray[np.float64]:
+    def _from_cell(self) -> Stack:
         """Sup of k from the begin of each cell on."""
-        return np.maximum.accumulate(np.append(self.highest, self.tail_highest)[::-1])[::-1]
+        tail = np.broadcast_to(self.tail_highest, self.highest.shape[:-1])[..., None]
+        values = np.concatenate([self.highest, tail], axis=-1)[..., ::-1]
+        return np.maximum.accumulate(values, axis=-1)[..., ::-1]
 
-    def integral(self) -> float:
-        """∫k over all times."""
-        return float(self.area.sum()) + self.tail_area
+    def integral(self) -> Stack:
+        """∫k over all times, (…)."""
+        return np.asarray(self.area.sum(axis=-1) + self.tail_area)
 
-    def sup_on_grid(self) -> float:
-        """Sup of k over the grid only."""
-        return float(self.highest.max(initial=0.0))
+    def sup_on_grid(self) -> Stack:
+        """Sup of k over the grid only, (…)."""
+        return np.asarray(self.highest.max(axis=-1, initial=0.0))
 
-    def integral_on_grid(self) -> float:
-        """∫k over the grid only."""
-        return float(self.area.sum())
+    def integral_on_grid(self) -> Stack:
+        """∫k over the grid only, (…)."""
+        return np.asarray(self.area.sum(axis=-1))
+
+
+def cells_at(edges_s: Stack, t_s: Stack) -> NDArray[np.intp]:
+    """Return the cell of each time, (…, j), in a grid, (…, cells + 1); the last edge is a cell."""
+    if edges_s.ndim == 1:
+        return np.asarray(np.searchsorted(edges_s, t_s, side="right") - 1)
+    lead = np.broadcast_shapes(edges_s.shape[:-1], t_s.shape[:-1])
+    found = np.empty((*lead, t_s.shape[-1]), np.intp)
+    edges_s = np.broadcast_to(edges_s, (*lead, edges_s.shape[-1]))
+    t_s = np.broadcast_to(t_s, found.shape)
+    for place in np.ndindex(lead):
+        found[place] = np.searchsorted(edges_s[place], t_s[place], side="right")
+    return found - 1
+
+
+def take_rows(values: Stack, places: NDArray[np.intp]) -> Stack:
+    """Return the values, (…, k), at places, (…, j), along the last axis."""
+    if values.ndim == 1:
+        return np.asarray(values[places])
+    return np.take_along_axis(values, places, axis=-1)
 
 
 def constant_kernel(value: float) -> KernelBounds:
     """Return the kernel of a constant response."""
-    edges_s = np.array([0.0, 1.0])
-    return KernelBounds(edges_s, np.full(1, value), np.full(1, value), value, math.inf, 0.0)
+    values, tail = np.full(1, value), np.array(value)
+    return KernelBounds(
+        np.array([0.0, 1.0]), values, values, tail, np.array(math.inf), np.array(0.0)
+    )
 
 
 class Outputs(Generic[Name]):
-    """Several output matrices C, (q, n) each, whose bounds are computed at once.
+    """Several output matrices C, (…, q, n) each, whose bounds are computed at once.
 
     They are ``stacked`` one below the other; ``rows`` are the rows of each, ``norms`` its ‖C‖.
     """
 
     def __init__(self, matrices: Mapping[Name, Matrix]) -> None:
         self.names = list(matrices)
-        self.stacked = np.concatenate(list(matrices.values()))
-        self.rows = _slices(*accumulate(map(len, matrices.values()), initial=0))
+        lead = np.broadcast_shapes(*(C.shape[:-2] for C in matrices.values()))
+        each = [np.broadcast_to(C, (*lead, *C.shape[-2:])) for C in matrices.values()]
+        self.stacked = np.concatenate(each, axis=-2)
+        self.rows = _slices(*accumulate((C.shape[-2] for C in each), initial=0))
+        self._alike = _grouped(self.rows)
         self.norms = self.norms_with(None)
 
-    def norms_with(self, M: Matrix | None) -> NDArray[np.float64]:
-        """Return ‖C M‖ of each C."""
+    def norms_with(self, M: Matrix | None) -> Stack:
+        """Return ‖C M‖ of each C, (…, outputs)."""
         product = self.stacked if M is None else self.stacked @ M
-        return np.array([spectral_norm(product[rows]) for rows in self.rows])
+        norms = np.empty((*product.shape[:-2], len(self.rows)))
+        for places, rows in self._alike:
+            norms[..., places] = spectral_norm(product[..., rows, :])
+        return norms
 
-    def sizes(self, values: Stack, columns: Sequence[slice]) -> Stack:
-        """Return the Frobenius norms of C Y, (rows, r, k) → (outputs, groups of columns, k)."""
-        return np.array([[sizes(values[rows, group]) for group in columns] for rows in self.rows])
+    def each(self, norm: Callable[[Stack], Stack], values: Stack, columns: Groups) -> Stack:
+        """Return a norm of each C Y, (…, rows, r, k) → (…, outputs, groups of columns, k)."""
+        found: Stack | None = None
+        for place, rows in enumerate(self.rows):
+            for number, group in enumerate(columns):
+                norms = norm(values[..., rows, group, :])
+                if found is None:
+                    *lead, cells = norms.shape
+                    found = np.empty((*lead, len(self.rows), len(columns), cells))
+                found[..., place, number, :] = norms
+        assert found is not None
+        return found
+
+
+def _grouped(groups: Groups) -> list[tuple[list[int], NDArray[np.intp]]]:
+    """Return the places of groups of equal length, with the rows of each, (groups, rows)."""
+    lengths = [group.stop - group.start for group in groups]
+    found = []
+    for length in dict.fromkeys(lengths):
+        places = [place for place, other in enumerate(lengths) if other == length]
+        rows = np.array([range(groups[place].start, groups[place].stop) for place in places])
+        found.append((places, rows))
+    return found
 
 
 @dataclass(frozen=True)
@@ -140,11 +198,11 @@ class ResponseBounds:
     """e^{Gτ} D at the nodes of a grid; :meth:`through` applies an output matrix C."""
 
     generator: Matrix
-    """G, (n, n), per second."""
-    edges_s: NDArray[np.float64]
-    """(cells + 1,)"""
+    """G, (…, n, n), per second."""
+    edges_s: Stack
+    """(…, cells + 1)"""
     states: Stack
-    """(cells + 1, n, r), e^{Gτ} D."""
+    """(…, cells + 1, n, r), e^{Gτ} D."""
     decay: Decay | None
     """L and ν; None if they are not needed, or if G does not decay."""
     endless: bool
@@ -154,21 +212,21 @@ class ResponseBounds:
 
     @cached_property
     def _bends(self) -> "_Bends":
-        nodes = self._nodes[:, :, :-1]
+        nodes = self._nodes[..., :-1]
         return _bends(self.generator, nodes, np.diff(self.edges_s), self.decay, self._columns)
 
     @cached_property
     def _nodes(self) -> Stack:
-        """The states with time last, (n, r, cells + 1)."""
-        return np.ascontiguousarray(self.states.transpose(1, 2, 0))
+        """The states with time last, (…, n, r, cells + 1)."""
+        return np.ascontiguousarray(np.moveaxis(self.states, -3, -1))
 
     @property
-    def _columns(self) -> list[slice]:
+    def _columns(self) -> Groups:
         """The columns of each group."""
-        return _slices(*self.groups, self.states.shape[2])
+        return _slices(*self.groups, self.states.shape[-1])
 
     def through(self, C: Matrix) -> KernelBounds:
-        """Return bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
+        """Return bounds of ‖C e^{Gτ} D‖, with C of shape (…, q, n)."""
         return self.through_each(Outputs({"": C}))[""]
 
     def through_each(self, outputs: Outputs[Name]) -> dict[Name, KernelBounds]:
@@ -177,44 +235,43 @@ class ResponseBounds:
 
     def through_groups(self, outputs: Outputs[Name]) -> dict[Name, list[KernelBounds]]:
         """Return bounds of ‖C e^{Gτ} D‖ for every output and each group of columns of D."""
-        steps_s, columns, nodes = np.diff(self.edges_s), self._columns, self._nodes
-        exact = times(outputs.stacked, nodes)
-        rounding = outputs.sizes(times(np.abs(outputs.stacked), np.abs(nodes)), columns)
-        norms = np.array(
-            [[largest_gains(exact[rows, group]) for group in columns] for rows in outputs.rows]
-        )
-        norms += EPSILON * len(nodes) * rounding
+        columns, nodes = self._columns, self._nodes
+        steps_s = np.diff(self.edges_s)[..., None, None, :]
+        norms = outputs.each(largest_gains, times(outputs.stacked, nodes), columns)
+        magnitudes = times(np.abs(outputs.stacked), np.abs(nodes))
+        norms += EPSILON * nodes.shape[-3] * outputs.each(sizes, magnitudes, columns)
         bends = self._bends.over(outputs)
         middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
         highest = np.maximum(norms[..., :-1], norms[..., 1:]) + steps_s**2 / 8 * bends
         areas = (steps_s * middle + steps_s**3 / 12 * bends) * _ROUNDING
         highest *= _ROUNDING
-        rate, beyond = 0.0, np.full(norms.shape[:2], math.inf)
+        rate, tails = np.array(0.0), np.full(norms.shape[:-1], math.inf)
         if self.endless and self.decay is not None:
             rate = self.decay.rate_per_s
-            last = self.decay.sizes(self.states[-1:])
-            beyond = outputs.norms_with(self.decay.inverse)[:, None] * last * _ROUNDING
-        tails = beyond.tolist()
+            last = self.decay.sizes(self.states[..., -1:, :, :])[..., None, :]
+            tails = outputs.norms_with(self.decay.inverse)[..., :, None] * last * _ROUNDING
+        decays = (rate > 0)[..., None, None]
+        after = np.where(decays, tails / np.where(rate > 0, rate, 1.0)[..., None, None], math.inf)
         return {
             name: [
                 KernelBounds(
-                    self.edges_s, highest[i, j], areas[i, j], tail,
-                    tail / rate if rate > 0 else math.inf, rate,
+                    self.edges_s, highest[..., i, j, :], areas[..., i, j, :],
+                    tails[..., i, j], after[..., i, j], rate,
                 )
-                for j, tail in enumerate(tails[i])
+                for j in range(len(columns))
             ]
             for i, name in enumerate(outputs.names)
         }  # fmt: skip
 
     def areas_of_columns(self, C: Matrix) -> Stack:
         """Return bounds of Σ_i ∫‖C e^{Gτ} D_i‖ over each cell, for the columns D_i of D."""
-        steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[2]
+        steps_s, nodes, columns = np.diff(self.edges_s), self._nodes, self.states.shape[-1]
         rounding = sizes(times(np.abs(C), np.abs(nodes)))
-        norms = np.linalg.norm(times(C, nodes), axis=0).sum(axis=0)
+        norms = np.linalg.norm(times(C, nodes), axis=-3).sum(axis=-2)
         # The sum over the columns is at most √columns times the Frobenius norm.
-        norms = norms + np.sqrt(columns) * EPSILON * len(nodes) * rounding
-        middle = 0.5 * (norms[:-1] + norms[1:])
-        bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[0, 0]
+        norms = norms + np.sqrt(columns) * EPSILON * nodes.shape[-3] * rounding
+        middle = 0.5 * (norms[..., :-1] + norms[..., 1:])
+        bend = np.sqrt(columns) * self._bends.over(Outputs({"": C}))[..., 0, 0, :]
         return np.asarray((steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING)
 
 
@@ -229,176 +286,216 @@ def norm_bounds(C: Matrix, states: Stack) -> Stack:
 class _Bends:
     """The factors, apart from C, of the bounds of ‖C G² e^{Gτ} D‖ over k cells."""
 
-    columns: Sequence[slice]
+    columns: Groups
     """Groups of D's columns."""
     powers: Stack
-    """(4, n, n), G^j of Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)!."""
-    scales: Matrix
-    """(4, k), s^{j−2}/(j−2)!"""
+    """(…, 4, n, n), G^j of Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)!."""
+    scales: Stack
+    """(…, 4, k), s^{j−2}/(j−2)!"""
     nodes: Stack
-    """(n, r, k), e^{Gτ} D at the left nodes."""
+    """(…, n, r, k), e^{Gτ} D at the left nodes."""
     rest: Stack
-    """(groups, k), factor of ‖C‖ in a bound of the remainder."""
+    """(…, groups, k), factor of ‖C‖ in a bound of the remainder."""
     decay: Decay | None
     rest_decaying: Stack
-    """(groups, k), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay."""
+    """(…, groups, k), factor of ‖C L^{−1}‖ in a bound of the remainder from the decay; infinite
+    without one."""
     least: Stack
-    """(groups, k), factor of ‖C L^{−1}‖ in a bound of the whole value."""
+    """(…, groups, k), factor of ‖C L^{−1}‖ in a bound of the whole value; infinite without one."""
 
     def over(self, outputs: Outputs[Name]) -> Stack:
-        """Return the bounds for output matrices C, (outputs, groups, k)."""
-        turned = (outputs.stacked @ self.powers).reshape(-1, len(self.nodes))
-        terms = times(turned, self.nodes)
-        terms = terms.reshape(len(self.powers), -1, *terms.shape[1:])
+        """Return the bounds for output matrices C, (…, outputs, groups, k)."""
+        turned = outputs.stacked[..., None, :, :] @ self.powers
+        *lead, terms, rows, n = turned.shape
+        found = times(turned.reshape(*lead, terms * rows, n), self.nodes)
+        found = found.reshape(*found.shape[:-3], terms, rows, *found.shape[-2:])
 
         def total(values: Stack) -> Stack:
-            norms = np.sqrt(np.einsum("jirk,jirk->jk", values, values))
-            return np.asarray((norms * self.scales).sum(axis=0))
+            norms = np.sqrt(np.einsum("...jirk,...jirk->...jk", values, values))
+            return np.asarray((norms * self.scales).sum(axis=-2))
 
-        bound = np.array(
-            [[total(terms[:, rows, group]) for group in self.columns] for rows in outputs.rows]
-        )
-        rest = outputs.norms[:, None, None] * self.rest
+        bound = outputs.each(total, found, self.columns)
+        rest = outputs.norms[..., None, None] * self.rest[..., None, :, :]
         if self.decay is None:
             return np.asarray(bound + rest)
-        seen = outputs.norms_with(self.decay.inverse)[:, None, None]
-        bound += np.minimum(rest, seen * self.rest_decaying)
-        return np.asarray(np.minimum(seen * self.least, bound))
+        seen = outputs.norms_with(self.decay.inverse)[..., None, None]
+        bound += np.minimum(rest, seen * self.rest_decaying[..., None, :, :])
+        return np.asarray(np.minimum(seen * self.least[..., None, :, :], bound))
 
 
 def _bends(
-    generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Sequence[slice]
+    generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None, columns: Groups
 ) -> _Bends:
-    """Return the factors for the cells that start at the nodes, (n, r, k), by Taylor's formula."""
-    exponents = max(logarithmic_norm(generator), 0.0) * steps_s
+    """Return the factors for the cells that start at the nodes, (…, n, r, k): Taylor's formula."""
+    exponents = np.maximum(logarithmic_norm(generator), 0.0)[..., None] * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    powers, scales = [generator @ generator], [np.ones(len(steps_s))]
+    powers, scales = [generator @ generator], [np.ones_like(steps_s)]
     for order in range(1, _TAYLOR_TERMS + 1):
         powers.append(generator @ powers[-1])
         scales.append(scales[-1] * (steps_s / order))
 
     def norms(matrix: Matrix) -> Stack:
         values = times(matrix, nodes)
-        return np.array([sizes(values[:, group]) for group in columns])
+        return np.stack([sizes(values[..., group, :]) for group in columns], axis=-2)
 
-    none = np.zeros(0)
+    last = scales[-1][..., None, :]
+    rest_decaying = least = np.zeros(0)
+    if decay is not None:
+        exists = (decay.rate_per_s > 0)[..., None, None]
+        rest_decaying = np.where(exists, last * norms(decay.factor @ powers[-1]), math.inf)
+        least = np.where(exists, norms(decay.factor @ powers[0]), math.inf)
     return _Bends(
         columns,
-        np.array(powers[:-1]),
-        np.array(scales[:-1]),
+        np.stack(powers[:-1], axis=-3),
+        np.stack(scales[:-1], axis=-2),
         nodes,
-        growth * scales[-1] * norms(powers[-1]),
+        growth[..., None, :] * last * norms(powers[-1]),
         decay,
-        none if decay is None else scales[-1] * norms(decay.factor @ powers[-1]),
-        none if decay is None else norms(decay.factor @ powers[0]),
+        rest_decaying,
+        least,
     )
 
 
-def _slices(*ends: int) -> list[slice]:
+def _slices(*ends: int) -> Groups:
     return [slice(*pair) for pair in pairwise(ends)]
 
 
 def response(generator: Matrix, D: Matrix) -> ResponseBounds:
-    """Compute e^{Gτ} D over all times, shapes (n, n) and (n, r).
+    """Compute e^{Gτ} D over all times, shapes (…, n, n) and (…, n, r).
 
     Raises:
-        NotDecayingError: G is not Hurwitz.
+        NotDecayingError: a G is not Hurwitz.
     """
-    margin = -spectral_abscissa(generator)
+    margin = float(-abscissas(generator).max())
     if margin <= 0:
         raise NotDecayingError(f"a mode of the loop grows at {-margin:.3g} /s")
     decay = find_decay(generator)
-    if decay is None:
+    if decay is None or not (decay.rate_per_s > 0).all():
         raise NotDecayingError("no Lyapunov function of it was found to working precision")
-    everything = Outputs({"": np.eye(len(generator))})
+    everything = Outputs({"": np.eye(generator.shape[-1])})
+    lead = np.broadcast_shapes(generator.shape[:-2], D.shape[:-2])
+    state = np.broadcast_to(D, (*lead, *D.shape[-2:]))
     parts: list[Stack] = []
-    edges: list[Stack] = [np.zeros(1)]
-    area, t_s, state, cells = 0.0, 0.0, D, 0
-    most_cells = min(_MOST_CELLS, _MOST_ENTRIES // D.size)
-    usual_s = _STEP / _fastest(generator)
+    edges: list[Stack] = [np.zeros((*lead, 1))]
+    area, cells, ends = np.zeros(lead), 0, np.zeros(lead, dtype=bool)
+    most_cells = min(_MOST_CELLS, _MOST_ENTRIES // math.prod(D.shape[-2:]))
+    usual_s = np.broadcast_to(_STEP / _fastest(generator), lead)
     step_s = usual_s * _FIRST_STEP / _STEP
     while True:
         states = _propagate(generator, state, step_s, _CELLS_PER_BLOCK)
-        parts.append(states[:-1])
-        edges.append(np.asarray(t_s + step_s * np.arange(1.0, _CELLS_PER_BLOCK + 1)))
-        t_s, state = float(edges[-1][-1]), states[-1]
-        area += step_s * float(frobenius_norms(states[:-1]).sum())
+        parts.append(states[..., :-1, :, :])
+        passed_s = step_s[..., None] * np.arange(1.0, _CELLS_PER_BLOCK + 1)
+        edges.append(edges[-1][..., -1:] + passed_s)
+        state = states[..., -1, :, :]
+        area = area + step_s * frobenius_norms(parts[-1]).sum(axis=-1)
         cells += _CELLS_PER_BLOCK
-        rest = float(decay.bounds(everything.stacked, state[None])[0]) / decay.rate_per_s
-        if rest <= _TAIL_SHARE * area or cells >= most_cells:
+        rest = decay.bounds(everything.stacked, state[..., None, :, :])[..., 0] / decay.rate_per_s
+        ends = ends | (rest <= _TAIL_SHARE * area)
+        if ends.all() or cells >= most_cells:
             break
-        while step_s > usual_s and not _straight(everything, generator, state, step_s, decay):
-            step_s /= 2
-        if 2 * step_s <= usual_s or _straight(everything, generator, state, 2 * step_s, decay):
-            step_s *= 2
-    states = np.concatenate([*parts, state[None]])
-    return ResponseBounds(generator, np.concatenate(edges), states, decay, endless=True)
+        while (bent := (step_s > usual_s) & ~_straight(generator, state, step_s, decay)).any():
+            step_s = np.where(bent, step_s / 2, step_s)
+        longer = (2 * step_s <= usual_s) | _straight(generator, state, 2 * step_s, decay)
+        step_s = np.where(ends, 0.0, np.where(longer, 2 * step_s, step_s))
+    states = np.concatenate([*parts, state[..., None, :, :]], axis=-3)
+    return ResponseBounds(generator, np.concatenate(edges, axis=-1), states, decay, endless=True)
 
 
-def _straight(
-    everything: Outputs[str], generator: Matrix, state: Matrix, step_s: float, decay: Decay
-) -> bool:
-    """Return whether e^{Gτ} Y is close to its chord over a step."""
-    size = float(np.linalg.norm(state))
-    bends = _bends(generator, state[:, :, None], np.array([step_s]), decay, [slice(None)])
-    return bool(step_s**2 / 8 * bends.over(everything).item() <= _SAG * size)
+def _straight(generator: Matrix, state: Matrix, step_s: Stack, decay: Decay) -> NDArray[np.bool_]:
+    """Return whether e^{Gτ} Y is close to its chord over a step, (…)."""
+    everything = Outputs({"": np.eye(generator.shape[-1])})
+    size = np.linalg.norm(state, axis=(-2, -1))
+    bends = _bends(generator, state[..., None], step_s[..., None], decay, [slice(None)])
+    return np.asarray(step_s**2 / 8 * bends.over(everything)[..., 0, 0, 0] <= _SAG * size)
 
 
 def response_until(
-    generator: Matrix, D: Matrix, until_s: float, cells: int = 64, groups: tuple[int, ...] = (0,)
+    generator: Matrix,
+    D: Matrix,
+    until_s: float | Stack,
+    cells: int = 64,
+    groups: tuple[int, ...] = (0,),
 ) -> ResponseBounds:
-    """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
-    step_s = until_s / cells
+    """Compute e^{Gτ} D over 0 ≤ τ ≤ ``until_s``, (…), on a grid of ``cells`` equal cells."""
+    step_s = np.asarray(until_s) / cells
+    decay, is_long = None, step_s * np.linalg.norm(generator, axis=(-2, -1)) > 1
+    if is_long.any() and (found := find_decay(generator)) is not None:
+        decay = found._replace(rate_per_s=np.where(is_long, found.rate_per_s, 0.0))
     return ResponseBounds(
         generator,
-        np.linspace(0.0, until_s, cells + 1),
+        np.linspace(0.0, until_s, cells + 1, axis=-1),
         _propagate(generator, D, step_s, cells),
-        find_decay(generator) if step_s * np.linalg.norm(generator) > 1 else None,
+        decay,
         endless=False,
         groups=groups,
     )
 
 
 def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:
-    """Factorise a matrix as L R; L has orthonormal columns, their number is the matrix's rank.
+    """Factorise matrices of equal rank as L R; L has orthonormal columns, as many as the rank.
 
     ‖L R v‖ = ‖R v‖, so a signal that acts in few directions is bounded in these directions only.
     """
     U, singular, Vt = np.linalg.svd(matrix, full_matrices=False)
-    cut = singular.max(initial=0.0) * max(matrix.shape) * np.finfo(float).eps
+    (rank,) = {int(one) for one in np.ravel(_ranks(singular, matrix.shape))}
+    return U[..., :, :rank], singular[..., :rank, None] * Vt[..., :rank, :]
+
+
+def ranks(matrix: Matrix) -> NDArray[np.int64]:
+    """Return the ranks of matrices, (…), as :func:`factors` uses them."""
+    return _ranks(np.linalg.svd(matrix, compute_uv=False), matrix.shape)
+
+
+def _ranks(singular: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    cut = singular.max(axis=-1, initial=0.0) * max(shape[-2:]) * np.finfo(float).eps
     # The omitted part is below the matrix's rounding error; a zero matrix keeps one column.
-    rank = max(int((singular > cut).sum()), 1)
-    return U[:, :rank], singular[:rank, None] * Vt[:rank]
+    return np.asarray(np.maximum((singular > cut[..., None]).sum(axis=-1), 1))
 
 
-def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> Stack:
-    """Return e^{G k s} state for k = 0 … cells, (cells + 1, n, r), block by block."""
-    entries = np.asarray(generator, dtype=np.float64).tobytes()
-    powers, leap = _powers(entries, len(generator), step_s, min(_BLOCK, cells))
-    size, blocks = len(powers), []
+def _propagate(generator: Matrix, state: Matrix, step_s: Stack, cells: int) -> Stack:
+    """Return e^{G k s} state for k = 0 … cells, (…, cells + 1, n, r), block by block."""
+    generator, step_s = np.asarray(generator, dtype=np.float64), np.asarray(step_s)
+    powers, leap = _powers(
+        generator.tobytes(), generator.shape, step_s.tobytes(), step_s.shape, min(_BLOCK, cells)
+    )
+    *lead, size, n, _ = powers.shape
+    blocks, rows = [], powers.reshape(*lead, size * n, n)
     for _ in range(-(-(cells + 1) // size)):
-        blocks.append((powers.reshape(-1, len(state)) @ state).reshape(size, *state.shape))
+        block = rows @ state
+        blocks.append(block.reshape(*block.shape[:-2], size, n, block.shape[-1]))
         state = leap @ state
-    return np.concatenate(blocks)[: cells + 1]
+    return np.concatenate(blocks, axis=-3)[..., : cells + 1, :, :]
 
 
 @lru_cache(maxsize=8)
-def _powers(entries: bytes, n: int, step_s: float, least: int) -> tuple[Stack, Matrix]:
+def _powers(
+    entries: bytes,
+    shape: tuple[int, ...],
+    steps: bytes,
+    of_steps: tuple[int, ...],
+    least: int,
+) -> tuple[Stack, Matrix]:
     """Return e^{G k s} for k < 2^j, at least so many, and e^{G 2^j s}.
 
-    The matrix is given by its entries; several responses follow each other with the same steps.
+    G and s are given by their entries; several responses follow each other with the same steps.
     """
-    generator = np.frombuffer(entries).reshape(n, n)
-    powers, leap = np.eye(n)[None], exponential(generator * step_s)
-    while len(powers) < least:
-        later = (powers.reshape(-1, n) @ leap).reshape(-1, n, n)
-        powers, leap = np.concatenate([powers, later]), leap @ leap
+    generator = np.frombuffer(entries).reshape(shape)
+    exponents = generator * np.frombuffer(steps).reshape(of_steps)[..., None, None]
+    leap = np.empty(exponents.shape)
+    for place in np.ndindex(exponents.shape[:-2]):
+        leap[place] = exponential(exponents[place])
+    n = shape[-1]
+    powers = np.broadcast_to(np.eye(n), (*leap.shape[:-2], 1, n, n))
+    while (size := powers.shape[-3]) < least:
+        later = (powers.reshape(*leap.shape[:-2], size * n, n) @ leap).reshape(powers.shape)
+        powers, leap = np.concatenate([powers, later], axis=-3), leap @ leap
     return powers, leap
 
 
-def _fastest(generator: Matrix) -> float:
-    """Return the rate in 1/s that determines the step."""
-    magnitude = float(np.abs(np.linalg.eigvals(generator)).max())
-    return max(magnitude, 0.2 * logarithmic_norm(generator), np.finfo(float).tiny)
+def _fastest(generator: Matrix) -> Stack:
+    """Return the rate in 1/s that determines the step, (…)."""
+    magnitude = np.abs(np.linalg.eigvals(generator)).max(axis=-1)
+    rates = np.maximum(magnitude, 0.2 * logarithmic_norm(generator))
+    return np.asarray(np.maximum(rates, np.finfo(float).tiny))

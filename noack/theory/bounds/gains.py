@@ -12,13 +12,14 @@ interest are the weighted norm W, the state itself, E x, and K H x (the error ra
 depend on the models alone; :class:`PlantGains` those of one known plant.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cached_property, lru_cache
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.config.resolution import LoopMatrices
 from noack.core.cached_method import cached_method
@@ -39,9 +40,12 @@ from noack.theory.bounds.enclosure import (
     constant_kernel,
     factors,
     norm_bounds,
+    ranks,
     response,
     response_until,
 )
+
+Counts = NDArray[np.int64]
 
 
 class NormalForcing(NamedTuple):
@@ -108,9 +112,9 @@ class Growth(NamedTuple):
     """Σ_i ∫‖C e^{Hτ} D_i‖ over each cell of the grid, from the disturbances."""
 
     @property
-    def totals(self) -> tuple[float, float, float]:
-        """The integrals over the grid: of the input error, the mismatch, the disturbances."""
-        disturbed = float(self.forced.sum())
+    def totals(self) -> tuple[Vector, Vector, Vector]:
+        """The integrals over the grid: of the input error, the mismatch, the disturbances, (…)."""
+        disturbed = np.asarray(self.forced.sum(axis=-1))
         return self.input_error.integral_on_grid(), self.mismatch.integral_on_grid(), disturbed
 
 
@@ -189,15 +193,19 @@ class ErrorGains:
             return 1.0
         return float(norm_bounds(self.outputs[output], self.inverse_weight[None])[0])
 
-    def missing(self, output: Output, events: int, spacing_s: float) -> float:
-        """Return Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖, the gain of N missing events."""
-        return float(
-            self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
-        )
+    def missing(self, output: Output, events: int | Counts, spacing_s: float | Vector) -> Vector:
+        """Return Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖, the gain of N missing events.
 
-    def missing_until(self, output: Output, events: int, due_s: float) -> float:
+        N and δ are those of one loop or of several, (…).
+        """
+        numbers = np.arange(np.max(events, initial=0), dtype=np.float64)
+        sups = self.kernels[output].sups(np.asarray(spacing_s)[..., None] * numbers)
+        missing = numbers < np.asarray(events)[..., None]
+        return np.asarray(np.where(missing, sups, 0.0).sum(axis=-1))
+
+    def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
-        return self._all_missing_until(events, due_s)[output]
+        return np.array([self._all_missing_until(N, due_s)[output] for N in events.tolist()])
 
     @cached_method
     def _all_missing_until(self, events: int, due_s: float) -> Mapping[Output, float]:
@@ -206,20 +214,22 @@ class ErrorGains:
             until_s = (number + 1) * due_s
             followed = response_until(self.scaled_H, self.inverse_weight, until_s)
             for output, kernel in followed.through_each(self.stacked).items():
-                totals[output] += kernel.sup_on_grid()
+                totals[output] += float(kernel.sup_on_grid())
         return totals
 
-    @property
+    @cached_property
     def decays(self) -> bool:
         """Whether e^{(H+αI)τ} decays, or is constant in a hold."""
         return not self.scaled_H.any() or spectral_abscissa(self.scaled_H) < 0
 
     def growths(
-        self, columns: Columns, until_s: float, cells: int, outputs: Outputs[Output]
+        self, columns: Columns, until_s: float | Vector, cells: int, outputs: Outputs[Output]
     ) -> dict[Output, Growth]:
         """Return the growth of some outputs C e_s, with what drives e_s through these columns."""
-        driven = np.hstack([columns.mismatch, columns.input_error])
-        groups = (0, columns.mismatch.shape[1])
+        pair = columns.mismatch, columns.input_error
+        lead = np.broadcast_shapes(*(one.shape[:-2] for one in pair))
+        each = [np.broadcast_to(one, (*lead, *one.shape[-2:])) for one in pair]
+        driven, groups = np.concatenate(each, axis=-1), (0, columns.mismatch.shape[-1])
         kernels = response_until(self.scaled_H, driven, until_s, cells, groups)
         areas = dict.fromkeys(outputs.names, np.zeros(cells))
         if columns.disturbed.size:
@@ -236,7 +246,7 @@ class ErrorGains:
         if until_s == 0:
             return 1.0
         followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-        return followed.through(self.weight).sup_on_grid()
+        return float(followed.through(self.weight).sup_on_grid())
 
     @cached_method
     def hold_remainder(self, hold_s: float) -> float:
@@ -248,11 +258,8 @@ class ErrorGains:
             return 0.0
         third = self.outputs[Output.GAIN_CURVATURE] @ self.H
         responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
-        return (
-            hold_s**3
-            / 6
-            * max(response_bounds.through(third).sup_on_grid() for response_bounds in responses)
-        )
+        sups = (followed.through(third).sup_on_grid() for followed in responses)
+        return float(hold_s**3 / 6 * max(sups))
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
@@ -268,18 +275,19 @@ def _error_gains(H: MatrixKey, K: MatrixKey, weight: MatrixKey, alpha_per_s: flo
 
 
 class Coefficients(NamedTuple):
-    """sup‖C x‖ ≤ ``free`` + ``gain`` · sup‖p‖."""
+    """sup‖C x‖ ≤ ``free`` + ``gain`` · sup‖p‖, of one loop or of several, (…)."""
 
-    free: float
-    gain: float
+    free: Vector
+    gain: Vector
 
 
 @dataclass(frozen=True)
 class PlantGains:
-    """Gains of one known plant, A (n, n) and B (n, m).
+    """Gains of one known plant, A (n, n) and B (n, m); or of several, (…, n, n) and (…, n, m).
 
     ``start`` is x(0) as a column, (n, 1), or a matrix that maps the unit ball to a set with x(0).
-    α of the scaling may differ from that of the models.
+    α of the scaling may differ from that of the models. Several plants (:meth:`together`) have the
+    same models; what differs among them has a leading axis, and so have the results.
     """
 
     error: ErrorGains
@@ -295,26 +303,39 @@ class PlantGains:
     is_one_plant: ClassVar = True
     """Whether A and B are the plant's, and not the centre of a box."""
 
-    of_start: ClassVar = {"states", "results of PlantGains.start_up"}
-    """The kept results that depend on x(0)."""
+    @property
+    def likeness(self) -> Hashable:
+        """What plants must have in common for their gains to be computed together.
 
-    def at_start(self, start: Matrix) -> Self:
-        """Return the same plant from another x(0); all other results are shared."""
-        if np.array_equal(start, self.start):
-            return self
-        other = replace(self, start=start)
-        known = {name: value for name, value in vars(self).items() if name not in vars(other)}
-        vars(other).update({k: v for k, v in known.items() if k not in self.of_start})
-        return other
-
-    @cached_property
-    def key(self) -> Hashable:
-        """What equal plants have in common, whatever their x(0)."""
-        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "start"}
-        matrices = [matrix_key(one) for one in own.values() if isinstance(one, np.ndarray)]
+        None: those of this plant are computed alone.
+        """
+        if self.forcing is not None:
+            return None
+        own = [getattr(self, one.name) for one in fields(self)]
+        shapes = [one.shape for one in own if isinstance(one, np.ndarray)]
         outputs = [(name, matrix_key(C)) for name, C in self.further_outputs.items()]
-        others = type(self), id(self.error), self.alpha_per_s, id(self.forcing)
-        return *others, *matrices, *outputs
+        rank = int(ranks(self.error.weight @ self._mismatch))
+        return type(self), id(self.error), self.alpha_per_s, rank, *shapes, *outputs
+
+    @property
+    def identity(self) -> Hashable:
+        """What equal plants without disturbances have in common."""
+        own = [getattr(self, one.name) for one in fields(self)]
+        return self.likeness, *(matrix_key(one) for one in own if isinstance(one, np.ndarray))
+
+    @classmethod
+    def together(cls, plants: Sequence[Self]) -> Self:
+        """Return several plants of equal likeness as one object; a single one is returned as is."""
+        first, *others = plants
+        if not others:
+            return first
+        changed: dict[str, Any] = {}
+        for name in (one.name for one in fields(first)):
+            values = [getattr(plant, name) for plant in plants]
+            if isinstance(values[0], np.ndarray):
+                stack = np.array(values)
+                changed[name] = values[0] if (stack == stack[0]).all() else stack
+        return replace(first, **changed)
 
     @cached_property
     def input_matrix(self) -> Matrix:
@@ -324,20 +345,24 @@ class PlantGains:
     @cached_property
     def closed_loop(self) -> Matrix:
         """A + BK + αI."""
-        return self.A + self.B @ self.error.K + self.alpha_per_s * np.eye(len(self.A))
+        return self.A + self.B @ self.error.K + self.alpha_per_s * np.eye(len(self.error.H))
+
+    @property
+    def _mismatch(self) -> Matrix:
+        """E."""
+        return self.A + self.B @ self.error.K - self.error.H
 
     @cached_property
     def split_mismatch(self) -> tuple[Matrix, Matrix]:
         """L_E, R_E with E = L_E R_E; W L_E has orthonormal columns, so ‖R_E x‖ = ‖E x‖_W."""
-        E = self.A + self.B @ self.error.K - self.error.H
-        L, R = factors(self.error.weight @ E)
+        L, R = factors(self.error.weight @ self._mismatch)
         return self.error.inverse_weight @ L, R
 
     @cached_property
     def outputs(self) -> Mapping[str, Matrix]:
         """C of each output C x."""
         return {
-            Output.STATE: np.eye(len(self.A)),
+            Output.STATE: np.eye(len(self.error.H)),
             Output.WEIGHTED: self.error.weight,
             Output.MISMATCH: self.split_mismatch[1],
             Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
@@ -370,9 +395,9 @@ class PlantGains:
         total = 0.0
         for followed, duration_s in zip(self._disturbed, self._forcing.durations_s, strict=True):
             kernel = followed.through(C)
-            at_most = kernel.integral()
+            at_most = float(kernel.integral())
             if np.isfinite(duration_s):
-                at_most = min(at_most, float(duration_s) * kernel.sup())
+                at_most = min(at_most, float(duration_s * kernel.sup()))
             total += at_most
         return total + self._normally_disturbed(C)
 
@@ -409,7 +434,7 @@ class PlantGains:
 
     @property
     def _forcing(self) -> Forcing:
-        n, m = self.B.shape
+        n, m = self.B.shape[-2:]
         return self.forcing or Forcing(np.zeros((n, 0)), np.zeros(0), np.zeros(m))
 
     @cached_property
@@ -422,12 +447,12 @@ class PlantGains:
         return response(self.closed_loop, self.input_matrix)
 
     @cached_method
-    def on_grid(self, until_s: float, cells: int) -> tuple[Vector, Mapping[str, Vector]]:
+    def on_grid(self, until_s: Vector, cells: int) -> tuple[Vector, Mapping[str, Vector]]:
         """Return the gains of a missing event's error, and of the input error, on equal cells.
 
         Returns:
-            sup‖R e^{(H+αI)τ} W^{−1}‖ over each cell, and ∫‖C e^{(A+BK+αI)τ} B U‖ over each cell for
-            every output.
+            sup‖R e^{(H+αI)τ} W^{−1}‖ over each cell, (…, cells), and ∫‖C e^{(A+BK+αI)τ} B U‖ over
+            each cell for every output.
         """
         error = self.error
         lost = response_until(error.scaled_H, error.inverse_weight, until_s, cells)
@@ -438,21 +463,21 @@ class PlantGains:
         return lost.through(error.outputs[Output.GAIN]).highest, areas
 
     @cached_method
-    def start_up(self, start_s: float) -> tuple[float, Mapping[str, float]]:
+    def start_up(self, start_s: float) -> tuple[Vector, Mapping[str, Vector]]:
         """Return the effect of zero input before ``start_s``, where p = −K x.
 
         Returns:
-            sup‖p‖ over the start, and its contribution to every sup‖C x‖.
+            sup‖p‖ over the start, (…), and its contribution to every sup‖C x‖.
         """
         if start_s == 0:
-            return 0.0, dict.fromkeys(self.outputs, 0.0)
-        drift = self.A + self.alpha_per_s * np.eye(len(self.A))
+            return np.zeros(()), dict.fromkeys(self.outputs, np.zeros(()))
+        drift = self.A + self.alpha_per_s * np.eye(len(self.error.H))
         free = response_until(drift, self.start, start_s)
         R = self.error.split_K[1]
         error = free.through(R).sup_on_grid()
         for column in self._forcing.limited.T:
             pushed = response_until(drift, column[:, None], start_s)
-            error += pushed.through(R).integral_on_grid()
+            error = error + pushed.through(R).integral_on_grid()
         return error, {
             output: error * start_s * self.forced[output].sup() for output in self.outputs
         }
@@ -463,7 +488,7 @@ class PlantGains:
         return Columns(self.split_mismatch[0], self.input_matrix, self._forcing.limited)
 
     @cached_method
-    def growth(self, until_s: float, cells: int) -> Growth:
+    def growth(self, until_s: float | Vector, cells: int) -> Growth:
         """Return the growth of ‖e_s‖_W over ``until_s``, on a grid."""
         error = self.error
         return error.growths(self.columns, until_s, cells, error.stacked_norm)[Output.WEIGHTED]

@@ -2,8 +2,8 @@
 
 Every rule is data (:mod:`noack.trigger.trigger_rule`), so the bounds follow from its fields:
 
-* a comparison promises ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.error_promise`);
-* one of the integral, ∫‖e_s‖_W ≤ δ, promises ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
+* a comparison bounds ‖e_s‖_W ≤ threshold + shares of x (:mod:`noack.trigger.comparison_bound`);
+* one of the integral, ∫‖e_s‖_W ≤ δ, bounds ‖e_s‖_W ≤ δ/T at some time of the last T, for each T;
 * until a dwell time has passed, and up to a deadline, e_s has grown from 0.
 
 :class:`TriggerBounds` states these bounds. :class:`ErrorGrowth` is how e_s grows from them until
@@ -19,11 +19,12 @@ from functools import cached_property
 import numpy as np
 
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
-from noack.theory.bounds.gains import Output, PlantGains
+from noack.theory.bounds.contraction import spectral_norm
+from noack.theory.bounds.gains import Columns, Growth, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError, TriggerBound
-from noack.trigger.error_promise import ErrorPromise, error_promise
+from noack.trigger.comparison_bound import ComparisonBound, comparison_bound
 from noack.trigger.trigger_rule import TriggerRule
 
 _AVERAGED = 2.0 ** np.arange(-6, 5)
@@ -52,14 +53,14 @@ class TriggerBounds:
     """Rate of the model's fastest mode."""
 
     @cached_property
-    def promise(self) -> ErrorPromise | None:
-        """What the comparison promises; None if nothing."""
-        return error_promise(self.rule, self.weight)
+    def comparison(self) -> ComparisonBound | None:
+        """What follows from the comparison; None if nothing."""
+        return comparison_bound(self.rule, self.weight)
 
     @property
     def beta(self) -> float:
         """β of a threshold βe^{−αt}; 0 without one."""
-        return 0.0 if self.promise is None else self.promise.size * self.rule.level
+        return 0.0 if self.comparison is None else self.comparison.size * self.rule.level
 
     @property
     def alpha_per_s(self) -> float:
@@ -69,16 +70,16 @@ class TriggerBounds:
     @property
     def floor(self) -> float:
         """ε: the constant, or the floor, of the threshold; 0 without one."""
-        if self.promise is None or self.rule.integrates:
+        if self.comparison is None or self.rule.integrates:
             return 0.0
-        return self.promise.size * self.rule.floor
+        return self.comparison.size * self.rule.floor
 
     @property
     def area(self) -> float:
         """δ of ∫‖e_s‖_W ≤ δ; 0 if the rule does not integrate."""
-        if self.promise is None or not self.rule.integrates:
+        if self.comparison is None or not self.rule.integrates:
             return 0.0
-        return self.promise.size * self.rule.floor
+        return self.comparison.size * self.rule.floor
 
     @property
     def is_homogeneous(self) -> bool:
@@ -93,7 +94,7 @@ class TriggerBounds:
     @property
     def outputs(self) -> Mapping[str, Matrix]:
         """S of each share sup‖S x‖ of the threshold, by name."""
-        shares = () if self.promise is None else self.promise.shares
+        shares = () if self.comparison is None else self.comparison.shares
         return {f"share {number}": S for number, S in enumerate(shares)}
 
     @property
@@ -138,9 +139,9 @@ class TriggerBounds:
         idle_s = self._after(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
         bounds: list[TriggerBound] = []
-        if self.promise is not None:
+        if self.comparison is not None:
             if reached is not None:
-                reached = reached * self.promise.least / self.promise.size or None
+                reached = reached * self.comparison.least / self.comparison.size or None
             shares = dict.fromkeys(self.outputs, 1.0)
             for ago_s, beta, least in self._levels(conditions, level, reached):
                 bounds.append(TriggerBound(beta, least, shares, untested_s, ago_s=ago_s))
@@ -149,7 +150,7 @@ class TriggerBounds:
         if not bounds:
             raise NoCertificateError(_NONE)
         is_separated = apart_s or conditions.spacing_s or any(bound.reached for bound in bounds)
-        grows_first = level > 0 and self.promise is not None and self.promise.least > 0
+        grows_first = level > 0 and self.comparison is not None and self.comparison.least > 0
         if not is_separated and not grows_first:
             raise NoCertificateError(_ACCUMULATE)
         if self.is_homogeneous:
@@ -176,21 +177,21 @@ class TriggerBounds:
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
     def text(self) -> str:
-        """Return in words what the rule promises about e_s."""
-        promises = []
-        if (promise := self.promise) is not None:
+        """Return in words how the rule bounds e_s."""
+        bounds = []
+        if (comparison := self.comparison) is not None:
             shares = " + ".join(
                 f"{number(float(np.linalg.norm(S @ np.linalg.inv(self.weight), 2)))} ‖x‖"
-                for S in promise.shares
+                for S in comparison.shares
             )
             level = "" if self.is_homogeneous else "the threshold"
             bounded = "∫‖e_s‖ dt" if self.rule.integrates else "‖e_s‖"
             total = " + ".join(filter(None, [level, shares]))
-            promises.append(f"after each test {bounded} ≤ {total or '0'}")
+            bounds.append(f"after each test {bounded} ≤ {total or '0'}")
         if self.has_due_time:
             longest_s = self.rule.longest_ns / NS_PER_S
-            promises.append(f"the next event at the latest {longest_s:g} s after the last one")
-        return "; ".join(promises)
+            bounds.append(f"the next event at the latest {longest_s:g} s after the last one")
+        return "; ".join(bounds)
 
     def _levels(
         self, conditions: NetworkConditions, level: float, reached: float | None
@@ -198,8 +199,8 @@ class TriggerBounds:
         """Return (T, β, least ‖e_s‖_W at an event): ‖e_s‖_W ≤ β at some time of the last T."""
         if not self.area:
             return [(0.0, level, reached)]
-        assert self.promise is not None
-        least = self.promise.least * self.rule.floor
+        assert self.comparison is not None
+        least = self.comparison.least * self.rule.floor
         test_s, longest_s = conditions.spacing_s, conditions.sampling_s
         times_s = _AVERAGED / self.fastest_per_s
         if test_s:  # the trapezoidal sum of the last k tests
@@ -241,20 +242,19 @@ class ErrorGrowth:
 
     def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
         stretch, outputs = plant.error.stretch(longest_s), plant.outputs
-        self.fixed, self.input_error = stretch * after.beta, 0.0
+        self.fixed: Vector = np.asarray(stretch * after.beta)
+        self.input_error: Vector = np.zeros(())
         # The trigger tests x_s − x̂, and may compare it with x̂.
         self.estimation = stretch * (1 + sum(
-            share * float(np.linalg.norm(outputs[C] @ plant.error.inverse_weight, 2))
+            share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
             for C, share in after.shares.items()
         ))  # fmt: skip
-        shares = {C: stretch * share for C, share in after.shares.items()}
+        shares: dict[str, Vector | float] = {C: stretch * of for C, of in after.shares.items()}
         if longest_s > 0:
-            growth = plant.growth(longest_s, COARSE_CELLS)
-            mismatch = growth.mismatch.integral_on_grid()
+            self.input_error, mismatch, forced = plant.growth(longest_s, COARSE_CELLS).totals
             shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
-            self.input_error = growth.input_error.integral_on_grid()
-            self.fixed += float(growth.forced.sum())
-        self.shares: Mapping[str, float] = shares
+            self.fixed = self.fixed + forced
+        self.shares: Mapping[str, Vector | float] = shares
 
 
 def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:
@@ -269,13 +269,13 @@ def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> l
 
 def first_passage_s(
     plant: PlantGains,
-    level: float,
-    mismatch: float,
-    input_error: float,
-    own: float,
-    start: float = 0.0,
-) -> float:
-    """Return a time before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
+    level: Vector,
+    mismatch: Vector,
+    input_error: Vector,
+    own: Vector,
+    start: Vector,
+) -> Vector:
+    """Return times before which ‖e_s‖_W, starting at ``start``, cannot reach ``level``.
 
     Let ρ(r) = sup_{s≤r} ‖e_s‖_W. The part of e_c that equals the present e_s is bounded by ρ:
 
@@ -284,41 +284,66 @@ def first_passage_s(
     and further terms from the disturbances and ``start``. This is iterated from ρ = ``level``;
     every iterate is a bound until the level is reached.
 
-    ``level`` is ‖e_s‖_W at an event, ``mismatch`` sup‖R_E x‖, ``own`` ‖K W^{−1}‖, and
-    ``input_error`` π', the input error without the effect of the present e_s.
+    Args:
+        plant: one plant, or as many as there are values, (loops,).
+        level: ‖e_s‖_W at an event, (loops,).
+        mismatch: sup‖R_E x‖, (loops,).
+        input_error: π', the input error without the effect of the present e_s, (loops,).
+        own: ‖K W^{−1}‖, (loops,).
+        start: ‖e_s‖_W at first, (loops,).
     """
-    if level <= start:
-        return 0.0
-    window_s = _first_window_s(plant, level, mismatch, input_error + own * level)
-    cells = COARSE_CELLS
-    known_s = 0.0
-    while True:
-        growth = plant.growth(window_s, cells)
-        areas = growth.mismatch.area * mismatch + growth.input_error.area * input_error
-        fixed = np.cumsum(areas + growth.forced)
-        if start:
-            fixed += start * plant.error.stretch(window_s)
-        rho = np.full(cells, level)
-        for _ in range(_PICARD_ROUNDS):
-            echo = np.convolve(growth.input_error.area, rho)[:cells]
-            rho = np.minimum(level, fixed + own * echo)
-        crossed = np.flatnonzero(rho >= level)
-        if len(crossed):
-            known_s = max(known_s, float(growth.mismatch.edges_s[crossed[0]]))
-            if cells == _FINE_CELLS:
-                return known_s
-            window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE_CELLS
-        elif window_s >= LONGEST_S:
-            return window_s
-        else:  # not reached, also after a coarse grid's overestimate: extend the window
-            known_s, window_s = window_s, 2 * window_s
+    start_of_growth = plant.growth(_SHORTEST_S, 1)
+    speed = start_of_growth.mismatch.sup_on_grid() * mismatch
+    speed = speed + start_of_growth.input_error.sup_on_grid() * (input_error + own * level)
+    speed = speed + start_of_growth.forced.sum(axis=-1) / _SHORTEST_S
+    # The first window is twice the time to the level at the initial speed, limited.
+    window_s = np.where(speed > 0, 2 * level / np.where(speed > 0, speed, 1.0), LONGEST_S)
+    window_s = window_s.clip(_SHORTEST_S, LONGEST_S)
+    known_s, cells = np.zeros(len(level)), np.full(len(level), COARSE_CELLS)
+    is_open = level > start
+    while is_open.any():
+        count = int(cells[is_open].min())
+        which = np.flatnonzero(is_open & (cells == count))
+        columns = Columns(*(one[which] if one.ndim == 3 else one for one in plant.columns))
+        error = plant.error
+        growth = error.growths(columns, window_s[which], count, error.stacked_norm)[Output.WEIGHTED]
+        first = _first_crossed(
+            growth, level[which], mismatch[which], input_error[which], own[which],
+            np.array([one and one * error.stretch(until_s) for one, until_s in zip(
+                start[which].tolist(), window_s[which].tolist(), strict=True
+            )]),
+        )  # fmt: skip
+        for loop, edge_s, cell in zip(which.tolist(), growth.mismatch.edges_s, first, strict=True):
+            if cell < count:
+                known_s[loop] = max(known_s[loop], edge_s[cell])
+                is_open[loop] = count != _FINE_CELLS
+                window_s[loop], cells[loop] = edge_s[cell + 1], _FINE_CELLS
+            elif window_s[loop] >= LONGEST_S:
+                known_s[loop], is_open[loop] = window_s[loop], False
+            else:  # not reached, also after a coarse grid's overestimate: extend the window
+                known_s[loop], window_s[loop] = window_s[loop], 2 * window_s[loop]
+    return known_s
 
 
-def _first_window_s(plant: PlantGains, level: float, mismatch: float, input_error: float) -> float:
-    """Return the first search window: twice the time to ``level`` at the initial speed, limited."""
-    start = plant.growth(_SHORTEST_S, 1)
-    speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
-    speed += float(start.forced.sum()) / _SHORTEST_S
-    if not speed > 0:
-        return LONGEST_S
-    return min(max(2 * level / speed, _SHORTEST_S), LONGEST_S)
+def _first_crossed(
+    growth: Growth,
+    level: Vector,
+    mismatch: Vector,
+    input_error: Vector,
+    own: Vector,
+    started: Vector,
+) -> list[int]:
+    """Return the first cell of each loop in which the level may be reached, or their number."""
+    areas = growth.mismatch.area * mismatch[:, None]
+    areas = areas + growth.input_error.area * input_error[:, None]
+    fixed = np.cumsum(areas + growth.forced, axis=-1) + started[:, None]
+    rho = np.repeat(level[:, None], fixed.shape[-1], axis=1)
+    echoing = np.broadcast_to(growth.input_error.area, rho.shape)
+    for _ in range(_PICARD_ROUNDS):
+        echo = [np.convolve(area, r)[: len(r)] for area, r in zip(echoing, rho, strict=True)]
+        before, rho = rho, np.minimum(level[:, None], fixed + own[:, None] * np.array(echo))
+        if np.array_equal(before, rho):
+            break
+    crossed = rho >= level[:, None]
+    found: list[int] = np.where(crossed.any(axis=1), crossed.argmax(axis=1), rho.shape[1]).tolist()
+    return found

@@ -303,7 +303,7 @@ class KnownStateBounds:
         followed = response(unscaled, self.disturbances)
         identity = np.eye(len(plant.A))
         for column in self.disturbances.T:
-            total += response(unscaled, column[:, None]).through(identity).integral()
+            total += float(response(unscaled, column[:, None]).through(identity).integral())
         sums = np.append(0.0, np.cumsum(followed.areas_of_columns(identity)))
         return followed.edges_s, np.append(sums, max(total, float(sums[-1])))
 

@@ -87,7 +87,7 @@ class DeliveryFlow:
         self.mismatch = E = self.closed_loop - self.H
         self.generator = np.block([[self.closed_loop, self.BK], [-E, self.H - self.BK]])
         self.start = self.weight @ plant.start
-        self.stretch = error.kernels[Output.WEIGHTED].sup()
+        self.stretch = float(error.kernels[Output.WEIGHTED].sup())
         fastest = max(float(np.abs(np.linalg.eigvals(self.generator)).max()), 1e-9)
         slowest, unstable = -spectral_abscissa(self.H), spectral_abscissa(self.generator)
         step_s, state = _FIRST_STEP / fastest, np.eye(2 * self.n)[:, : self.n]
@@ -386,7 +386,7 @@ class _Stage:
             bends += np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", seen, inverse, seen)))
             terms = F @ terms * (steps_s / order)
         with np.errstate(over="ignore"):
-            growth = np.exp(max(logarithmic_norm(F), 0.0) * steps_s[:, 0, 0])
+            growth = np.exp(max(float(logarithmic_norm(F)), 0.0) * steps_s[:, 0, 0])
         bends += growth * np.sqrt(np.abs(np.einsum("jab,jbc,jac->j", terms, inverse, terms)))
         return np.asarray(steps_s[:, 0, 0] ** 2 / 8 * bends * ROUNDING)
 

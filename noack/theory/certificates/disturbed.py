@@ -31,7 +31,7 @@ from noack.theory.bounds.terms import (
     TriggerBound,
 )
 from noack.theory.bounds.trigger_bounds import TriggerBounds
-from noack.theory.certificates.solution import solve_parts
+from noack.theory.certificates.solution import Problem, Search
 
 PlantAt = Callable[[ErrorGains, Matrix, float], PlantGains]
 """Returns the plant's gains from the gains of the models, the start of x, and α."""
@@ -41,7 +41,7 @@ _RATES = (0.05, 0.2, 0.4, 0.7)
 """Rates that are tried, as shares of the loop's decay rate."""
 SHARES = (0.5, 0.2, 0.8)
 """Values of λ that are tried."""
-Found = TypeVar("Found", bound=Sequence[Constants])
+Some = TypeVar("Some", bound=Sequence[Constants])
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class DisturbedCertificate:
 
     def constants(
         self, conditions: NetworkConditions, *, decays: bool, longest: bool = True
-    ) -> list[Added]:
-        """Return the constants that decay and those to be added; without decay only one.
+    ) -> Search[list[Added]]:
+        """Search for the constants that decay and those to be added; without decay only one.
 
         Where there are several such sums, each bounds the run.
 
@@ -79,27 +79,29 @@ class DisturbedCertificate:
         structured = self.start_error == 0.0
         if decays and self.resolved.coverage.is_decaying:
             try:
-                return [solve_two_parts(
+                two = yield from solve_two_parts(
                     self._decaying, self._persistent, conditions, self.start_error,
                     structured=structured, shares=SHARES if longest else (),
-                )]  # fmt: skip
+                )  # fmt: skip
+                return [two]
             except NotDecayingError:
                 pass
         level, floor = max(self.trigger.beta, self.trigger.floor), self.trigger.floor
         bound = self.trigger.bound(conditions, level, floor or None)
         part = self._together._replace(bound=bound)
-        (constants,) = solve_parts(
-            [part], conditions, self.start_error, structured=structured, longest=longest
-        )
+        (constants,) = yield Problem((part,), conditions, self.start_error, structured, longest)
         # The mean of an integral bounds e_s over a time that suits only one of several parts.
         is_divided = not self.trigger.beta and not self.trigger.area and not self.start_error
         divided: list[Added] = []
         if decays and is_divided and longest:
-            divided = self._of_constant_threshold(conditions, constants.inter_event_s or 0.0)
+            apart_s = constants.inter_event_s or 0.0
+            divided = yield from self._of_constant_threshold(conditions, apart_s)
         return divided or [(constants, None)]
 
-    def _of_constant_threshold(self, conditions: NetworkConditions, apart_s: float) -> list[Added]:
-        """Return the constants of what follows from the start, and of what persists, if any.
+    def _of_constant_threshold(
+        self, conditions: NetworkConditions, apart_s: float
+    ) -> Search[list[Added]]:
+        """Search for the constants of what follows from the start, and of what persists, if any.
 
         There is one pair for each bound of e_s that suffices, that with the smallest ultimate bound
         first. The threshold has no rate; that of :func:`choose_rate` is taken. ``apart_s`` is a
@@ -108,13 +110,13 @@ class DisturbedCertificate:
         pairs: list[Added] = []
         for of_start, of_rest in self.trigger.divided(conditions, apart_s):
             with contextlib.suppress(NoCertificateError, NotDecayingError):
-                pairs.append(self._divided(of_start, of_rest, conditions))
+                pairs.append((yield from self._divided(of_start, of_rest, conditions)))
         return sorted(pairs, key=lambda pair: 0.0 if pair[1] is None else pair[1].state)
 
     def _divided(
         self, of_start: TriggerBound, of_rest: TriggerBound, conditions: NetworkConditions
-    ) -> Added:
-        """Return the constants that one bound of e_s gives.
+    ) -> Search[Added]:
+        """Search for the constants that one bound of e_s gives.
 
         Raises: as :func:`choose_rate`.
         """
@@ -122,10 +124,11 @@ class DisturbedCertificate:
         persists = of_rest.beta or rest.plant.forcing is not None or rest.estimation.fixed
         others = [rest] if persists else []
 
-        def solved(rate_per_s: float) -> list[Constants]:
-            return solve_parts([self._at_rate(rate_per_s, of_start), *others], conditions)
+        def solved(rate_per_s: float) -> Search[list[Constants]]:
+            return (yield Problem((self._at_rate(rate_per_s, of_start), *others), conditions))
 
-        first, *added = choose_rate(solved, self.slowest_per_s, loop_of(self.resolved).x0)
+        x0 = loop_of(self.resolved).x0
+        first, *added = yield from choose_rate(solved, self.slowest_per_s, x0)
         return first, added[0] if added else None
 
     @cached_property
@@ -187,8 +190,8 @@ def solve_two_parts(
     *,
     structured: bool = True,
     shares: Sequence[float] = SHARES,
-) -> tuple[Constants, Constants]:
-    """Return the constants of both parts, with the λ of ``shares`` for which δ is longest.
+) -> Search[tuple[Constants, Constants]]:
+    """Search for the constants of both parts, with the λ of ``shares`` for which δ is longest.
 
     Without ``shares`` δ is searched for only if there is no certificate otherwise.
 
@@ -198,41 +201,48 @@ def solve_two_parts(
     """
     beta, floor = decaying.bound.beta, persistent.bound.beta
 
-    def solved(share: float | None) -> tuple[Constants, Constants]:
+    def solved(share: float | None) -> Search[tuple[Constants, Constants]]:
         reached = (None, None) if share is None else (share * beta, (1 - share) * floor)
         parts = [
             part._replace(bound=part.bound._replace(reached=level))
             for part, level in zip((decaying, persistent), reached, strict=True)
         ]
-        first, second = solve_parts(parts, conditions, earlier_error, structured=structured)
+        first, second = yield Problem(tuple(parts), conditions, earlier_error, structured)
         return first, second
 
     if floor == 0:
-        return solved(None)
+        return (yield from solved(None))
     if not shares:
         with contextlib.suppress(NoCertificateError):
-            return solved(None)
-    tried = [solved(share) for share in shares or SHARES[:1]]
-    return max(tried, key=lambda pair: pair[0].inter_event_s or 0.0)
+            return (yield from solved(None))
+    best: tuple[Constants, Constants] | None = None
+    for share in shares or SHARES[:1]:
+        pair = yield from solved(share)
+        if best is None or (pair[0].inter_event_s or 0.0) > (best[0].inter_event_s or 0.0):
+            best = pair
+    assert best is not None
+    return best
 
 
-def choose_rate(solved: Callable[[float], Found], decay_per_s: float, start: Vector) -> Found:
-    """Return the constants for a rate, where none is given.
+def choose_rate(
+    solved: Callable[[float], Search[Some]], decay_per_s: float, start: Vector
+) -> Search[Some]:
+    """Search for the constants for a rate, where none is given.
 
     It is the rate at which the first constants' bound of ‖x‖ falls to ‖x(0)‖/10 first.
 
     Args:
-        solved: returns constants for a rate in 1/s.
+        solved: searches for constants for a rate in 1/s.
         decay_per_s: the decay rate of the loop.
         start: x(0), (n,).
 
     Raises: what ``solved`` raises at the smallest rate.
     """
-    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Found]]()
+    size, candidates = float(np.linalg.norm(start)) or 1.0, list[tuple[float, Some]]()
     for share in _RATES:
         rate_per_s = share * decay_per_s
         try:
-            constants = solved(rate_per_s)
+            constants = yield from solved(rate_per_s)
         except (NotDecayingError, NoCertificateError):
             if not candidates:
                 raise

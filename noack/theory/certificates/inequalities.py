@@ -39,15 +39,16 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossWindow
 from noack.theory.bounds.enclosure import KernelBounds
-from noack.theory.bounds.gains import Coefficients, Output, PlantGains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part
+from noack.theory.bounds.gains import Coefficients, Counts, Output, PlantGains
+from noack.theory.bounds.terms import Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import (
     COARSE_CELLS,
     ErrorGrowth,
@@ -60,75 +61,98 @@ _CELLS = 2048
 _MOST_BINS = 1 << 16
 _ROUNDING = 1 + 1e-9
 _EPSILON = float(np.finfo(float).eps)
+_TRANSFORMED = 3 * math.log2(2 * _CELLS) * _EPSILON
+"""Times the norms of both factors, this exceeds the rounding of a convolution by transforms."""
 
 
 class Solution(NamedTuple):
-    """The bound of v, if there is one."""
+    """The bound of v, of one loop or of several."""
 
-    loop_gain: float
-    """1 minus the smallest leading principal minor of I − F; below 1 if and only if ρ(F) < 1. If it
-    is not below 1: at least the largest entry of the diagonal."""
-    bound: Vector | None
-    """Upper bound of v, (k,); None if ρ(F) < 1 was not confirmed."""
+    loop_gain: Vector
+    """(…) 1 minus the smallest leading principal minor of I − F; below 1 if and only if ρ(F) < 1.
+    If it is not below 1: at least the largest entry of the diagonal."""
+    bound: Vector
+    """(…, k) upper bound of v; infinite where ρ(F) < 1 was not confirmed."""
 
 
 def solve_inequalities(F: Matrix, g: Vector) -> Solution:
-    """Return the smallest bound of v that follows, for F of shape (k, k) and g of shape (k,)."""
-    F = np.where(F.any(axis=1) | (g > 0), F, 0.0)  # a signal that is 0 affects nothing
-    sizes = g + F @ (g + F @ g)  # a right side of the size of x makes w/x dimensionless
-    least = sizes[sizes > 0].min(initial=math.inf)
-    least = least if math.isfinite(least) else 1.0
-    remainder = np.eye(len(g)) - F
-    minors, (x, w) = _eliminated(remainder, g, np.where(sizes > 0, sizes, least))
-    loop_gain = 1 - min(minors)
-    if not loop_gain < 1:
-        minors = [np.linalg.det(remainder[:k, :k]) for k in range(1, len(g) + 1)]
-        gains = [1 - min(minors), *np.diagonal(F)]
-        return Solution(max(1.0, *gains) if np.isfinite(gains).all() else math.inf, None)
-    rounding = (len(g) + 4) * _EPSILON
-    moved_x, moved_w = F @ x, F @ w
+    """Return the smallest bound of v that follows, for F of shape (…, k, k) and g of (…, k)."""
+    size = F.shape[-1]
+    # A signal that is 0 affects nothing.
+    F = np.where((F.any(axis=-1) | (g > 0))[..., None, :], F, 0.0)
+    # A right side of the size of x makes w/x dimensionless.
+    sizes = g + _applied(F, g + _applied(F, g))
+    least = np.where(sizes > 0, sizes, np.inf).min(axis=-1, keepdims=True)
+    right = np.where(sizes > 0, sizes, np.where(np.isfinite(least), least, 1.0))
+    remainder = np.eye(size) - F
+    minor, x, w = _eliminated(remainder, g, right)
+    loop_gain = np.asarray(1 - minor)
+    is_small = loop_gain < 1
+    if not is_small.all():
+        large = ~is_small
+        with np.errstate(invalid="ignore"):
+            minors = [np.linalg.det(remainder[large][..., :k, :k]) for k in range(1, size + 1)]
+        diagonal = np.diagonal(F[large], axis1=-2, axis2=-1)
+        gains = np.concatenate([1 - np.min(minors, axis=0)[..., None], diagonal], axis=-1)
+        known = np.isfinite(gains).all(axis=-1)
+        loop_gain[large] = np.where(known, np.maximum(gains.max(axis=-1), 1.0), np.inf)
+    rounding = (size + 4) * _EPSILON
+    moved_x, moved_w = _applied(F, x), _applied(F, w)
     slack = w - moved_w - rounding * (w + moved_w)
-    if not (w > 0).all() or not (slack > 0).all():
-        return Solution(loop_gain, None)
     missing = moved_x + g - x + rounding * (moved_x + g + x)
-    bound = x + w * max(float((missing / slack).max()), 0.0) * (1 + rounding)
-    return Solution(loop_gain, np.where(F.any(axis=1), bound, g))
+    largest = np.maximum((missing / slack).max(axis=-1, keepdims=True), 0.0)
+    bound = np.where(F.any(axis=-1), x + w * largest * (1 + rounding), g)
+    confirmed = is_small & (w > 0).all(axis=-1) & (slack > 0).all(axis=-1)
+    return Solution(loop_gain, np.where(confirmed[..., None], bound, np.inf))
 
 
-def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[list[float], list[Vector]]:
-    """Return the leading principal minors up to the first one not above 0, and the solutions.
+def _applied(F: Matrix, v: Vector) -> Vector:
+    return np.asarray((F @ v[..., None])[..., 0])
 
-    The elimination is that of Gauss without exchanges, in floats: the matrices are tiny.
+
+def _eliminated(matrix: Matrix, *right_sides: Vector) -> tuple[Vector, ...]:
+    """Return the smallest leading principal minor, (…), and the solutions, (…, k).
+
+    Minors after the first one not above 0 are left out; the solutions are then of no use. The
+    elimination is that of Gauss without exchanges.
     """
-    size, minors = len(matrix), [1.0]
-    rows = np.column_stack([matrix, *right_sides]).tolist()
+    size = matrix.shape[-1]
+    rows = np.concatenate([matrix, np.stack(right_sides, axis=-1)], axis=-1)
+    minor = np.ones(matrix.shape[:-2])
+    smallest, counts = np.full_like(minor, np.inf), np.ones_like(minor, dtype=bool)
     for k in range(size):
-        minors.append(minors[-1] * rows[k][k])
-        if not minors[-1] > 0:
-            return minors, [np.full(size, np.nan) for _ in right_sides]
-        rows[k] = [value / rows[k][k] for value in rows[k]]
-        for i in range(size):
-            if i != k and (share := rows[i][k]):
-                rows[i] = [value - share * own for value, own in zip(rows[i], rows[k], strict=True)]
-    return minors[1:], list(np.array(rows)[:, size:].T)
+        minor = minor * rows[..., k, k]
+        smallest = np.where(counts, np.minimum(smallest, minor), smallest)
+        counts = counts & (minor > 0)
+        rows[..., k, :] /= rows[..., k, k, None].copy()
+        shares = rows[..., k].copy()
+        shares[..., k] = 0.0
+        rows -= np.where(shares != 0, shares, 0.0)[..., None] * rows[..., k : k + 1, :]
+    return smallest, *np.moveaxis(rows[..., size:], -1, 0)
 
 
 @dataclass(frozen=True)
 class LossAccumulation:
-    """The bounds of one plant for lost updates that count from the age ``delay_s`` on."""
+    """The bounds of one plant, or of several, for lost updates that count from ``delay_s`` on."""
 
     plant: PlantGains
     delay_s: float
 
-    def total(self, output: str, spacing_s: float, windows: Sequence[LossWindow]) -> float:
+    def total(
+        self, output: str, spacing_s: float, windows: Sequence[LossWindow], loop: int = 0
+    ) -> float:
         """Return the bound of sup‖C x‖ / β̃ from all lost updates; infinite if it is not found."""
-        bins = math.ceil(self._until_s / spacing_s) if spacing_s > 0 else _MOST_BINS
+        until_s = self._of_loop(self._until_s, loop)
+        bins = math.ceil(until_s / spacing_s) if spacing_s > 0 else _MOST_BINS
         if bins >= _MOST_BINS:
             return math.inf
-        highest = _over_bins(self._effects[output], spacing_s / self._cell_s, bins)
-        return min(self._total(output, highest, spacing_s, window) for window in windows)
+        effects = self._of_loop(self._effects[output], loop)
+        highest = _over_bins(effects, spacing_s / (until_s / _CELLS), bins)
+        return min(self._total(output, highest, spacing_s, window, loop) for window in windows)
 
-    def _total(self, output: str, highest: Vector, spacing_s: float, window: LossWindow) -> float:
+    def _total(
+        self, output: str, highest: Vector, spacing_s: float, window: LossWindow, loop: int
+    ) -> float:
         most, packets = window
         if most == 0:
             return 0.0
@@ -136,8 +160,14 @@ class LossAccumulation:
         padded = np.zeros(blocks * packets)
         padded[: len(highest)] = highest
         ranked = np.sort(padded.reshape(blocks, packets), axis=1)[:, ::-1]
-        beyond = self._beyond(output, most, packets * spacing_s)
-        return float(ranked[:, :most].sum()) * _ROUNDING + beyond
+        falling = self._of_loop(self._beyond[output], loop)
+        # The blocks that begin beyond the grid.
+        beyond = sum(most * f * (1 + 2 / (rate * packets * spacing_s)) for f, rate in falling)
+        return float(ranked[:, :most].sum()) * _ROUNDING + float(beyond)
+
+    @staticmethod
+    def _of_loop(values: Vector, loop: int) -> Any:
+        return values[loop if len(values) > 1 else 0]
 
     @cached_property
     def _kernels(self) -> tuple[KernelBounds, Mapping[str, KernelBounds]]:
@@ -145,40 +175,49 @@ class LossAccumulation:
         return self.plant.error.kernels[Output.GAIN], self.plant.forced
 
     @cached_property
-    def _until_s(self) -> float:
-        """End of the grid: beyond half of it, all kernels are bounded by exponentials."""
+    def _until_s(self) -> Vector:
+        """End of the grid, (loops,): beyond half of it, all kernels are bounded by exponentials."""
         g, forced = self._kernels
-        ends_s = [g.edges_s[-1], *(k.edges_s[-1] for k in forced.values())]
-        return 2 * float(max(ends_s))
-
-    @property
-    def _cell_s(self) -> float:
-        return self._until_s / _CELLS
+        ends_s = [kernel.edges_s[..., -1] for kernel in (g, *forced.values())]
+        return np.atleast_1d(2 * np.max(np.broadcast_arrays(*ends_s), axis=0))
 
     @cached_property
-    def _effects(self) -> Mapping[str, Vector]:
-        """The bound of c over each cell, for every output."""
-        g, areas = self.plant.on_grid(self._until_s, _CELLS)
-        g = np.where(np.arange(1, _CELLS + 1) * self._cell_s > self.delay_s, g, 0.0)
-        ages = np.maximum(g, np.append(0.0, g[:-1]))
-        return {output: np.convolve(area, ages)[:_CELLS] for output, area in areas.items()}
+    def _effects(self) -> Mapping[str, Matrix]:
+        """The bound of c over each cell, (loops, cells), for every output."""
+        until_s = self._until_s if len(self._until_s) > 1 else self._until_s[0]
+        g, areas = self.plant.on_grid(until_s, _CELLS)
+        numbers = np.arange(1, _CELLS + 1)
+        g = np.where(numbers * (self._until_s[:, None] / _CELLS) > self.delay_s, g, 0.0)
+        ages = np.maximum(g, np.pad(g[:, :-1], ((0, 0), (1, 0))))
+        seen, size = np.fft.rfft(ages, 2 * _CELLS), np.linalg.norm(ages, axis=-1)
+        effects = {}
+        for output, area in areas.items():
+            convolved = np.fft.irfft(np.fft.rfft(area, 2 * _CELLS) * seen)[..., :_CELLS]
+            rounding = _TRANSFORMED * np.linalg.norm(area, axis=-1) * size
+            effects[output] = np.maximum(convolved, 0.0) + rounding[:, None]
+        return effects
 
-    def _beyond(self, output: str, most: int, block_s: float) -> float:
-        """Bound the sum over the losses that are older than the grid: a falling function f of age.
+    @cached_property
+    def _beyond(self) -> Mapping[str, NDArray[np.float64]]:
+        """Bounds of the losses older than the grid, for every output, (loops, 2, 2).
 
-        The blocks that begin beyond it contribute at most m f(T) + m/block ∫_T^∞ f.
+        A falling function of age, sup over T/2 and its rate for each of both terms. The blocks that
+        begin beyond the grid contribute at most m f(T) + m/block ∫_T^∞ f.
         """
         g, forced = self._kernels
-        k, half_s = forced[output], self._until_s / 2
-        total = 0.0
-        for kernel, level in (
-            (g, g.tail_highest * k.integral()),
-            (k, k.tail_area * g.sup()),
-        ):
-            rate = kernel.tail_rate_per_s
-            first = level * math.exp(-rate * (half_s - float(kernel.edges_s[-1])))
-            total += most * first * (1 + 2 / (rate * block_s))
-        return total
+        half_s = self._until_s / 2
+        found = {}
+        for output, k in forced.items():
+            levels = (g, g.tail_highest * k.integral()), (k, k.tail_area * g.sup())
+            terms = [
+                np.broadcast_arrays(
+                    level * np.exp(-kernel.tail_rate_per_s * (half_s - kernel.edges_s[..., -1])),
+                    kernel.tail_rate_per_s,
+                )
+                for kernel, level in levels
+            ]
+            found[output] = np.moveaxis(np.array(terms), -1, 0)
+        return found
 
 
 def _over_bins(cells: Vector, per_bin: float, bins: int) -> Vector:
@@ -194,8 +233,36 @@ class BoundMethod(Enum):
     DRIFTING = "by its value d ago, and by what has driven it since"
 
 
+class LoopConstants(NamedTuple):
+    """The constants of several loops but δ, (loops,) each: see ``Constants`` in ``terms``."""
+
+    missing_events: Counts
+    delta: Vector
+    overshoot: Vector
+    input_error: Vector
+    start_error: Vector
+    state: Vector
+    state_weighted: Vector
+    mismatch: Vector
+    loop_gain: Vector
+    estimation_error: Vector
+    received_input_error: Vector
+    exists: NDArray[np.bool_]
+    """Where there is a certificate; of the others only ``loop_gain`` is of use."""
+
+    def of_loop(self, loop: int, rate_per_s: float, inter_event_s: float | None) -> Constants:
+        """Return the constants of one loop."""
+        own = {name: values[loop].item() for name, values in self._asdict().items()}
+        del own["exists"]
+        return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **own)
+
+
 class ErrorInequalities:
-    """The inequalities of one part, and their solution for an assumed spacing of events."""
+    """The inequalities of one part, and their solution for assumed spacings of events.
+
+    The part is that of one loop, or of several (:meth:`PlantGains.together`), with the same
+    trigger and conditions; spacings and solutions are those of each loop.
+    """
 
     def __init__(self, part: Part, conditions: NetworkConditions, earlier_error: float) -> None:
         self._error, self._plant, self._bound, self._estimation = error, plant, bound, _ = part
@@ -203,7 +270,7 @@ class ErrorInequalities:
         self._lost: LossAccumulation | None = None
         self._remainder = error.hold_remainder(conditions.hold_s)
         self._start_error, start = plant.start_up(conditions.start_s)
-        self._beyond = max(self._start_error, earlier_error)
+        self._beyond = np.maximum(self._start_error, earlier_error)
         self._states = {
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
@@ -224,143 +291,145 @@ class ErrorInequalities:
             return [*BoundMethod]
         return [BoundMethod.MISSING]
 
-    def constants(self, spacing_s: float, method: BoundMethod) -> Constants:
-        """Return all constants but δ, given inter-event times of at least ``spacing_s``.
+    def constants(self, spacing_s: Vector, method: BoundMethod) -> LoopConstants:
+        """Return all constants but δ, given inter-event times of at least ``spacing_s``, (loops,).
 
-        Raises:
-            NoCertificateError: the loop gain is not below 1.
+        A loop without a certificate has a loop gain that is not below 1, and perhaps infinite.
         """
-        events = self._missing(spacing_s)
+        conditions, error = self._conditions, self._error
+        events = np.full(len(spacing_s), conditions.dropouts)
+        is_spaced = spacing_s > 0
+        if conditions.delay_s > 0:  # without a spacing, any number of updates may be in flight
+            events[is_spaced] += np.ceil(conditions.delay_s / spacing_s[is_spaced]).astype(np.int64)
         if method is BoundMethod.DRIFTING:
-            return self._constants(self._drifting(spacing_s), events, spacing_s)
-        error = self._error
-        bound = _ErrorBound(
-            {output: error.now(output) for output in error.outputs},
-            {output: self._missing_gain(output, events, spacing_s) for output in error.outputs},
-            self._missing_gain(Output.GAIN, events - self._conditions.dropouts, spacing_s),
-        )
-        return self._constants(bound, events, spacing_s)
+            bound = self._drifting(spacing_s)
+        else:
+            gains = {C: self._missing_gain(C, events, spacing_s) for C in error.outputs}
+            in_flight = self._missing_gain(Output.GAIN, events - conditions.dropouts, spacing_s)
+            bound = _ErrorBound({C: error.now(C) for C in error.outputs}, gains, in_flight)
+        signals = self._signals(bound, self._from_errors(bound, spacing_s))
+        loop_gain, solved = self._solved(signals)
+        if conditions.delay_s > 0:
+            loop_gain = np.where(is_spaced, loop_gain, np.inf)
+        sensor_error = solved[..., 1] + solved[..., 2]
+        states = signals.free + _applied(signals.states, solved)
+        state = dict(zip(self._states, np.moveaxis(states, -1, 0), strict=True))
 
-    def _drifting(self, spacing_s: float) -> "_ErrorBound":
+        def of_error(output: Output) -> Vector:
+            return _product(signals.errors[output], solved)
+
+        found = (
+            (of_error(Output.WEIGHTED) + solved[..., 2]) / self.unit,
+            sensor_error / self.unit,
+            of_error(Output.GAIN) + solved[..., 0],
+            self._start_error,
+            state[Output.STATE],
+            state[Output.WEIGHTED],
+            state[Output.MISMATCH],
+            loop_gain,
+            solved[..., 2],
+            error.now(Output.GAIN) * solved[..., 1] + solved[..., 0],
+            np.isfinite(solved).all(axis=-1) & (is_spaced | (conditions.delay_s == 0)),
+        )
+        columns = (np.broadcast_to(values, events.shape) for values in found)
+        return LoopConstants(events, *columns)
+
+    def _drifting(self, spacing_s: Vector) -> "_ErrorBound":
         """Return the bound of e_c by its value d ago, and by what has driven it since.
 
         d ago, e_c consisted of e_s and of the errors of events that are lost.
         """
         error, dropouts, kernels = self._error, self._conditions.dropouts, self._error.kernels
         return _ErrorBound(
-            {output: kernel.sup() for output, kernel in kernels.items()},
+            {output: float(kernel.sup()) for output, kernel in kernels.items()},
             {output: error.missing(output, dropouts, spacing_s) for output in kernels},
-            0.0,
+            np.zeros(()),
             self._drift,
         )
 
     @cached_property
-    def _drift(self) -> Mapping[Output, tuple[float, float, float]]:
+    def _drift(self) -> Mapping[Output, tuple[Vector, Vector, Vector]]:
         growths = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
         return {output: growth.totals for output, growth in growths.items()}
-
-    def _constants(self, bound: "_ErrorBound", events: int, spacing_s: float) -> Constants:
-        from_errors = self._from_errors(bound, spacing_s)
-        signals = self._signals(bound, from_errors)
-        loop_gain, solved = self._solved(signals)
-        sensor_error = float(solved[1] + solved[2])
-        state = dict(zip(self._states, signals.free + signals.states @ solved, strict=True))
-        return Constants(
-            self._error.alpha_per_s,
-            events,
-            float(signals.errors[Output.WEIGHTED] @ solved + solved[2]) / self.unit,
-            sensor_error / self.unit,
-            float(signals.errors[Output.GAIN] @ solved + solved[0]),
-            self._start_error,
-            float(state[Output.STATE]),
-            float(state[Output.WEIGHTED]),
-            float(state[Output.MISMATCH]),
-            None,
-            loop_gain,
-            float(solved[2]),
-            float(self._error.now(Output.GAIN) * solved[1] + solved[0]),
-        )
 
     @property
     def unit(self) -> float:
         """The unit of Δ and β̃/β."""
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
-    def _signals(self, bound: "_ErrorBound", from_errors: Mapping[str, float]) -> "_Signals":
+    def _signals(self, bound: "_ErrorBound", from_errors: Mapping[str, Vector]) -> "_Signals":
         """Return how all outputs depend on (q, β̃, η, π, sup‖R_E x‖, 1).
 
         An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
         """
-        free = np.array([state.free for state in self._states.values()])
         still = (0.0, 0.0, 0.0)
-        by_input = np.array(bound.drift.get(Output.GAIN, still))
+        by_input = bound.drift.get(Output.GAIN, still)
         present = bound.present[Output.GAIN]
         states = [
-            (gain, from_errors[name], from_errors[name] - gain * present, *(gain * by_input))
+            _columns(
+                gain, from_errors[name], from_errors[name] - gain * present,
+                *(gain * driven for driven in by_input),
+            )
             for name, (_, gain) in self._states.items()
-        ]
+        ]  # fmt: skip
         errors = {
-            output: np.array([0.0, now + gone, gone, *bound.drift.get(output, still)])
+            output: _columns(0.0, now + gone, gone, *bound.drift.get(output, still))
             for (output, now), gone in zip(
                 bound.present.items(), bound.missing.values(), strict=True
             )
         }
-        return _Signals(list(self._states), free, np.array(states), errors)
+        free = _columns(*(state.free for state in self._states.values()))
+        return _Signals(list(self._states), free, _rows(*states), errors)
 
-    def _solved(self, signals: "_Signals") -> tuple[float, Vector]:
-        """Return the loop gain and the bounds of the signals.
+    def _solved(self, signals: "_Signals") -> tuple[Vector, Matrix]:
+        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
 
-        Raises:
-            NoCertificateError: the loop gain is not below 1.
+        The bounds are infinite where the loop gain is not below 1.
         """
-        free, errors = signals.free, signals.errors
-        hold_s = self._conditions.hold_s
+        errors, hold_s, beyond = signals.errors, self._conditions.hold_s, self._beyond
         held: dict[str, float] = {
             Output.GAIN_RATE: hold_s,
             Output.GAIN_CURVATURE: hold_s**2 / 2,
             Output.WEIGHTED: self._remainder,
         }
-        beyond = self._beyond
         held_input, _, estimated, *_ = np.eye(_SIGNALS)
         input_error = errors[Output.GAIN] + held_input
 
-        through = signals.row(held)
+        through, free = signals.through(held)
         from_errors = sum(gain * errors[Output(output)] for output, gain in held.items())
-        of_age = (through @ signals.states + from_errors, float(through @ free))
+        of_age = (through + from_errors, free)
         estimation = self._estimation
-        through = signals.row(estimation.shares)
+        through, free = signals.through(estimation.shares)
         of_estimate = (
-            through @ signals.states + estimation.from_input * input_error,
-            estimation.fixed + float(through @ free) + estimation.from_input * beyond,
+            through + estimation.from_input * input_error,
+            estimation.fixed + free + estimation.from_input * beyond,
         )
-        through = signals.row({Output.MISMATCH: 1.0})
-        of_mismatch = (through @ signals.states, float(through @ free))
+        of_mismatch = signals.through({Output.MISMATCH: 1.0})
         others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
 
         def solved(growing: ErrorGrowth) -> Solution:
-            through = signals.row(growing.shares)
-            F = through @ signals.states + growing.input_error * input_error
-            F += growing.estimation * estimated
-            fixed = growing.fixed + through @ free + growing.input_error * beyond
-            rows = (of_age, (F, fixed), of_estimate, *others)
-            return solve_inequalities(*map(np.array, zip(*rows, strict=True)))
+            through, free = signals.through(growing.shares)
+            F = through + np.asarray(growing.input_error)[..., None] * input_error
+            F = F + np.asarray(growing.estimation)[..., None] * estimated
+            fixed = growing.fixed + free + growing.input_error * beyond
+            each = (of_age, (F, fixed), of_estimate, *others)
+            rows = _rows(*(row for row, _ in each))
+            return solve_inequalities(rows, np.broadcast_to(
+                _columns(*(right for _, right in each)), rows.shape[:-1]
+            ))  # fmt: skip
 
         # Of each bound one growth applies, and all bounds hold.
-        solutions = [_largest([solved(growth) for growth in growths]) for growths in self._growths]
-        gain = min(solution.loop_gain for solution in solutions)
-        bounds = [solution.bound for solution in solutions if solution.bound is not None]
-        if not bounds:
-            raise NoCertificateError(
-                f"the loop gain of the errors is {gain:.3g}, not below 1", gain
-            )
-        return gain, np.min(bounds, axis=0)
+        each = [[solved(growth) for growth in growths] for growths in self._growths]
+        gains = [np.max([one.loop_gain for one in solutions], axis=0) for solutions in each]
+        bounds = [np.max([one.bound for one in solutions], axis=0) for solutions in each]
+        return np.min(gains, axis=0), np.min(bounds, axis=0)
 
-    def _missing_gain(self, output: Output, events: int, spacing_s: float) -> float:
+    def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):
             return self._error.missing(output, events, spacing_s)
         return self._error.missing_until(output, events, self._bound.due_s)
 
-    def _from_errors(self, bound: "_ErrorBound", spacing_s: float) -> Mapping[str, float]:
+    def _from_errors(self, bound: "_ErrorBound", spacing_s: Vector) -> Mapping[str, Vector]:
         """Return Γ_C for every output, from D_K and from the losses in windows.
 
         The second is computed only where it can be smaller: where all lost updates together have
@@ -374,50 +443,55 @@ class ErrorInequalities:
         windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
         lasting = density * self._error.kernels[Output.GAIN].integral()
-        if not lasting < (share - present) * spacing_s:
+        which = np.flatnonzero(lasting < (share - present) * spacing_s).tolist()
+        if not which:
             return sizes
         for output, (_, gain) in self._states.items():
-            together = gain * present + self._lost.total(output, spacing_s, windows)
-            sizes[output] = min(sizes[output], together)
+            alone = np.full(len(spacing_s), np.inf)
+            for loop in which:
+                alone[loop] = self._lost.total(output, float(spacing_s[loop]), windows, loop)
+            sizes[output] = np.minimum(sizes[output], gain * present + alone)
         return sizes
 
-    def inter_event_s(self, constants: Constants, method: BoundMethod) -> float:
-        """Return the time that ‖e_s‖_W needs to the next event, given the constants until then."""
+    def inter_event_s(
+        self,
+        constants: LoopConstants,
+        drifts: NDArray[np.bool_],
+        searched: NDArray[np.bool_],
+    ) -> Vector:
+        """Return the times that ‖e_s‖_W needs to the next event, given the constants until then.
+
+        Args:
+            constants: of all loops.
+            drifts: where the method is ``DRIFTING``, (loops,).
+            searched: the loops whose times are needed, (loops,); the others are of no use.
+        """
         # The part of D_K that is the e_s of now.
-        own = 0.0 if method is BoundMethod.DRIFTING else self._error.now(Output.GAIN)
+        own = np.where(drifts, 0.0, self._error.now(Output.GAIN))
         sensor_error = constants.overshoot * self.unit - constants.estimation_error
         others = constants.input_error - own * sensor_error
-        estimation = constants.estimation_error
+        estimation = np.where(searched, constants.estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
-        passages_s = [
-            first_passage_s(
-                self._plant,
-                bound.reached - estimation,
-                constants.mismatch,
-                max(others, self._beyond),
-                own,
-                estimation,
+        times_s = [
+            np.minimum(
+                first_passage_s(
+                    self._plant,
+                    np.where(searched, bound.reached - estimation, 0.0),
+                    np.where(searched, constants.mismatch, 0.0),
+                    np.where(searched, np.maximum(others, self._beyond), 0.0),
+                    own,
+                    estimation,
+                ),
+                bound.ago_s or math.inf,
             )
             for bound in self._bound.every
             if bound.reached is not None
         ]
-        limits_s = [
-            bound.ago_s or math.inf for bound in self._bound.every if bound.reached is not None
-        ]
-        found_s = max(map(min, passages_s, limits_s))
-        found_s = max(min(found_s, self._bound.due_s), self._bound.apart_s)
-        grid_s = self._conditions.spacing_s
-        return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
-
-    def _missing(self, spacing_s: float) -> int:
-        dropouts, delay_s = self._conditions.dropouts, self._conditions.delay_s
-        if delay_s == 0:
-            return dropouts
-        if spacing_s == 0:
-            raise NoCertificateError(
-                "events may be arbitrarily close, so that any number may be in flight"
-            )
-        return dropouts + math.ceil(delay_s / spacing_s)
+        found_s = np.max(times_s, axis=0)
+        found_s = np.maximum(np.minimum(found_s, self._bound.due_s), self._bound.apart_s)
+        if (grid_s := self._conditions.spacing_s) == 0:
+            return np.asarray(found_s)
+        return np.asarray(grid_s * np.maximum(np.ceil(found_s / grid_s - 1e-9), 1.0))
 
 
 class _ErrorBound(NamedTuple):
@@ -425,11 +499,11 @@ class _ErrorBound(NamedTuple):
 
     present: Mapping[Output, float]
     """The gain of e_s, now or where the drift begins."""
-    missing: Mapping[Output, float]
+    missing: Mapping[Output, Vector]
     """The gain of the events that are missing then."""
-    in_flight: float
+    in_flight: Vector
     """The part of missing_K that is not lost."""
-    drift: Mapping[Output, tuple[float, float, float]] = MappingProxyType({})
+    drift: Mapping[Output, tuple[Vector, Vector, Vector]] = MappingProxyType({})
     """The gains of what has driven e_c since then; none without a delay."""
 
 
@@ -441,19 +515,35 @@ class _Signals(NamedTuple):
 
     names: list[str]
     free: Vector
-    """(k,) the constant part of sup‖C x‖."""
+    """(…, k) the constant part of sup‖C x‖."""
     states: Matrix
-    """(k, 6)"""
+    """(…, k, 6)"""
     errors: Mapping[Output, Vector]
-    """(6,) of sup‖C e_c‖."""
+    """(…, 6) of sup‖C e_c‖."""
 
-    def row(self, gains: Mapping[str, float]) -> Vector:
-        """Return gains of the outputs, by name, as an array (k,)."""
-        return np.array([gains.get(name, 0.0) for name in self.names])
+    def through(self, gains: Mapping[str, Vector | float]) -> tuple[Vector, Vector]:
+        """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""
+        row = _columns(*(gains.get(name, 0.0) for name in self.names))
+        return np.asarray((row[..., None, :] @ self.states)[..., 0, :]), _product(row, self.free)
 
 
-def _largest(solutions: Sequence[Solution]) -> Solution:
-    """Return the larger of several solutions; no bound if one has none."""
-    bounds = [solution.bound for solution in solutions if solution.bound is not None]
-    gain = max(solution.loop_gain for solution in solutions)
-    return Solution(gain, np.max(bounds, axis=0) if len(bounds) == len(solutions) else None)
+def _product(row: Vector, column: Vector) -> Vector:
+    """Return the scalar products of vectors, (…, k)."""
+    return np.asarray((row[..., None, :] @ column[..., None])[..., 0, 0])
+
+
+def _columns(*values: Vector | float) -> Matrix:
+    """Return values of loops, (…), side by side, (…, k)."""
+    found = np.empty((*np.broadcast(*values).shape, len(values)))
+    for place, value in enumerate(values):
+        found[..., place] = value
+    return found
+
+
+def _rows(*values: Vector) -> Matrix:
+    """Return vectors of loops, (…, j), one below the other, (…, k, j)."""
+    *lead, size = np.broadcast(*values).shape
+    found = np.empty((*lead, len(values), size))
+    for place, value in enumerate(values):
+        found[..., place, :] = value
+    return found

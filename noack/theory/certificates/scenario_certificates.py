@@ -6,8 +6,8 @@ searches for the largest sampling period, delay and age of inputs for which a ce
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -20,13 +20,13 @@ from noack.settings.section import Rows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, PlantGains, error_gains
-from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError
+from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, Part
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates.assumptions import below, certificate_assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import BOX, OWN_PLANT, kept_probability
 from noack.theory.certificates.disturbed import DisturbedCertificate, PlantAt, choose_rate
-from noack.theory.certificates.solution import solve
+from noack.theory.certificates.solution import Problem, Search, completed_alone, sharpened
 
 MOST_S = 10.0
 """No larger times are tried."""
@@ -154,10 +154,14 @@ class CertificateScope:
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """Return the certificate under some conditions; a void certificate has the reason."""
+        return completed_alone(self.search(conditions))
+
+    def search(self, conditions: NetworkConditions) -> Search[ScenarioCertificate]:
+        """Search for the certificate under some conditions, perhaps together with others."""
         trigger, void = self._trigger, None
         phases: Sequence[tuple[Constants | None, ...]] = [(None, None, None)]
         try:
-            phases = self._constants(conditions)
+            phases = yield from self._constants(conditions)
         except (NotDecayingError, NoCertificateError) as error:
             void = str(error)
 
@@ -187,15 +191,18 @@ class CertificateScope:
         """Return the loop gain of a certificate; at least 1, perhaps infinite, if there is none."""
         # Whether inputs of an earlier run are covered depends on the constants.
         try:
-            constants = self._constants(conditions, longest=self._start_error > 0)
+            search = self._constants(conditions, longest=self._start_error > 0)
+            constants = completed_alone(search)
         except NoCertificateError as error:
             return max(error.loop_gain, 1.0)
         except NotDecayingError:
             return math.inf
         return max(phase.loop_gain for phase in constants[0] if phase is not None)
 
-    def _constants(self, conditions: NetworkConditions, *, longest: bool = True) -> list[Phases]:
-        """Return the constants of each bound of the run; all of them hold.
+    def _constants(
+        self, conditions: NetworkConditions, *, longest: bool = True
+    ) -> Search[list[Phases]]:
+        """Search for the constants of each bound of the run; all of them hold.
 
         ``longest``: search for the tightest bounds and the longest δ; otherwise any suffice.
 
@@ -204,32 +211,33 @@ class CertificateScope:
             NotDecayingError: a mode of the loop decays too slowly.
         """
         try:
-            with np.errstate(all="ignore"):
-                if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
-                    return [(*self._phases(conditions, longest=longest), None)]
-                pairs = self._disturbed_phases(conditions, longest=longest)
-                return [(first, None, rest) for first, rest in pairs]
+            if self._resolved.coverage.is_undisturbed and not self._trigger.is_constant:
+                first, late = yield from self._phases(conditions, longest=longest)
+                return [(first, late, None)]
+            pairs = yield from self._disturbed_phases(conditions, longest=longest)
+            return [(first, None, rest) for first, rest in pairs]
         except (OverflowError, np.linalg.LinAlgError):
             raise NoCertificateError(_TOO_LARGE) from None
 
     def _phases(
         self, conditions: NetworkConditions, *, longest: bool
-    ) -> tuple[Constants, Constants | None]:
-        """Return the constants, and those after the threshold has reached its floor, if any."""
+    ) -> Search[tuple[Constants, Constants | None]]:
+        """Search for the constants, and those after the threshold has reached its floor, if any."""
         trigger, late = self._trigger, None
         conditions = trigger.tested(conditions)
-        first = self._first_phase(conditions, longest=longest)
+        first = yield from self._first_phase(conditions, longest=longest)
         if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
             late = _at_floor(first, trigger.floor / trigger.beta)
         return self._checked(first, late)
 
     def _disturbed_phases(
         self, conditions: NetworkConditions, *, longest: bool
-    ) -> list[tuple[Constants, Constants | None]]:
-        """Return the constants, and those that are added to them under persistent disturbances."""
+    ) -> Search[list[tuple[Constants, Constants | None]]]:
+        """Search for the constants, and those to be added under persistent disturbances."""
         alpha = self._trigger.alpha_per_s
         decays = not self._held and below(alpha, min(self._decay.values()))
-        pairs = self._disturbed.constants(conditions, decays=decays, longest=longest)
+        search = self._disturbed.constants(conditions, decays=decays, longest=longest)
+        pairs = yield from search
         return [self._checked(*pair) for pair in pairs]
 
     @cached_property
@@ -257,43 +265,45 @@ class CertificateScope:
                 raise NoCertificateError(_TOO_LARGE)
         return first, other
 
-    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Constants:
+    def _first_phase(self, conditions: NetworkConditions, *, longest: bool) -> Search[Constants]:
         trigger, decay = self._trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         if trigger.is_homogeneous:
             if not longest:
                 with contextlib.suppress(NoCertificateError):
-                    return self._solve(conditions, 0.0, 0.0, None, longest=False)
-            return self._fastest(conditions, decay)
+                    return (yield from self._solve(conditions, 0.0, 0.0, None, longest=False))
+            return (yield from self._fastest(conditions, decay))
         if not self._held and below(alpha, decay) and floor < beta:
             try:
-                return self._solve(conditions, alpha, beta, beta, longest=longest)
+                return (yield from self._solve(conditions, alpha, beta, beta, longest=longest))
             except NotDecayingError:
                 if floor > 0:
                     raise
-                return self._slower(conditions, alpha)
+                return (yield from self._slower(conditions, alpha))
         # Certify a slower decay or none; the smallest event level is then the floor, if any.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = max(beta, floor)
-        return self._solve(conditions, slower, level, floor or None, longest=longest)
+        return (yield from self._solve(conditions, slower, level, floor or None, longest=longest))
 
-    def _fastest(self, conditions: NetworkConditions, decay: float) -> Constants:
-        """Return bounds for a threshold that is a share of the state: any rate may be certified.
+    def _fastest(self, conditions: NetworkConditions, decay: float) -> Search[Constants]:
+        """Search for bounds for a threshold that is a share of the state, at any rate.
 
         Raises:
             NoCertificateError: there are no bounds, not even without decay.
         """
+
+        def at_rate(rate_per_s: float) -> Search[tuple[Constants]]:
+            return ((yield from self._solve(conditions, rate_per_s, 0.0, None)),)
+
         # Inputs of an earlier run are bounded without a rate.
         if not self._held and 0 < decay < math.inf and self._start_error == 0.0:
             with contextlib.suppress(NotDecayingError, NoCertificateError):
-                return choose_rate(
-                    lambda rate: (self._solve(conditions, rate, 0.0, None),),
-                    decay, self._loop.x0,
-                )[0]  # fmt: skip
-        return self._solve(conditions, 0.0, 0.0, None)
+                (constants,) = yield from choose_rate(at_rate, decay, self._loop.x0)
+                return constants
+        return (yield from self._solve(conditions, 0.0, 0.0, None))
 
-    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Constants:
-        """Return bounds that decay more slowly than the threshold, for a box too large for α.
+    def _slower(self, conditions: NetworkConditions, alpha_per_s: float) -> Search[Constants]:
+        """Search for bounds that decay more slowly than the threshold, for a box too large for α.
 
         Raises:
             NotDecayingError: there are no such bounds.
@@ -301,7 +311,7 @@ class CertificateScope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                return self._solve(conditions, rate, self._trigger.beta, None)
+                return (yield from self._solve(conditions, rate, self._trigger.beta, None))
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _solve(
@@ -312,39 +322,33 @@ class CertificateScope:
         reached: float | None,
         *,
         longest: bool = True,
-    ) -> Constants:
+    ) -> Search[Constants]:
         if alpha_per_s not in self._plants:
             error = error_gains(self._loop, alpha_per_s)
             plant = self._plant_at(error, self._loop.x0[:, None], alpha_per_s)
             plant = replace(plant, further_outputs=self._trigger.outputs)
-            self._plants[alpha_per_s] = _first_equal(_EqualPlant(plant)).at_start(plant.start)
+            self._plants[alpha_per_s] = _first_equal(_KnownPlant(plant.identity, plant))
         plant = self._plants[alpha_per_s]
         # Inputs of an earlier run are covered by their norm only.
         earlier = self._start_error
-        bound = self._trigger.bound(conditions, level, reached)
-        return solve(
-            plant.error, plant, conditions, bound, earlier,
-            structured=earlier == 0.0, longest=longest,
-        )  # fmt: skip
+        part = Part(plant.error, plant, self._trigger.bound(conditions, level, reached))
+        return (yield from sharpened(
+            Problem((part,), conditions, earlier, structured=earlier == 0.0, longest=longest)
+        ))  # fmt: skip
 
 
-class _EqualPlant:
-    """A plant that equals others from another x(0)."""
+@dataclass(frozen=True)
+class _KnownPlant:
+    """A plant, which equals others of its identity."""
 
-    def __init__(self, plant: PlantGains) -> None:
-        self.plant = plant
-
-    def __hash__(self) -> int:
-        return hash(self.plant.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _EqualPlant) and self.plant.key == other.plant.key
+    identity: Hashable
+    plant: PlantGains = field(compare=False)
 
 
 @lru_cache(maxsize=16)
-def _first_equal(one: _EqualPlant) -> PlantGains:
+def _first_equal(known: _KnownPlant) -> PlantGains:
     """Return the first of several equal plants, whose gains the others use."""
-    return one.plant
+    return known.plant
 
 
 def _at_floor(first: Constants, share: float) -> Constants:

@@ -18,12 +18,14 @@ with all enclosures.
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Generator, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
@@ -49,7 +51,7 @@ from noack.theory.certificates.delivery_flow import (
     error_after,
     errors_after_losses,
 )
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
+from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities, LoopConstants
 
 _SETTLED = 1e-3
 _SHARPER = 0.99
@@ -70,6 +72,100 @@ _ILL_CONDITIONED = 1e8
 _LEAST_SHARE = 1e-6
 
 
+class Problem(NamedTuple):
+    """The inequalities of a loop, whose constants are sought.
+
+    All inequalities are linear in functions of time, for given events. So they may be divided into
+    parts: what decays is one part, what persists another one. All parts bound e_c by the same
+    method, since the sum of solutions of different inequalities bounds nothing. The threshold is at
+    least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
+    """
+
+    parts: tuple[Part, ...]
+    conditions: NetworkConditions
+    earlier_error: float = 0.0
+    """Bound of sup‖p‖ of the first part while the plant still applies inputs of an earlier run."""
+    structured: bool = True
+    """Whether p = u − Kx consists at every time of the errors of the events and of the age of the
+    input. Otherwise it is only known that its norm is at most π."""
+    longest: bool = True
+    """Whether the longest δ is sought; otherwise only if there is no certificate without it."""
+
+    @property
+    def likeness(self) -> Hashable:
+        """What problems must have in common to be solved together; None if this one is alone."""
+        plants = [part.plant.likeness for part in self.parts]
+        if None in plants:
+            return None
+        terms = [(part.bound, part.estimation) for part in self.parts]
+        return repr((*self[1:], *terms)), *plants
+
+
+Found = TypeVar("Found")
+Search = Generator[Problem, list[Constants], Found]
+"""A search for a certificate: it yields problems, and receives the constants of their parts.
+
+An error of a problem is raised where it was yielded.
+"""
+_TOGETHER = 256
+"""So many problems of one state are solved together: the memory grows with the squared states."""
+_UNSOLVED = (NotDecayingError, np.linalg.LinAlgError, OverflowError)
+
+
+def completed(searches: Sequence[Search[Found]]) -> list[Found]:
+    """Return the results of searches; their like problems are solved together.
+
+    Raises:
+        NoCertificateError, NotDecayingError: a search does not handle this error of its problem.
+    """
+    results: dict[int, Found] = {}
+    answers: dict[int, list[Constants] | Exception | None] = dict.fromkeys(range(len(searches)))
+    with np.errstate(all="ignore"):
+        while answers:
+            open_problems: dict[int, Problem] = {}
+            for number, answer in answers.items():
+                search = searches[number]
+                try:
+                    if isinstance(answer, Exception):
+                        open_problems[number] = search.throw(answer)
+                    else:  # the first value is None
+                        open_problems[number] = search.send(cast("list[Constants]", answer))
+                except StopIteration as end:
+                    results[number] = end.value
+            answers = dict(zip(open_problems, _answers([*open_problems.values()]), strict=True))
+    return [results[number] for number in range(len(searches))]
+
+
+def completed_alone(search: Search[Found]) -> Found:
+    """Return the result of one search; see :func:`completed`."""
+    (found,) = completed([search])
+    return found
+
+
+def _answers(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
+    """Return the constants of each problem, or its error."""
+    alike = defaultdict[Hashable, list[int]](list)
+    for place, problem in enumerate(problems):
+        likeness = problem.likeness if len(problems) > 1 else None
+        alike[("alone", place) if likeness is None else likeness].append(place)
+    groups: list[list[int]] = []
+    for places in alike.values():
+        states = len(problems[places[0]].parts[0].error.H)
+        width = max(_TOGETHER // states**2, 1)
+        groups += (places[first : first + width] for first in range(0, len(places), width))
+    answers: dict[int, list[Constants] | Exception] = {}
+    for places in groups:
+        try:
+            found = _solved([problems[place] for place in places])
+            answers.update(zip(places, found, strict=True))
+        except _UNSOLVED as error:
+            if len(places) == 1:
+                answers[places[0]] = error
+            else:  # of one of them
+                answers.update((place, _answers([problems[place]])[0]) for place in places)
+    return [answers[place] for place in range(len(problems))]
+
+
 def solve(
     error: ErrorGains,
     plant: PlantGains,
@@ -81,23 +177,27 @@ def solve(
     structured: bool = True,
     longest: bool = True,
 ) -> Constants:
-    """Return the constants that are certified for all times.
-
-    ``structured``: at every time, p = u − Kx consists of the errors of the events and of the age of
-    the input. Otherwise it is only known that its norm is at most π.
-
-    ``earlier_error``: bound of sup‖p‖ while the plant still applies inputs of an earlier run.
-    ``longest``: search for the longest δ; otherwise only if there is no certificate without it.
+    """Return the constants of one part that are certified for all times; see :class:`Problem`.
 
     Raises:
         NoCertificateError: the loop gain is not below 1.
         NotDecayingError: a mode of the loop decays more slowly than the threshold.
     """
     part = Part(error, plant, bound, estimation)
-    (constants,) = solve_parts(
-        [part], conditions, earlier_error, structured=structured, longest=longest
+    return completed_alone(
+        sharpened(Problem((part,), conditions, earlier_error, structured, longest))
     )
-    if longest and structured and earlier_error == 0.0 and _is_reset_flow(part, conditions):
+
+
+def sharpened(problem: Problem) -> Search[Constants]:
+    """Search for the constants of a problem of one part, sharpened where that is possible.
+
+    Raises: as :func:`solve`.
+    """
+    (constants,) = yield problem
+    (part,), conditions, *_ = problem
+    is_plain = problem.structured and problem.earlier_error == 0.0
+    if problem.longest and is_plain and _is_reset_flow(part, conditions):
         with contextlib.suppress(np.linalg.LinAlgError, NotDecayingError):
             return _sharpened(constants, part, conditions)
     return constants
@@ -150,88 +250,123 @@ def _sharpened(constants: Constants, part: Part, conditions: NetworkConditions) 
             return constants
 
 
-def solve_parts(
-    parts: Sequence[Part],
-    conditions: NetworkConditions,
-    earlier_error: float = 0.0,
-    *,
-    structured: bool = True,
-    longest: bool = True,
-) -> list[Constants]:
-    """Return the constants of several parts, whose bounds hold when they are added.
-
-    All inequalities are linear in functions of time, for given events. So they may be
-    divided: what decays is one part, what persists another one. All parts bound e_c in the same
-    method, since the sum of solutions of different inequalities bounds nothing. The threshold is at
-    least the sum of the parts' ``reached``, so the next event needs one part that reaches its own.
-    The ``earlier_error`` is that of the first part.
-
-    Raises: as :func:`solve`.
-    """
-    first, *others = parts
-    steps = [ErrorInequalities(first, conditions, earlier_error)]
-    steps += [ErrorInequalities(part, conditions, 0.0) for part in others]
-    if structured and parts[0].plant.is_one_plant:
-        for step in steps:
-            step.use_windows()
-
-    def constants(spacing_s: float, inter_event_s: float | None) -> list[Constants]:
-        constants_of_parts, _ = _smallest(steps, spacing_s)
-        return [
-            part_constants._replace(inter_event_s=inter_event_s)
-            for part_constants in constants_of_parts
-        ]
-
-    apart_s = max(part.bound.apart_s for part in parts)
-    least_s = max(conditions.spacing_s, apart_s)
-    if any(all(bound.reached is None for bound in part.bound.every) for part in parts):
-        return constants(least_s, apart_s or None)
-    void = None
-    if not longest:
-        try:
-            return constants(least_s, least_s or None)
-        except NoCertificateError as error:
-            void = error
-    spacing_s = LONGEST_S
-    for _ in range(_ATTEMPTS):
-        if spacing_s <= least_s:
-            break
-        found_s = math.inf
-        try:
-            constants_of_parts, method = _smallest(steps, spacing_s)
-        except NoCertificateError:
-            break
-        for step, part_constants in zip(reversed(steps), reversed(constants_of_parts), strict=True):
-            found_s = min(found_s, step.inter_event_s(part_constants, method))
-            if found_s <= least_s:  # often by what persists, which is the last part
-                break
-        if found_s >= spacing_s:
-            return constants(spacing_s, spacing_s)
-        # Iterate from above to the largest spacing that is consistent with itself.
-        spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-    if void is not None:
-        raise void
-    return constants(least_s, least_s or None)
-
-
-def _smallest(
-    steps: Sequence[ErrorInequalities], spacing_s: float
-) -> tuple[list[Constants], BoundMethod]:
-    """Return the constants of all parts with the method for e_c that bounds x tighter.
+def _solved(problems: Sequence[Problem]) -> list[list[Constants] | Exception]:
+    """Return the constants of like problems, or the reason why there is no certificate.
 
     Raises:
-        NoCertificateError: no loop gain is below 1.
+        NotDecayingError: a mode of a loop decays more slowly than the threshold.
     """
-    candidates, void = list[tuple[list[Constants], BoundMethod]](), NoCertificateError("")
+    first = problems[0]
+    conditions, count = first.conditions, len(problems)
+    steps = []
+    for place, part in enumerate(first.parts):
+        plants = [problem.parts[place].plant for problem in problems]
+        together = part._replace(plant=part.plant.together(plants))
+        earlier = first.earlier_error if place == 0 else 0.0
+        steps.append(ErrorInequalities(together, conditions, earlier))
+        if first.structured and first.parts[0].plant.is_one_plant:
+            steps[-1].use_windows()
+    apart_s = max(part.bound.apart_s for part in first.parts)
+    least_s = max(conditions.spacing_s, apart_s)
+    is_separated = all(
+        any(bound.reached is not None for bound in part.bound.every) for part in first.parts
+    )
+    searched = np.full(count, is_separated)
+    if is_separated and not first.longest:
+        searched = ~_smallest(steps, np.full(count, least_s)).exists
+    spacing_s = _longest_s(steps, searched, least_s)
+    smallest = _smallest(steps, spacing_s)
+    rates = [part.error.alpha_per_s for part in first.parts]
+    shortest_s = least_s if is_separated else apart_s
+    between_s = np.where(spacing_s > least_s, spacing_s, shortest_s).tolist()
+    return [smallest.of_loop(loop, rates, between_s[loop] or None) for loop in range(count)]
+
+
+def _longest_s(
+    steps: Sequence[ErrorInequalities], searched: NDArray[np.bool_], least_s: float
+) -> Vector:
+    """Return the largest spacing of each loop that is consistent with itself, or ``least_s``.
+
+    It is ``least_s`` where the loop is not searched, or has no certificate.
+    """
+    spacing_s = np.where(searched, LONGEST_S, least_s)
+    is_open = searched & (spacing_s > least_s)
+    for _ in range(_ATTEMPTS):
+        if not is_open.any():
+            break
+        smallest = _smallest(steps, spacing_s)
+        is_open, found_s = is_open & smallest.exists, np.full(len(spacing_s), np.inf)
+        spacing_s = np.where(smallest.exists, spacing_s, least_s)
+        for step, constants in zip(reversed(steps), reversed(smallest.parts), strict=True):
+            # Often what persists, which is the last part, gives a time of at most the least one.
+            which = is_open & (found_s > least_s)
+            passed_s = step.inter_event_s(constants, smallest.drifts, which)
+            found_s = np.where(which, np.minimum(found_s, passed_s), found_s)
+        is_open &= found_s < spacing_s
+        # Iterate from above.
+        shorter = found_s < (1 - _SETTLED) * spacing_s
+        next_s = np.where(shorter, found_s, (1 - _SETTLED) * found_s)
+        spacing_s = np.where(is_open, np.maximum(next_s, least_s), spacing_s)
+        is_open &= spacing_s > least_s
+    return np.where(is_open, least_s, spacing_s)
+
+
+class _Smallest(NamedTuple):
+    """The constants of all parts of several loops, with the method that bounds x tighter."""
+
+    parts: Sequence[LoopConstants]
+    drifts: NDArray[np.bool_]
+    """Where the method is ``DRIFTING``, (loops,)."""
+    exists: NDArray[np.bool_]
+    loop_gain: Vector
+    """(loops,) that of the first part that has no certificate; the smaller one of both methods."""
+    is_spaced: NDArray[np.bool_]
+    """Where events are assumed to be apart, (loops,)."""
+
+    def of_loop(
+        self, loop: int, rates_per_s: Sequence[float], inter_event_s: float | None
+    ) -> list[Constants] | Exception:
+        """Return the constants of the parts of a loop, or the reason for having none."""
+        if self.exists[loop]:
+            return [
+                part.of_loop(loop, rate, inter_event_s)
+                for part, rate in zip(self.parts, rates_per_s, strict=True)
+            ]
+        gain = float(self.loop_gain[loop])
+        if math.isinf(gain) and not self.is_spaced[loop]:
+            return NoCertificateError(
+                "events may be arbitrarily close, so that any number may be in flight"
+            )
+        return NoCertificateError(f"the loop gain of the errors is {gain:.3g}, not below 1", gain)
+
+
+def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smallest:
+    """Return the constants of all parts with the method for e_c that bounds x tighter."""
+    none = np.full(len(spacing_s), np.inf)
+    best = _Smallest((), none > 0, none < 0, none, spacing_s > 0)
+    sizes = none
     for method in BoundMethod:
-        if all(method in step.methods for step in steps):
-            try:
-                candidates.append(([step.constants(spacing_s, method) for step in steps], method))
-            except NoCertificateError as error:
-                void = min(void, error, key=lambda error: error.loop_gain)
-    if not candidates:
-        raise void
-    return min(candidates, key=lambda candidate: sum(constants.state for constants in candidate[0]))
+        if not all(method in step.methods for step in steps):
+            continue
+        parts = [step.constants(spacing_s, method) for step in steps]
+        exists, gain = np.ones(len(none), dtype=bool), none
+        for part in parts:
+            gain = np.where(exists & ~part.exists, part.loop_gain, gain)
+            exists = exists & part.exists
+        size = np.where(exists, sum(part.state for part in parts), np.inf)
+        better = exists & ((size < sizes) | ~best.exists)
+        drifts = np.where(better, method is BoundMethod.DRIFTING, best.drifts)
+        if best.parts:
+            parts = [
+                LoopConstants(*(np.where(better, *pair) for pair in zip(one, other, strict=True)))
+                for one, other in zip(parts, best.parts, strict=True)
+            ]
+        sizes = np.where(better, size, sizes)
+        gain = np.where(better | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
+        best = best._replace(
+            parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain
+        )
+    return best
 
 
 class SharpenedBounds(NamedTuple):

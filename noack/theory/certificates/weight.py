@@ -174,9 +174,8 @@ def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
     """Return the norms of a kernel from its values at nodes; beyond the last node it is 0."""
     norms = spectral_norms(values)
     ends = np.maximum(norms[:-1], norms[1:])
-    return KernelBounds(
-        nodes_s, ends, np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, 0.0, 0.0, 0.0
-    )
+    areas, none = np.diff(nodes_s) * (norms[:-1] + norms[1:]) / 2, np.zeros(())
+    return KernelBounds(nodes_s, ends, areas, none, none, none)
 
 
 def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:

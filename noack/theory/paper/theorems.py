@@ -85,7 +85,7 @@ def _theorem_2(
     loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float, alpha_bar_per_s: float
 ) -> Theorem2:
     closed, identity = loop.A + loop.B @ loop.K, np.eye(loop.n)
-    c = response(closed + alpha_bar_per_s * identity, identity).through(identity).sup()
+    c = float(response(closed + alpha_bar_per_s * identity, identity).through(identity).sup())
     x0, BK = float(np.linalg.norm(loop.x0)), float(np.linalg.norm(loop.B @ loop.K, 2))
     a_hat, gap = float(np.linalg.norm(loop.H, 2)), alpha_bar_per_s - alpha_per_s
     a_tilde = float(np.linalg.norm(closed - loop.H, 2))
@@ -148,5 +148,5 @@ def theorem_1(H: Matrix, alpha_per_s: float, longest_s: Sequence[float]) -> floa
         if not math.isfinite(reach_s) or alpha_per_s * reach_s > 700:
             return math.inf
         followed = response_until(H, identity, reach_s, _CELLS)
-        delta += math.exp(alpha_per_s * reach_s) * followed.through(identity).sup_on_grid()
+        delta += math.exp(alpha_per_s * reach_s) * float(followed.through(identity).sup_on_grid())
     return delta

@@ -167,15 +167,16 @@ class _Inequalities:
             a += growth.input_error.integral_on_grid() * self._input
         rows = np.array([a, pi])
         solution = solve_inequalities(rows[:, :2], rows[:, 2])
-        if solution.bound is None:
-            return {"loop_gain": solution.loop_gain}
+        loop_gain = float(solution.loop_gain)
+        if not np.isfinite(solution.bound).all():
+            return {"loop_gain": loop_gain}
         values = np.append(solution.bound, 1.0)
         return {
             "sensor_error": float(values[0]),
             "controller_error": float(controller[Output.WEIGHTED] @ values),
             "input_error": float(values[1]),
             "state": float(self._state(Output.STATE) @ values),
-            "loop_gain": solution.loop_gain,
+            "loop_gain": loop_gain,
         }
 
     @property
@@ -194,7 +195,7 @@ class _Inequalities:
         recent = [0.0, 0.0]
         if delay_s > 0:
             recent = [
-                drive_response.through(C).integral_on_grid()
+                float(drive_response.through(C).integral_on_grid())
                 for drive_response in self._recent_drive
             ]
             bound = bound + error.kernels[output].sup(delay_s) * _A

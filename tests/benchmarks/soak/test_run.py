@@ -8,8 +8,7 @@ import pytest
 
 import benchmarks.soak
 from benchmarks.soak.__main__ import main
-from benchmarks.soak.result import Result
-from benchmarks.soak.run import PICTURE_FILE, RESULT_FILE, ended_badly, soak
+from benchmarks.soak.run import PICTURE_FILE, RESULT_FILE, Result, ended_badly, soak
 from cosim.record.run_record import load_record
 
 FOLDER = Path(benchmarks.soak.__file__).parent

@@ -39,7 +39,7 @@ class RecordingPlane(FakePlane):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reports: list[dict[str, Any]] = []
+        self.reports: list[RunProgress] = []
 
     def publish(self, *parts: str, content: Any) -> None:
         assert parts == ("progress",)
@@ -81,7 +81,7 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
     line = f"void (assumption violated) from 0.506 s on: {cause}"
-    void = [report["warnings"] for report in plane.reports]
+    void = [report.warnings for report in plane.reports]
     assert void == [[]] * 5 + [[line]] * 6
     notices = recorded(recorder, tmp_path).notices
     assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
@@ -104,7 +104,7 @@ def test_a_violation_found_at_the_end_is_reported(run: RunRecord, tmp_path: Path
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     (notice,) = recorded(recorder, tmp_path).notices
-    assert [report["warnings"] for report in plane.reports] == [[notice["text"]]]
+    assert [report.warnings for report in plane.reports] == [[notice["text"]]]
 
 
 def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_missing_rows_are_reported_as_an_unknown_result(run: RunRecord, tmp_path
     recorder.poll()
     recorder.show()
     recorder.show()
-    assert plane.reports[-1]["warnings"] == [
+    assert plane.reports[-1].warnings == [
         "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
     assert recorded(recorder, tmp_path).notices == []
@@ -132,9 +132,9 @@ def test_the_terminal_reports_each_cause_once(run: RunRecord, terminal: bool) ->
     console = Console(file=shown, force_terminal=terminal, width=200)
     with progress_line(console, run.scenario) as watcher:
         watcher.started(Path())
-        watcher.progress(report)
+        watcher.progress(RunProgress(**report))
         for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
-            watcher.progress(report | {"warnings": void})
+            watcher.progress(RunProgress(**report, warnings=void))
     assert shown.getvalue().count("one [cause]") == 1
     assert shown.getvalue().count("another") == 1
 
@@ -157,7 +157,7 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
 def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> None:
     plane = RecordingPlane()
     recorder = recorder_of(run.scenario, tmp_path, plane)
-    recorder.end_monitoring()
+    recorder.is_stopping = True
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     recorder.show()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.legend import Legend
 
 import noack
 
@@ -102,7 +103,8 @@ def test_the_figure_has_what_is_known() -> None:
     assert len(explorer.figure("V").axes) == 4
     state, errors, *_ = explorer.figure().axes
     assert state.get_title(loc="left") == "Y_g: plant and both models"
-    named = [text.get_text() for text in errors.get_legend().get_texts()]
+    legends = [one for one in errors.get_children() if isinstance(one, Legend)]
+    named = [text.get_text() for one in legends for text in one.get_texts()]
     assert named == ["threshold", "‖e_s‖", "‖e_c‖", "certified bound"]
     assert not state.collections
     assert explorer.ensemble is not None

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.program import patient_stream
+from cosim.cli.program import pipe_safe_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]
@@ -116,7 +116,7 @@ def test_a_line_is_written_at_once(line_buffering: bool, write_through: bool) ->
         open(writing, "wb") as raw,  # noqa: PTH123
         io.TextIOWrapper(raw, line_buffering=line_buffering, write_through=write_through) as stream,
     ):
-        patient = patient_stream(stream)
+        patient = pipe_safe_stream(stream)
         patient.write("waiting\n")
         assert os.read(reading, 100) == b"waiting\n"
     os.close(reading)

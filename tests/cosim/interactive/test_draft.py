@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from cosim.interactive.controls import chosen, controls_of, dragged
 from cosim.interactive.draft import (
+    Draft,
     DraftError,
     Mistake,
     draft_of_query,
     known_scenarios,
     open_draft,
     value_text,
-    with_value,
 )
 from cosim.shipped_files import shipped_names
 from noack.config import toml_file
@@ -67,10 +67,13 @@ def test_the_model_error_multiplies_both_boxes() -> None:
 @pytest.mark.parametrize("key", ["a", "t.a", "t.inner.b", "t.new", "new.table.c"])
 def test_any_value_at_any_place_is_read_back(key: str, value: object) -> None:
     text = 'a = 1 # "a" = 2\n[t]\na = "x # y" # a = 3\ninner = { a = [1, 2], b = 2.5 }\n'
+    draft = Draft("a", Path(), text, text)
     content = toml_file.parsed(text, "")
-    changed = toml_file.parsed(with_value(text, content, key, value), "")
     put(content, key, value, key)
-    assert changed == content
+    changed = draft.with_value(key, value)
+    assert toml_file.parsed(changed.text, "") == changed.content == content
+    assert (changed.text.count("#") >= 2) or "new" in key
+    assert toml_file.parsed(changed.without(key).text, "") == changed.without(key).content
 
 
 def test_values_are_written_on_one_line() -> None:

@@ -127,11 +127,11 @@ def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str)
     setting = ensemble.setting_of(resolve(scenario))
     population = ensemble.box_of(scenario).population(7, range(draws))
     _, events = ensemble.run_with_events(setting, population)
-    z = ensemble.trajectories(setting, population, events, t_s)
+    states = ensemble.trajectories(setting, population, events, t_s)
     for draw in range(draws):
         exact = run_continuous(drawn_scenario(scenario, 7, draw)).at(t_s)
-        wanted = np.hstack([exact.x, exact.e_s, exact.e_c])
-        np.testing.assert_allclose(z[draw], wanted, rtol=1e-6, atol=1e-8)
+        wanted = np.stack(exact[1:], axis=1)
+        np.testing.assert_allclose(states[draw], wanted, rtol=1e-6, atol=1e-8)
 
 
 def test_the_bands_contain_the_draws() -> None:

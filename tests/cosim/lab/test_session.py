@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 from cosim.interactive.draft import open_draft
+from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN
 from cosim.interactive.scenario_guarantee import VOID, Margin
 from cosim.lab import lab_services as under_test
 from cosim.lab.lab_services import PageCalls, Session
@@ -37,11 +38,15 @@ def session_of(name: str, drawn: list[Session], calls: object = None, **settings
     async def on_drawn() -> None:
         drawn.append(found)
         # What is there is not waited for any more.
-        assert found.guarantee is None or "certificate" not in found.pending
+        assert not known(found, CERTIFICATE) or "certificate" not in found.pending
         await asyncio.sleep(0)  # as the browser's answer is awaited
 
     found = Session(cast("PageCalls", calls or Inline()), draft, on_drawn)
     return found
+
+
+def known(session: Session, name: str) -> bool:
+    return session.results is not None and name in session.results.known
 
 
 async def settled(found: Session) -> None:
@@ -53,11 +58,10 @@ async def settled(found: Session) -> None:
 def test_certificate_and_margin_follow_the_run(drawn: list[Session]) -> None:
     found = session_of("lane_following", drawn, horizon_s=2.0)
     asyncio.run(settled(found))
-    assert found.run is not None
-    assert found.guarantee is not None
-    assert found.margin is not None
+    assert found.results is not None
+    assert found.results.known == {RUN, CERTIFICATE, ENSEMBLE, MARGIN}
     assert len(drawn) == 4
-    assert found.warning == ""
+    assert found.results.warning == ""
 
 
 class Watched(Inline):
@@ -71,7 +75,7 @@ class Watched(Inline):
         assert self.session is not None
         while not self.session.pending.endswith("waiting for the processor"):
             await asyncio.sleep(0)
-        self.begun.append((self.session.pending, self.session.guarantee is not None))
+        self.begun.append((self.session.pending, known(self.session, CERTIFICATE)))
         return await super().compute(function, *arguments)
 
 
@@ -99,8 +103,8 @@ def test_of_many_changes_the_newest_is_drawn(drawn: list[Session]) -> None:
         await asyncio.gather(*map(found.change, drafts))
 
     asyncio.run(drag())
-    assert found.run is not None
-    assert found.run.scenario.trigger.beta == pytest.approx(0.8)
+    assert found.results is not None
+    assert found.results.run.scenario.trigger.beta == pytest.approx(0.8)
     assert len(drawn) <= 4
 
 
@@ -108,7 +112,7 @@ def test_mistakes_leave_no_run(drawn: list[Session]) -> None:
     found = session_of("lane_following", drawn)
     found.draft = found.draft.with_text(found.draft.text + "\nbeta = 1\n")
     asyncio.run(found.change(found.draft))
-    assert found.run is None
+    assert found.results is None
     assert found.mistakes
 
 
@@ -118,7 +122,7 @@ def test_a_loop_that_grows_is_explained(drawn: list[Session], tmp_path: Path) ->
         network__loss={"model": "worst_case"}, trigger={"policy": "periodic", "period_s": 0.1},
     )  # fmt: skip
     asyncio.run(settled(found))
-    assert found.guarantee is not None
-    assert found.guarantee.verdict == VOID
-    assert "it diverged at" in found.warning
-    assert found.guarantee.reason in found.warning
+    assert found.results is not None
+    assert found.results.certificate.verdict == VOID
+    assert "it diverged at" in found.results.warning
+    assert found.results.certificate.reason in found.results.warning

@@ -14,15 +14,16 @@ from noack.core.errors import CallerError
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 
 
-def requests_of(loops: int, *settings: str) -> ChangeRequests:
-    scenario = load(PATH, [f'loops=[{{ name = "p", count = {loops} }}]', *settings])
+def requests_of(loops: int | str, *settings: str) -> ChangeRequests:
+    entries = loops if isinstance(loops, str) else f'[{{ name = "p", count = {loops} }}]'
+    scenario = load(PATH, [f"loops={entries}", *settings])
     ticket = SimpleNamespace(scenario=scenario, run_dir="here")
     plane = SimpleNamespace(announce_change=lambda announcement: None)
     return ChangeRequests(cast("Any", ticket), cast("Any", plane))
 
 
 def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:
-    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None)
+    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None).fields()
 
 
 def answer(loops: int, settings: dict[str, Any]) -> dict[str, Any]:
@@ -35,6 +36,17 @@ def test_every_listed_parameter_can_be_changed(loops: int) -> None:
     assert {"trigger.beta", "network.mansd", "controller.setpoint"} <= listed.keys()
     for key, value in listed.items():
         assert answer(loops, {key: value})["from_s"] > 0
+
+
+def test_each_entry_of_the_loops_has_its_own_values() -> None:
+    requests = requests_of('[{ name = "p", count = 3 }, { name = "q", trigger = { beta = 0.07 } }]')
+    before = requested(requests, {})
+    assert before["loops"]["q"]["trigger.beta"] == 0.07
+    assert before["loops"]["p"] == before["runtime_parameters"]
+    assert before["changed_loops"] == ()
+    after = requested(requests, {"trigger.beta": 0.07})
+    assert after["changed_loops"] == ("p",)
+    assert after["loops"]["p"] == after["loops"]["q"]
 
 
 def test_other_settings_are_refused() -> None:
@@ -52,4 +64,4 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     assert requested(requests, {"network.loss": loss})["from_s"] > 0
     found = requested(requests, {})["runtime_parameters"]
     assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
-    assert [one["number"] for one in requests.announced] == [0, 1]
+    assert [one.number for one in requests.announced] == [0, 1]

@@ -37,7 +37,7 @@ def test_a_run_that_cannot_fit_is_refused(
 ) -> None:
     scenario = scenario_of(content, 1e7)
     with_free(monkeypatch, spool_bytes(resolve(scenario)) - 1)
-    with pytest.raises(MachineError, match=r"this run records \d+ \w+ .* are free on the disk"):
+    with pytest.raises(MachineError, match=r"this run records .* are free on the disk"):
         launch(scenario, tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
 

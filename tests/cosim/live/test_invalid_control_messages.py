@@ -49,7 +49,7 @@ def test_an_invalid_request_is_refused_and_the_others_join(
             plane.put(question, Query(f"noack/0/{question}/{role}", request))
             barrier.poll()
     assert barrier.epoch_ns is not None
-    assert plane.answers[-1]["addresses"].keys() == set(LOOP_ROLES)
+    assert plane.answers[-1].addresses.keys() == set(LOOP_ROLES)
 
 
 def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
@@ -58,7 +58,7 @@ def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
     scenario, plane = resolve(validate(content, "")), FakePlane()
     (tmp_path / SCENARIO_FILE).write_text(dumps(scenario))
     recorder = Recorder(scenario, tmp_path, plane)  # type: ignore[arg-type]
-    row = np.zeros(1, recorder._store.types[PLANT_STEP]).tobytes()
+    row = np.zeros(1, recorder.store.types[PLANT_STEP]).tobytes()
     header = b'{"first": 0, "rows": 1}'
     for junk in JUNK:
         plane.put("telemetry", Sample("t/plant/plant_step", junk, header))

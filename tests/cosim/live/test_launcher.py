@@ -8,7 +8,8 @@ from typing import Any, cast
 import pytest
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.launcher import Watcher, _Run, launch, overtime_s
+from cosim.live.launcher import _Run, launch, overtime_s
+from cosim.live.run_watcher import Watcher
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, ExitStatus, MachineError
@@ -263,7 +264,7 @@ def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
             for role in ROLES:
                 children.exit(role, 0)
 
-        def progress(self) -> dict[str, Any] | None:
+        def progress(self) -> Any:
             self.looks += 1
             return {"warnings": ["late"]} if self.looks == 2 else None
 

@@ -48,7 +48,7 @@ class Run:
         self.recorder.poll()
 
     def follow(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
-        self.recorder.abandon()
+        self.recorder.store.writer.close()
         self.begin(start, instance, present)
 
     def send(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
@@ -57,7 +57,7 @@ class Run:
         self.recorder.poll()
 
     def rows(self, table: str, count: int, generation: int = 0) -> None:
-        rows = np.zeros(count, self.recorder._store.types[table])
+        rows = np.zeros(count, self.recorder.store.types[table])
         rows["input"] = generation * GENERATION + np.arange(count)
         self.send(table, 0, rows.tobytes(), OWNER[table], generation)
 
@@ -88,7 +88,7 @@ class Run:
 def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
     found = Run(content, tmp_path)
     yield found
-    found.recorder.abandon()
+    found.recorder.store.writer.close()
 
 
 def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> None:

@@ -7,17 +7,23 @@ import time
 import urllib.error
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.live.launcher import Watcher, joint_watcher, later_watcher
 from cosim.live.run_metrics import RunMetrics
+from cosim.live.run_watcher import Watcher, joint_watcher, later_watcher
+from noack.runtime.control_messages import RunProgress
 from tests.netem.control.test_emulator_metrics import exposed, values_of
 from tests.noack.runtime.test_json_log import objects
 from tests.noack.runtime.test_metrics_server import read, slow_reader
+
+PROGRESS: dict[str, Any] = {
+    "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None, "live": None,
+}  # fmt: skip
 
 
 def test_metrics_follow_the_launchers_reports() -> None:
@@ -30,10 +36,7 @@ def test_metrics_follow_the_launchers_reports() -> None:
     watcher.started(Path("runs/a"))
     watcher.failed("plant died", 1.0, None)
     watcher.restarted("plant", 1.5)
-    watcher.progress({
-        "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None,
-        "live": None, "warnings": ["void"], "changes": [],
-    })  # fmt: skip
+    watcher.progress(RunProgress(**PROGRESS, warnings=["void"]))
     values = values_of(exposed(found))
     assert values["noack_run_info,lane_following,runs/a"] == 1
     assert values["noack_run_missing_processes"] == 2
@@ -48,15 +51,15 @@ def test_metrics_follow_the_launchers_reports() -> None:
 def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:
     seen: list[float] = []
 
-    def closed(report: dict[str, float]) -> None:
+    def closed(report: RunProgress) -> None:
         seen.append(-1)
         raise BrokenPipeError
 
     joint = joint_watcher([
-        Watcher(progress=closed), Watcher(progress=lambda report: seen.append(report["t_s"]))
+        Watcher(progress=closed), Watcher(progress=lambda report: seen.append(report.t_s))
     ])  # fmt: skip
-    joint.progress({"t_s": 1.0})
-    joint.progress({"t_s": 2.0})
+    joint.progress(RunProgress(**PROGRESS | {"t_s": 1.0}))
+    joint.progress(RunProgress(**PROGRESS | {"t_s": 2.0}))
     assert seen == [-1, 1.0, 2.0]
 
 

@@ -5,13 +5,13 @@ import io
 import pytest
 
 from cosim.live import progress
-from cosim.live.progress import PatientConsole, runs_bar
+from cosim.live.progress import PipeSafeConsole, runs_bar
 
 
 def test_a_pipe_gets_a_line_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s, output = 100.0, io.StringIO()
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s)
-    with runs_bar(PatientConsole(file=output)) as update:
+    with runs_bar(PipeSafeConsole(file=output)) as update:
         update(0, 1200)
         for done in range(1, 9):  # a run every second and a half
             now_s += 1.5

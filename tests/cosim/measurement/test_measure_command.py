@@ -13,8 +13,7 @@ import noack
 from cosim.cli import app
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.measurement_outputs import trace_csv
-from cosim.measurement.measurement_page import measurement_figures
-from cosim.measurement.measurement_tables import measurement_tables
+from cosim.measurement.measurement_page import measurement_figures, measurement_tables
 from cosim.measurement.network_measurement import (
     Measurement,
     MeasurementOptions,

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live import finalize as concluding
-from cosim.output import figure_files, report_page
+from cosim.output import figure_files, report_page, signal_figures
 from cosim.output.figure_drawing import draw
-from cosim.output.figure_files import markup_of
+from cosim.output.figure_files import inline
 from cosim.output.figure_style import settings
 from cosim.output.report_page import Report, page, write_report
 from cosim.output.run_figures import BOUNDED, run_figures
@@ -287,7 +286,7 @@ def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:
         ("c", "inter_event", t_s, t_s, "printed"),
     ]
     found = {
-        name: [label for label, *_ in "abc" if label in labels_of(draw(describe()))]
+        name: [label for label in "abc" if label in describe().rows[-1].panels[0].labels]
         for name, describe in run_figures(record, envelopes).items()
     }
     assert {name: labels for name, labels in found.items() if labels} == dict(
@@ -295,17 +294,13 @@ def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:
     )
 
 
-def labels_of(figure: Figure) -> list[str]:
-    legends = [axes.get_legend() for axes in figure.axes]
-    return [text.get_text() for legend in legends if legend for text in legend.get_texts()]
-
-
 def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
-    figure = Figure(figsize=(2, 1))
-    figure.add_axes((0, 0, 1, 1))
-    assert not Page(markup_of(figure, "small", 'named "so"')).attributes("img")
+    figure = signal_figures.state_norm_figure(np.arange(3.0), np.ones(3)).captioned(
+        "", 'named "so"'
+    )
+    assert not Page(inline(figure)).attributes("img")
     monkeypatch.setattr(figure_files, "_HEAVY_CHARACTERS", 10)
-    (image,) = Page(markup_of(figure, "large", 'named "so"')).attributes("img")
+    (image,) = Page(inline(figure)).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")
 

@@ -6,66 +6,39 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
 from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, one_panel
-from cosim.output.figure_files import (
-    characters_of_paper_fonts,
-    file_content,
-    save_figures,
-)
+from cosim.output.figure_drawing import draw
+from cosim.output.figure_files import file_content, save_figures
 from cosim.output.figure_format import FigureFormat, figure_files
-from cosim.output.figure_style import settings
+from cosim.output.figure_style import figure_width
 from noack.core.errors import CallerError
 
 
-def saved(figure: Figure, path: Path) -> None:
-    path.write_bytes(file_content(figure, FigureFormat(path.suffix[1:])))
-
-
-def figure_of(title: str) -> Figure:
-    with settings():
-        figure = Figure(figsize=(4, 3))
-        axes = figure.subplots()
-        axes.set(title=title.replace("$", r"\$"), xlabel=r"norm $\|e_c\|$", yscale="log")
-        axes.plot(np.arange(1, 9), 10.0 ** -np.arange(1, 9))
-    return figure
-
-
-def test_texts_have_the_fonts_of_latex_only_while_a_figure_is_saved(tmp_path: Path) -> None:
-    figure = figure_of("title")
-    saved(figure, tmp_path / "before.svg")
-    before = dict(mpl.rcParams)
-    saved(figure, tmp_path / "a.pdf")
-    saved(figure, tmp_path / "after.svg")
-    assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
+def test_texts_of_a_pdf_have_the_fonts_of_latex() -> None:
+    """Computer Modern has other characters at the places of some, which are mathematics then."""
+    x = np.arange(1.0, 9.0)
+    line = Line(x=x, y=10.0**-x, colour=(0, 0, 0), label=r"norm $\|e_c\|$")
+    ticks = {1.0: "a_b", 2.0: "c|d"}
+    y = Axis(label=r"5 \$_", logarithmic=True)
+    panel = Panel(title="lane_following <$x_s$>", items=[line], x=Axis(ticks=ticks), y=y)
+    figure, before = one_panel("figure", panel, 2.0), dict(mpl.rcParams)
+    with figure_width(3.5, latex=True):
+        drawn = draw(figure)
+        drawn.draw_without_rendering()
     assert dict(mpl.rcParams) == before
-    assert {text.get_fontfamily()[0] for text in figure.findobj(Text)} == {"sans-serif"}
-    pdf = (tmp_path / "a.pdf").read_bytes()
-    assert b"Cmr10" in pdf
+    texts = {text.get_text() for text in drawn.findobj(Text)}
+    written = {r"a$\_$b", "c$|$d", r"5 \$$\_$", r"lane$\_$following $<$$x_s$$>$"}
+    assert written <= texts
+    pdf = file_content(figure, FigureFormat.PDF, 3.5)
+    for font in (b"Cmr10", b"Cmb10"):
+        assert font in pdf
     assert b"/Type3" not in pdf.replace(b" ", b"")  # refused by publishers
-
-
-def test_computer_modern_has_other_characters_at_the_place_of_some(tmp_path: Path) -> None:
-    figure = figure_of("lane_following <$x_s$>")
-    figure.axes[0].set_xticks([1.0, 2.0], ["a_b", "c|d"])
-    saved(figure, tmp_path / "before.svg")
-    with characters_of_paper_fonts(figure):
-        figure.draw_without_rendering()
-        texts = {text.get_text() for text in figure.findobj(Text)}
-        assert {r"a$\_$b", "c$|$d"} <= texts
-    saved(figure, tmp_path / "after.svg")
-    assert (tmp_path / "after.svg").read_bytes() == (tmp_path / "before.svg").read_bytes()
-    for text, written in (("a_b $x_c$ {1}", r"a$\_$b $x_c$ $\{$1$\}$"), (r"5 \$_", r"5 \$$\_$")):
-        figure.axes[0].set_title(text, loc="left")
-        with characters_of_paper_fonts(figure):
-            assert figure.axes[0].get_title("left") == written
-    saved(figure, tmp_path / "a.pdf")
-    assert b"Cmtt10" in (tmp_path / "a.pdf").read_bytes()
+    assert written.isdisjoint(text.get_text() for text in draw(figure).findobj(Text))
 
 
 def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:

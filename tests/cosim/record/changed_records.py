@@ -19,7 +19,7 @@ def copied(record: RunRecord) -> dict[str, Rows]:
 def changed(record: RunRecord, rows: Mapping[str, Rows] = NO_CHANGE, **others: Any) -> RunRecord:
     """The record with other rows of some tables, or another scenario, notices, reports or kind."""
     every = {table: rows.get(table, record[table]) for table in record.tables}
-    names = ("scenario", "notices", "reports", "kind", "number", "is_network")
+    names = ("scenario", "notices", "reports", "kind", "number", "roles")
     kept = {name: getattr(record, name) for name in names}
     return RunRecord(rows=every, **(kept | others))
 

@@ -16,8 +16,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.candidates import DesignLimits
-from cosim.studies.design.design_search import design
+from cosim.studies.design.design_search import DesignLimits, design
 from noack.config.resolution import resolve, steady_state
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, validate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.record.record_source import NetworkRows
+from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.config.parameter_changes import LATE
@@ -164,9 +164,10 @@ def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -
         rows[table]["input"][half] += GENERATION - first
     for missing in (0, 2):
         rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
-        found = NetworkRows(rows, phases_ns(scenario))
-        for own in map(found.of_loop, range(len(phases_ns(scenario)))):
-            inputs = np.sort(np.concatenate([one["input"] for one in own.values()]))
+        found = NetworkRows(RowsInMemory(rows), phases_ns(scenario))
+        for loop in range(len(phases_ns(scenario))):
+            batches = (one["input"] for table in rows for one in found.of_loop(table, loop))
+            inputs = np.sort(np.concatenate([*batches]))
             for generation in (0, 1):
                 numbers = inputs[inputs // GENERATION == generation] % GENERATION
                 assert numbers[0] == 0

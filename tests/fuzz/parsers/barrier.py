@@ -14,7 +14,9 @@ from tests.fuzz.tables import damaged
 
 PASS = _TICKET.admission_pass
 HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001], "admission_pass": PASS}
-PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None}
+PROGRESS = {
+    "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None, "live": None,
+}  # fmt: skip
 KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 
 
@@ -33,7 +35,7 @@ def one_input(data: bytes) -> None:
             case 1:
                 plane.put("progress", Sample("noack/0/progress", _bytes(choices, PROGRESS)))
                 progress = barrier.progress()
-                assert progress is None or progress.keys() >= PROGRESS.keys()
+                assert progress is None or progress.fields().keys() >= PROGRESS.keys()
             case 2 | 3:
                 query = Query(f"noack/0/admit/{role}", _bytes(choices, HELLO))
                 admissions.append(query)
@@ -49,7 +51,7 @@ def one_input(data: bytes) -> None:
             assert _is_over(asked[-1]), "a join request has no answer"
     assert all(query.answered == 1 for query in admissions), "an admission request has no answer"
     for answer in plane.answers:
-        for host, port in answer.get("addresses", {}).values():
+        for host, port in answer.fields().get("addresses", {}).values():
             assert isinstance(host, str)
             assert 0 < port <= 65_535
     barrier.stop("the end")

@@ -9,7 +9,6 @@ from unittest.mock import patch
 from cosim.live import coordinator
 from noack.config.parameter_changes import (
     ChangeSchedule,
-    ParameterChange,
     settings_bytes,
     settings_of,
 )
@@ -46,6 +45,8 @@ ANSWER = {
     "t_s": 0.5,
     "from_s": 0.7,
     "runtime_parameters": SETTINGS,
+    "loops": {"x": SETTINGS},
+    "changed_loops": ["x"],
 }
 RUN = {"name": "00", "run_dir": "runs/x", "session": None}
 KNOWN = Vocabulary(
@@ -62,9 +63,7 @@ def one_input(data: bytes) -> None:
             _announce(_bytes(choices, ANNOUNCED))
         case 2:
             with refusal("not a valid change reply"):
-                assert isinstance(
-                    parse_message(ChangeReply, _bytes(choices, ANSWER))["run_dir"], str
-                )
+                assert isinstance(parse_message(ChangeReply, _bytes(choices, ANSWER)).run_dir, str)
         case _:
             _find(_bytes(choices, RUN))
 
@@ -82,11 +81,9 @@ def _request(content: bytes) -> None:
     assert query.error is None or query.error.strip()
     for announced in plane.announced:
         one = parse_message(ChangeAnnouncement, json.dumps(announced))
-        ChangeSchedule(_TICKET.scenario).announce(
-            "t", ParameterChange(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
-        )
+        ChangeSchedule(_TICKET.scenario).announce("t", one.change, 0, 0, -1)
     try:
-        settings = parse_message(ChangeRequest, content).get("settings", {})
+        settings = parse_message(ChangeRequest, content).settings
     except PeerError:
         assert not plane.announced
     else:
@@ -98,10 +95,9 @@ def _announce(content: bytes) -> None:
     with refusal("not a valid change announcement"):
         one = parse_message(ChangeAnnouncement, content)
         schedule = ChangeSchedule(_TICKET.scenario)
-        change = ParameterChange(one["number"], one["t_ns"], one["settings"])
         with refusal(("the change", "a change"), lines=True):
-            schedule.announce("t", change, 0, 0, -1)
-            assert settings_of(settings_bytes(one["settings"])) == one["settings"]
+            schedule.announce("t", one.change, 0, 0, -1)
+            assert settings_of(settings_bytes(one.settings)) == one.settings
             return
         assert schedule.last is _TICKET.scenario
 

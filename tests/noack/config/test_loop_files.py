@@ -129,6 +129,7 @@ def test_what_the_loops_share_is_that_of_the_run(content: dict[str, Any], tmp_pa
         ("parts/none.toml", {}, "no such file, nor a shipped scenario; `noack scenarios` lists"),
         ("lane_folowing", {}, "nor a shipped scenario; did you mean lane_following?"),
         ("x" * 5000, {}, "no such file, nor a shipped scenario"),
+        ("", {}, 'scenario = "": no such file, nor a shipped scenario'),
         ("parts", {}, "cannot be read"),
         ("parts/other.toml", {"loops": [{"name": "c"}]},
          'loops.0.scenario = "parts/other.toml": that file has loops itself'),

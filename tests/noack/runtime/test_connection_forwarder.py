@@ -69,7 +69,7 @@ def connected(
 
 
 def handshake(plain: socket.socket, keys: TlsKeys, own: KeyPair | None) -> ssl.SSLSocket:
-    context = ssl.create_default_context(cadata=keys.authority)
+    context = ssl.create_default_context(cadata=keys.coordinator.certificate)
     if own is not None:
         with tempfile.TemporaryDirectory() as folder:
             (path := Path(folder) / "own.pem").write_text(own.private_key + own.certificate)

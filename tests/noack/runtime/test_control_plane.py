@@ -186,8 +186,8 @@ def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives
     threading.Thread(target=serve, daemon=True).start()
     with ControlPlane(ticket, "plant") as plant:
         received = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
-        assert received["epoch_ns"] == 7
-        assert received["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+        assert received.epoch_ns == 7
+        assert received.addresses == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
         # The message must not read ``noack plant: plant: no answer``.
         with pytest.raises(PeerError, match=r"^no answer to 'nothing'"):
             plant.request("nothing", {}, timeout_s=0.05)

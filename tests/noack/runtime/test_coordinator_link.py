@@ -34,7 +34,7 @@ def listening() -> Iterator[socket.socket]:
 
 def destination(endpoint: socket.socket, keys: TlsKeys = KEYS, key: bytes = KEY) -> Destination:
     host, port = endpoint.getsockname()
-    return Destination(host, port, keys.authority, *keys.joining, key.hex())
+    return Destination(host, port, keys.coordinator.certificate, *keys.joining, key.hex())
 
 
 def reason(to: Destination) -> str:

@@ -20,7 +20,7 @@ from noack.runtime.join_ticket import (
 from tests.fuzz.parsers.ticket import _TICKET
 
 REMOTE = RemoteAccess(
-    host="127.0.0.1", port=7000, authority="A", certificate="C", private_key="K",
+    host="127.0.0.1", port=7000, coordinator="A", certificate="C", private_key="K",
     valid_until="2030-01-01T00:00:00+00:00",
 )  # fmt: skip
 INVITED: Ticket = _TICKET.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})

@@ -130,7 +130,7 @@ def test_messages_are_handled_in_order_and_answered(
         assert (report["sent"], report["send_errors"]) == (len(sent), {})
         own = "{}:{}".format(*live.peer.getsockname())
         assert report["received_from"] == {own: len(given)}
-        assert report["lost_in_kernel"] == 0
+        assert report["kernel_drops"] == 0
         each: Any = report["loops"]
         assert [one["accepted"] for one in each] == [len(given) // loops] * loops
 

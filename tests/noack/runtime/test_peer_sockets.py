@@ -139,7 +139,7 @@ def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(content: dict[st
     assert rejected[SHED] > 5000
     assert sum(rejected.values()) == sent
     assert report["accepted"] == 10
-    assert report["lost_in_kernel"] == 0
+    assert report["kernel_drops"] == 0
     assert [line.text.split(":")[0] for line in live.rows.notices] == ["flood"]
 
 

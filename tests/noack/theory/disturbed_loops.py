@@ -17,6 +17,7 @@ from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerB
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import own_plant
+from noack.theory.certificates.solution import completed_alone
 from tests.oracles.lossy_loops import (
     RUNS,
     STEPS,
@@ -68,11 +69,11 @@ class DisturbedLoop:
         decaying, pushed = system.gains(), loop.pushed(plant)
         models = pushed.error
         estimation = EstimationBound(float(np.linalg.norm(np.abs(system.weight) @ loop.noise)))
-        first, rest = solve_two_parts(
+        first, rest = completed_alone(solve_two_parts(
             Part(decaying.error, decaying, TriggerBound(system.beta, None)),
             Part(models, pushed, TriggerBound(floor, None, unit=1.0), estimation),
             system.conditions,
-        )
+        ))  # fmt: skip
         return Sum(self.system, first, rest)
 
 

@@ -16,6 +16,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.disturbed import solve_two_parts
 from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.certificates.solution import completed_alone
 from tests.noack.theory.disturbed_loops import Sum, random_disturbed_loop, signals
 from tests.oracles.lossy_loops import RUNS, STEPS, Plants, System, networks, random_system, simulate
 
@@ -32,11 +33,11 @@ def box_certificate(system: System, columns: np.ndarray, half: float, floor: flo
     forcing = Forcing(columns, np.full(k, np.inf), np.zeros(m))
     first = plant(system.alpha, system.x0[:, None], None)
     rest = plant(0.0, np.zeros((len(system.A), 1)), forcing)
-    return Sum(system, *solve_two_parts(
+    return Sum(system, *completed_alone(solve_two_parts(
         Part(first.error, first, TriggerBound(system.beta, None)),
         Part(rest.error, rest, TriggerBound(floor, None, unit=1.0)),
         system.conditions,
-    ))  # fmt: skip
+    )))  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(4))

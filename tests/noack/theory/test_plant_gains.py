@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.bounds.gains import Output
+from noack.theory.bounds.gains import Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import first_passage_s
 from tests.oracles.lossy_loops import SEARCH, System, certified_or_skipped, systems
@@ -210,6 +210,11 @@ def test_the_constants_solve_the_inequalities(system: System) -> None:
     assert solves(by_events) or (conditions.delay_s > 0 and solves(by_drift))
 
 
+def passage_s(plant: PlantGains, *values: float) -> float:
+    """The first passage of one loop from 0."""
+    return float(first_passage_s(plant, *np.array([*values, 0.0])[:, None])[0])
+
+
 @settings(SOME)
 @given(systems(n=2), st.floats(0.01, 3.0), st.floats(0.0, 3.0), st.floats(0.0, 3.0))
 def test_the_first_passage_is_that_of_the_volterra_equation(
@@ -218,7 +223,7 @@ def test_the_first_passage_is_that_of_the_volterra_equation(
     """ρ(r) = ∫₀^r k_E(s) X + k_B(s) (π' + own ρ(r−s)) ds, marched in small steps, reaches β."""
     plant = system.gains()
     level = system.beta
-    found_s = first_passage_s(plant, level, mismatch, push, own)
+    found_s = passage_s(plant, level, mismatch, push, own)
     longest_s = 6 * slow_s(system.H + system.alpha * np.eye(len(system.H)))
     assume(found_s < longest_s)  # skipped where the push is almost 0
     G, W = system.H + system.alpha * np.eye(len(system.H)), system.weight
@@ -248,11 +253,11 @@ def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
         step_s=0.01, sample_steps=1, delay_steps=0, hold_steps=0, lag_steps=0,
     )  # fmt: skip
     plant = system.gains()
-    assert first_passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
+    assert passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
     found = system.certify(NetworkConditions(0))
     assert found.inter_event_s is not None
     assert found.inter_event_s >= 1e6
     # ρ = π'(1 − e^{−t}): never above π', and half of it at ln 2.
-    assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
-    assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
-    assert first_passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4
+    assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
+    assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
+    assert passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4

@@ -16,15 +16,20 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_continuous_lyapunov
 
 from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
+from noack.config.scenario import Scenario, loops_of
 from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import spectral_abscissa
 from noack.theory.bounds.gains import ErrorGains
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import OWN_PLANT, ideal_conditions
-from noack.theory.certificates.scenario_certificates import certify, certify_box
+from noack.theory.certificates.conditions import (
+    OWN_PLANT,
+    allowed_conditions,
+    ideal_conditions,
+)
+from noack.theory.certificates.scenario_certificates import box, certify, certify_box, own_plant
+from noack.theory.certificates.solution import completed
 from noack.theory.paper.theorems import theorem_2
 from tests.oracles.lossy_loops import (
     ROUNDING,
@@ -302,3 +307,44 @@ def test_a_threshold_without_an_inter_event_time_is_rejected_in_few_steps(
         assert certificate is not None
         assert (certificate.constants is None) == (certificate.void is not None)
     assert calls < 500
+
+
+@pytest.mark.parametrize(
+    ("name", "override"),
+    [
+        ("lane_following", "trigger.floor=0.001"),
+        ("tabuada_dynamic", "plant.initial_state_halfwidth=[0.2, 0.1]"),
+        ("lane_crosswind", "horizon_s=10"),
+    ],
+)
+def test_certificates_that_are_computed_together_are_those_of_each_loop(
+    name: str, override: str
+) -> None:
+    drawn = [override, 'loops=[{name="loop", count=3}]']
+    loops = loops_of(load(ROOT / f"scenarios/{name}.toml", drawn))
+    others = loops_of(load(ROOT / "scenarios/different_loops.toml"))
+    scopes = [
+        (scope, allowed_conditions(loop))
+        for loop in map(resolve, (*loops, *others))
+        for scope in (own_plant(loop), box(loop))
+        if scope is not None
+    ]
+    found = completed([scope.search(conditions) for scope, conditions in scopes])
+    assert any(one.constants is not None for one in found)
+    for together, (scope, conditions) in zip(found, scopes, strict=True):
+        assert_equal_to_rounding(together.to_json(), scope.certificate(conditions).to_json())
+
+
+def assert_equal_to_rounding(found: Any, expected: Any) -> None:
+    """Sums over grids that end at different times are rounded differently."""
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys()
+        for key, value in expected.items():
+            assert_equal_to_rounding(found[key], value)
+    elif isinstance(expected, list | tuple):
+        for one, other in zip(found, expected, strict=True):
+            assert_equal_to_rounding(one, other)
+    elif isinstance(expected, float):
+        assert found == pytest.approx(expected, rel=1e-12, abs=0.0)
+    else:
+        assert found == expected

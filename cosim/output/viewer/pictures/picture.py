@@ -61,8 +61,7 @@ class Frames(NamedTuple):
 
     def at(self, which: NDArray[np.bool_]) -> "Frames":
         """Return a subset."""
-        z = None if self.z is None else self.z[which]
-        return Frames(self.t_s[which], self.x[which], self.x_s[which], self.x_c[which], z)
+        return Frames(*(None if part is None else part[which] for part in self))  # type: ignore[arg-type]
 
     def of(self, who: str) -> Reals:
         """Return the state (k, n) of one of ``WHO``, in the loop's coordinates."""
@@ -71,14 +70,9 @@ class Frames(NamedTuple):
 
 def joined(batches: Sequence[Frames]) -> Frames:
     """Return successive batches of frames as one batch."""
+    t_s, x, x_s, x_c = map(np.concatenate, list(zip(*batches, strict=True))[:4])
     own = [frames.z for frames in batches if frames.z is not None]
-    return Frames(
-        np.concatenate([frames.t_s for frames in batches]),
-        np.concatenate([frames.x for frames in batches]),
-        np.concatenate([frames.x_s for frames in batches]),
-        np.concatenate([frames.x_c for frames in batches]),
-        np.concatenate(own) if own else None,
-    )
+    return Frames(t_s, x, x_s, x_c, np.concatenate(own) if own else None)
 
 
 class DrawnPlant(NamedTuple):

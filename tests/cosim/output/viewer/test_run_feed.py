@@ -35,6 +35,13 @@ from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops are not given up, and no lag is named, on a busy machine."""
+    for name in ("_NAMED_S", "_PATIENCE_S"):
+        monkeypatch.setattr(f"cosim.output.viewer.run_feed.{name}", np.inf)
+
+
 def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks, list[str]]:
     """Simulate loops, and pass their rows on as in a live run; read the recording."""
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]

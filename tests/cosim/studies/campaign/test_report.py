@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline
+from cosim.output.result_tables import ResultTable
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
@@ -28,7 +29,7 @@ from cosim.studies.campaign.campaign_figures import (
 )
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
-from cosim.studies.campaign.campaign_report import SummaryRow, tables_of, write_report, written
+from cosim.studies.campaign.campaign_report import split_table, write_report, written
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
@@ -264,19 +265,18 @@ def test_terminal_tables_print_names_literally_and_list_failed_runs(
 def test_the_tables_fit_narrow_terminals(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [
-        SummaryRow(
-            ["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (97.5 % of runs)"]
-        ),
-        SummaryRow(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
+        ["MB-ET", "0.1", "36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (97.5 % of runs)"],
+        ["ZOH-ET", "10", "549 ± 44", "0.0310 ± 0.0039", "never", "–"],
     ]
     console = Console(width=width, file=StringIO(), record=True)
-    for table in tables_of("all", ["policy", "β"], headings, rows, width):
+    whole = ResultTable("all", "all", ["policy", "β", *headings], rows)
+    for table in split_table(whole, 2, width):
         console.print(table)
     lines = console.export_text().splitlines()
     for label in ("MB-ET", "ZOH-ET"):
         found = [line for line in lines if line.strip().startswith(label)]
-        (row,) = [row for row in rows if row.labels[0] == label]
-        for cell in row.cells:
+        (row,) = [row for row in rows if row[0] == label]
+        for cell in row[2:]:
             assert sum(cell in line for line in found) == 1
     for heading in headings:
         assert all(any(word in line for line in lines) for word in heading.split())
@@ -286,9 +286,10 @@ def test_the_tables_fit_narrow_terminals(width: int) -> None:
 
 def test_a_long_axis_name_does_not_push_a_column_out() -> None:
     headings = ["cost", "cost of the worst loop", "share of loops that diverged"]
-    rows = [SummaryRow(["model_based", "30"], ["7.849e+11 ± 1.7e+10", "1.897e+12 ± 4.1e+10", "1"])]
+    rows = [["model_based", "30", "7.849e+11 ± 1.7e+10", "1.897e+12 ± 4.1e+10", "1"]]
     console = Console(width=80, file=StringIO(), record=True)
-    for table in tables_of("all", ["policy", "number of loops"], headings, rows, 80):
+    whole = ResultTable("all", "all", ["policy", "number of loops", *headings], rows)
+    for table in split_table(whole, 2, 80):
         console.print(table)
     text = console.export_text()
     assert all(word in text for heading in headings for word in heading.split())

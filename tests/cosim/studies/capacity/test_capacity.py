@@ -18,14 +18,14 @@ from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.sampled_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_criteria import (
+from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
+from cosim.studies.capacity.capacity_plan import kinds_of, policies_of, smallest_mixture
+from cosim.studies.capacity.capacity_result import (
     PolicyCapacity,
     capacities,
     capacity_of,
     carried,
 )
-from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
-from cosim.studies.capacity.capacity_plan import kinds_of, policies_of, smallest_mixture
 from noack.config.scenario_file import load
 from noack.protocol.record_tables import Fate
 

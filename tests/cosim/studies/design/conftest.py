@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.studies.design.candidates import DesignLimits, DesignResult
-from cosim.studies.design.design_search import design
+from cosim.studies.design.design_search import DesignLimits, DesignResult, design
 from cosim.studies.design.design_space import families_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load

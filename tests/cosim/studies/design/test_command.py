@@ -12,8 +12,8 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.studies.design.candidates import DesignResult
 from cosim.studies.design.design_page import page
+from cosim.studies.design.design_search import DesignResult
 from cosim.studies.design.design_space import lqr_gain
 from noack.config.scenario_file import load
 

@@ -10,8 +10,7 @@ import pytest
 from cosim.simulation.batch import run_batch, setting_of
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidates import DesignLimits, certificate_of
-from cosim.studies.design.design_search import design
+from cosim.studies.design.design_search import DesignLimits, certificate_of, design
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.config.named_models import lane_following
 from noack.config.resolution import resolve

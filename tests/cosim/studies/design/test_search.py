@@ -9,7 +9,7 @@ import pytest
 
 from cosim.simulation.batch import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidates import (
+from cosim.studies.design.design_search import (
     DesignLimits,
     DesignResult,
     measure,

@@ -8,28 +8,51 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.studies.paper.paper_campaign import BASE, load_campaign, resolved_draw
-from cosim.studies.paper.paper_evidence import Numbers, evidence
-from cosim.studies.paper.paper_results import read_results, results_of
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.paper.paper_evidence import (
+    Numbers,
+    evidence,
+    open_loop_eigenvalues,
+    resolved_draw,
+)
+from cosim.studies.paper.paper_page import _rounded
 from noack.config.named_models import lane_following
 from noack.config.resolution import loop_of
 
-COMMITTED = Path(__file__).parents[4] / "docs" / "figures" / "paper.json"
+ROOT = Path(__file__).parents[4]
+CAMPAIGN = ROOT / "campaigns" / "paper.toml"
+COMMITTED = json.loads((ROOT / "docs" / "figures" / "paper.json").read_bytes())
 DIGITS = 2e-4
 """Five digits are stored; rounding, which a loop may amplify by 1e5, is far below."""
-SCENARIO = load_campaign()[1][BASE]
+SCENARIO = grid(load(CAMPAIGN), CAMPAIGN)[0].scenario
 
 
 @pytest.fixture(scope="module")
 def computed() -> Numbers:
-    return evidence(SCENARIO, read_results(json.loads(COMMITTED.read_bytes())).representative)
+    return evidence(SCENARIO, COMMITTED["summary"]["draws"], COMMITTED["representative"])
 
 
 def test_the_committed_evidence_is_what_the_code_computes(computed: Numbers) -> None:
-    assert_close(
-        results_of([], computed).evidence,
-        read_results(json.loads(COMMITTED.read_bytes())).evidence,
-    )
+    assert_close(_rounded(computed), COMMITTED["evidence"])
+
+
+def test_no_draw_exceeds_its_certified_bounds(computed: Numbers) -> None:
+    found = computed["certificates"]
+    assert max(found["error"], found["state"]) < 1 < found["inter_event"]
+    assert 1 < found["representative"]["error"] <= found["representative"]["delta"]
+    # eq:tau is smallest at t_i = 0 or as t_i → ∞.
+    assert found["theorem_2"]["inter_event_s"][0] <= found["theorem_2"]["first_s"][0]
+
+
+def test_the_double_eigenvalue_at_zero_is_recognised_in_every_plant() -> None:
+    for draw in range(20):
+        loop = loop_of(resolved_draw(SCENARIO, draw, "model"))
+        assert (open_loop_eigenvalues(loop.A) == 0).sum() == 2
+        assert np.linalg.matrix_rank(loop.A) == 3
+        lateral = np.sort(np.linalg.eigvals(loop.A[:2, :2]).real)
+        others = np.sort(open_loop_eigenvalues(loop.A).real)[[0, -1]]
+        np.testing.assert_allclose(others, [lateral[0], max(lateral[1], 0.0)], atol=1e-9)
 
 
 def assert_close(first: Any, second: Any) -> None:

@@ -17,14 +17,14 @@ import numpy as np
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.core.linear_systems import Matrix
-from noack.theory.bounds.terms import Constants, NetworkConditions, TriggerBound
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates import scenario_certificates, solution
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.inequalities import BoundMethod, ErrorInequalities
+from noack.theory.certificates.inequalities import ErrorInequalities
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
-from noack.trigger.error_promise import ErrorPromise
+from noack.trigger.comparison_bound import ComparisonBound
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
 from tests.noack.theory.certificate_kinds.shares import Case, shares_of
@@ -316,16 +316,16 @@ Conditions = NetworkConditions
 @dataclass(frozen=True)
 class NoShares(TriggerBounds):
     @property
-    def promise(self) -> ErrorPromise | None:  # type: ignore[override]
-        found = super().promise
+    def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
+        found = super().comparison
         return None if found is None else found._replace(shares=())
 
 
 @dataclass(frozen=True)
 class NoCrossTerm(TriggerBounds):
     @property
-    def promise(self) -> ErrorPromise | None:  # type: ignore[override]
-        found = super().promise
+    def comparison(self) -> ComparisonBound | None:  # type: ignore[override]
+        found = super().comparison
         return None if found is None else found._replace(shares=found.shares[:1])
 
 
@@ -378,11 +378,10 @@ def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertifi
 
     true = solution._smallest
 
-    def smallest(
-        steps: Sequence[ErrorInequalities], spacing_s: float
-    ) -> tuple[list[Constants], BoundMethod]:
+    def smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> solution._Smallest:
         found = [true([step], spacing_s) for step in steps]
-        return [constants for (constants,), _ in found], found[0][1]
+        exists = np.all([one.exists for one in found], axis=0)
+        return found[0]._replace(parts=[one.parts[0] for one in found], exists=exists)
 
     with patch.object(solution, "_smallest", smallest):
         return certify(resolved, conditions)

@@ -1,4 +1,4 @@
-"""What a trigger rule promises about the sensor's error, whatever the plant and the network do.
+"""The bound that a trigger rule sets to the sensor's error, whatever the plant and the network do.
 
 Where the comparison was made and did not transmit, zᵀQz ≤ f², with z = (x, e_s), Q = PᵀP − NᵀN and
 the threshold f. Let Q₂₂ = FᵀF be its part on e_s, J = Q₂₂⁻¹Q₂₁, and CᵀC ⪰ Q₁₂J − Q₁₁. Then
@@ -21,7 +21,7 @@ _RELATIVE, _RESIDUAL = 1e-7, 1e-13
 """Least eigenvalue of a positive definite Q₂₂, and the error of a computed Q, as shares of ‖Q‖."""
 
 
-class ErrorPromise(NamedTuple):
+class ComparisonBound(NamedTuple):
     """‖W e_s‖ ≤ ``size`` · f + Σ ‖S x‖, after an event, or a comparison with f that was none."""
 
     size: float
@@ -32,8 +32,8 @@ class ErrorPromise(NamedTuple):
     """
 
 
-def error_promise(rule: TriggerRule, weight: Matrix) -> ErrorPromise | None:
-    """Return what the comparison of a rule promises in the norm ‖W e_s‖; None if it is nothing.
+def comparison_bound(rule: TriggerRule, weight: Matrix) -> ComparisonBound | None:
+    """Return the bound of ‖W e_s‖ that the comparison of a rule sets; None if it sets none.
 
     ``weight`` is W, (n, n). A rule that integrates compares ∫‖P z‖ instead of ‖P z‖.
     """
@@ -46,16 +46,16 @@ def error_promise(rule: TriggerRule, weight: Matrix) -> ErrorPromise | None:
         return _of_mixed_form(rule.form, weight)
     P, N = up[:, n:], down[:, :n]
     if np.array_equal(P, weight):
-        return ErrorPromise(1.0, (N,) if N.any() else (), 1.0)
+        return ComparisonBound(1.0, (N,) if N.any() else (), 1.0)
     if not _is_definite(P.T @ P, 1.0):
         return None
     size = float(np.linalg.norm(weight @ np.linalg.pinv(P), 2)) * _ROUNDING
     least = 1 / (float(np.linalg.norm(P @ np.linalg.inv(weight), 2)) * _ROUNDING)
-    return ErrorPromise(size, (size * N,) if N.any() else (), least)
+    return ComparisonBound(size, (size * N,) if N.any() else (), least)
 
 
-def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ErrorPromise | None:
-    """Return the promise of a form that compares e_s together with x."""
+def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ComparisonBound | None:
+    """Return the bound of a form that compares e_s together with x."""
     n = len(weight)
     Q = form.up.T @ form.up - form.down.T @ form.down
     size_of_Q = float(np.linalg.norm(form.up, 2) ** 2 + np.linalg.norm(form.down, 2) ** 2)
@@ -68,7 +68,7 @@ def _of_mixed_form(form: QuadraticForm, weight: Matrix) -> ErrorPromise | None:
     F = np.linalg.cholesky(Q[n:, n:]).T
     size = float(np.linalg.norm(weight @ np.linalg.inv(F), 2)) * _ROUNDING
     shares = (size * C, _ROUNDING * weight @ J)
-    return ErrorPromise(size, tuple(S for S in shares if S.any()), 0.0)
+    return ComparisonBound(size, tuple(S for S in shares if S.any()), 0.0)
 
 
 def _is_definite(Q: Matrix, size: float) -> bool:

@@ -1,4 +1,4 @@
-"""What a rule promises about e_s, against the boundary of the rule itself."""
+"""The bound of e_s that a rule sets, against the boundary of the rule itself."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from noack.config.scenario_file import validate
+from noack.trigger.comparison_bound import comparison_bound
 from noack.trigger.dynamic import DynamicSettings
-from noack.trigger.error_promise import error_promise
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
 from tests.trigger_rules import quadratic_rule
@@ -25,39 +25,37 @@ SCENARIO: dict[str, Any] = {
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 4))
-def test_no_e_s_at_which_a_quadratic_rule_is_silent_is_larger_than_promised(
-    seed: int, n: int
-) -> None:
+def test_no_e_s_at_which_a_quadratic_rule_is_silent_exceeds_the_bound(seed: int, n: int) -> None:
     """zᵀQz = ε is solved along random directions of e_s, for random x."""
     rng = np.random.default_rng(seed)
     W = rng.uniform(-1, 1, (n, n)) + 1.5 * np.eye(n)
     Q = rng.uniform(-1, 1, (2 * n, 2 * n))
     Q = Q + Q.T
     Q[n:, n:] += 3 * np.eye(n)
-    promise = error_promise(quadratic_rule(Q, 10**7, EPSILON, 0, W), W)
-    assume(promise is not None)
-    assert promise is not None
+    bounded = comparison_bound(quadratic_rule(Q, 10**7, EPSILON, 0, W), W)
+    assume(bounded is not None)
+    assert bounded is not None
     for _ in range(20):
         x, direction = rng.normal(size=n) * 10 ** rng.uniform(-2, 2), rng.normal(size=n)
         roots = np.roots([
             direction @ Q[n:, n:] @ direction, 2 * direction @ Q[n:, :n] @ x,
             x @ Q[:n, :n] @ x - EPSILON,
         ])  # fmt: skip
-        bound = promise.size * EPSILON**0.5
-        bound += sum(float(np.linalg.norm(S @ x)) for S in promise.shares)
+        bound = bounded.size * EPSILON**0.5
+        bound += sum(float(np.linalg.norm(S @ x)) for S in bounded.shares)
         for root in roots[np.isreal(roots)].real:
             assert np.linalg.norm(W @ (root * direction)) <= bound
 
 
 @pytest.mark.parametrize("kind", [LyapunovSettings, DynamicSettings])
-def test_rules_that_leave_e_s_unbounded_promise_nothing(
+def test_rules_that_leave_e_s_unbounded_set_no_bound(
     kind: type[LyapunovFunctionSettings],
 ) -> None:
     model = ModelMatrices(np.zeros((2, 2)), np.eye(2), -np.eye(2))
     settings = kind.example(2)
     assert settings is not None
     rule = settings.trigger_policy(model)
-    assert error_promise(rule, np.eye(2)) is None
+    assert comparison_bound(rule, np.eye(2)) is None
 
 
 def test_the_same_threshold_from_a_later_origin() -> None:

@@ -1,4 +1,0 @@
-#if !defined(__x86_64__)
-#define N 16
-#include "../code.h"
-#endif

@@ -1,4 +1,0 @@
-#if !defined(__x86_64__)
-#define N 2
-#include "../code.h"
-#endif

@@ -1,2 +1,0 @@
-#define N 64
-#include "../code.h"

@@ -1,4 +1,0 @@
-#if !defined(__x86_64__)
-#define N 8
-#include "../code.h"
-#endif
