@@ -36,10 +36,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from netem.relay_links import DIRECTIONS, EVENT, Direction, LinkSpec, say
+from noack.core.core_library import dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent
-from noack.impairments.link_settings import Constraints, Mansd, RecordedDecision
+from noack.impairments.link_settings import Constraints, Decisions, Mansd
 from noack.impairments.loss_guarantee import LossHistory
 from noack.protocol.record_tables import Fate
 
@@ -251,8 +252,7 @@ _LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 class Fates(NamedTuple):
     """The content of a trace, for each direction of each link."""
 
-    decisions: Mapping[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]]
-    """Decisions of each flow, in packet order."""
+    decisions: Mapping[tuple[str, Direction], Decisions]
     guarantees: Mapping[tuple[str, Direction], Mapping[str, Any]]
     """The keys ``mansd`` and ``constraints`` of its settings; none if the recorded fates break the
     guarantee, because it changed during the recording."""
@@ -279,7 +279,7 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             known = ", ".join(links_recorded)
             raise CallerError(f"{path}: has no link {link!r}; its links: {known}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
-    found: dict[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]] = {}
+    found: dict[tuple[str, Direction], Decisions] = {}
     guarantees: dict[tuple[str, Direction], Mapping[str, Any]] = {}
     for link in links_recorded if links is None else links:
         for direction in DIRECTIONS:
@@ -384,9 +384,7 @@ def _document(path: Path, text: bytes | None) -> _Document:
         raise CallerError(f"{path}: not a fate trace of this program") from None
 
 
-def _flows(
-    rows: Mapping[str, NDArray[Any]], most_flows: int, place: str
-) -> Sequence[Sequence[RecordedDecision]]:
+def _flows(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> Decisions:
     """Return the decisions of each flow, from the rows of a direction."""
     _check(rows, most_flows, place)
     order = np.lexsort((rows["packet"], rows["flow"]))
@@ -401,10 +399,10 @@ def _flows(
             f"{place}: flow {flows[k]}: expected packet {expected[k]}, found {packets[k]}; "
             "an incomplete trace cannot be replayed"
         )
-    names = ("fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
-    columns = [rows[name][order].tolist() for name in names]
-    decisions = [RecordedDecision(*values) for values in zip(*columns, strict=True)]
-    found: list[Sequence[RecordedDecision]] = [()] * (int(flows[-1]) + 1 if len(flows) else 0)
+    decisions = np.empty(len(order), dtype_of("noack_recorded"))
+    for name in decisions.dtype.names or ():
+        decisions[name] = rows[name][order]
+    found = [decisions[:0]] * (int(flows[-1]) + 1 if len(flows) else 0)
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
         found[int(flows[begin])] = decisions[begin:end]
     return found

@@ -6,8 +6,7 @@ are several of a kind. Hence adding a delay does not change which packets are lo
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
-from noack.impairments.link_settings import NEVER_NS, Counters, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.impairments.loss_guarantee import DeliveriesBetweenBursts, LossesInWindow
 from noack.impairments.loss_prediction import with_kept_loss
 
@@ -51,14 +50,14 @@ class LinkState:
         settings: LinkSettings,
         seed: int,
         *name: str,
-        decisions: Sequence[Sequence[RecordedDecision]] = (),
+        decisions: Decisions = (),
         rows: int = 1,
         restarted: bool = False,
     ) -> None:
         self.settings = settings
         self._seed, self._name, self._restarted = seed, name, restarted
-        recorded = [astuple(decision) for flow in decisions for decision in flow]
-        self._decisions = np.array(recorded, dtype_of("noack_recorded"))
+        recorded = chain.from_iterable(decisions)
+        self._decisions = np.fromiter(recorded, dtype_of("noack_recorded"))
         begins = [*accumulate(map(len, decisions), initial=0)] if decisions else [0]
         self._decisions_begin = np.array(begins, np.int64)
         self.flows: NDArray[np.void] = np.zeros(rows, dtype_of("noack_flow"))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from noack.core.core_library import core, dtype_of
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import Counters, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import Counters, Decisions, LinkSettings
 from noack.runtime.address import SocketName as SocketName
 from noack.runtime.address import packed_name as packed_name
 from noack.runtime.address import text_of
@@ -70,9 +70,7 @@ class LinkSpec:
     """A client without a datagram in either direction for this time is removed."""
     most_clients: int = 65_536
     """Maximum number of clients; datagrams of further clients are refused and counted."""
-    decisions: Mapping[Direction, Sequence[Sequence[RecordedDecision]]] = field(
-        default_factory=dict
-    )
+    decisions: Mapping[Direction, Decisions] = field(default_factory=dict)
     """Recorded decisions per flow; each flow repeats them before the settings apply."""
 
 

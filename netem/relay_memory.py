@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from netem.link_state import Integers, LinkState
 from netem.relay_links import EVENT
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
 Array = NDArray[Any]
@@ -189,7 +189,7 @@ class RelayDirection(LinkState):
         seed: int,
         name: Sequence[str],
         row: Any,
-        decisions: Sequence[Sequence[RecordedDecision]] = (),
+        decisions: Decisions = (),
         restarted: bool = False,
     ) -> None:
         super().__init__(

@@ -136,7 +136,7 @@ def settings_of(words: str | Sequence[str]) -> LinkSettings:
     return settings
 
 
-def text_of(settings: LinkSettings, seed: int | None = None) -> str:
+def text_of(settings: LinkSettings) -> str:
     """Return words that :func:`parse` reads back to the same settings."""
     words = [impairment.text() for impairment in settings.impairments]
     words += guarantee_words(settings)
@@ -144,8 +144,6 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
         words.append("first")
     if settings.limit != _LIMIT:
         words.append(f"limit {settings.limit}")
-    if seed is not None:
-        words.append(f"seed {seed}")
     return " ".join(words)
 
 

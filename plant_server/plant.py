@@ -64,15 +64,8 @@ class Disturbance:
     ) -> None:
         self._parts, self.widths = (at_input, at_state), widths
 
-    def block(self, first: int) -> tuple[Matrix, Matrix]:
-        """Return d, shape (k, m), and w, (k, n), of the ``BLOCK`` steps from ``first`` on.
-
-        The shape is (k, 0) where there is no disturbance.
-        """
-        return self.values(range(first, first + BLOCK))
-
     def values(self, steps: range) -> tuple[Matrix, Matrix]:
-        """Return d, shape (k, m), and w, (k, n), of some steps; see :meth:`block`."""
+        """Return d, shape (k, m), and w, (k, n), of k steps; (k, 0) where there is none."""
         d, w = (_sum(signals, steps) for signals in self._parts)
         return d, w
 
@@ -275,7 +268,7 @@ class Plant:
         step = plant.machine.step
         first = step - step % BLOCK
         if self.disturbance is not None:
-            blocks = self.disturbance.block(first)
+            blocks = self.disturbance.values(range(first, first + BLOCK))
             for signal, values in zip((plant.at_input, plant.at_state), blocks, strict=True):
                 if signal.width:
                     signal.first = first

@@ -1,6 +1,10 @@
-"""Named linear models: the nominal matrices that a scenario may refer to by name."""
+"""Named linear models: the nominal matrices that a scenario may refer to by name.
+
+The keyword arguments of a model's function are its parameters, with their default values.
+"""
 
 from collections.abc import Callable, Mapping
+from inspect import signature
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +22,11 @@ class NamedModel(NamedTuple):
     input_names: tuple[str, ...]
 
 
-LANE_FOLLOWING_DEFAULTS: Mapping[str, float] = {
-    "a11": -1.6579, "a12": 10.45, "a21": 0.4886, "a22": -2.718,
-    "b1": -12.1053, "b2": 13.1429,
-    "speed": -12.0, "look_ahead": 40.0, "gain": 1.0,
-}  # fmt: skip
-
-
-def lane_following(parameters: Mapping[str, float]) -> NamedModel:
+def lane_following(
+    *, a11: float = -1.6579, a12: float = 10.45, a21: float = 0.4886, a22: float = -2.718,
+    b1: float = -12.1053, b2: float = 13.1429,
+    speed: float = -12.0, look_ahead: float = 40.0, gain: float = 1.0,
+) -> NamedModel:  # fmt: skip
     """Vehicle lane following, Section V of Garcia & Antsaklis (after Unyelioglu et al., 1997).
 
     States: lateral velocity V, yaw rate r, yaw ψ, lateral position Y_g of the centre of gravity.
@@ -35,29 +36,25 @@ def lane_following(parameters: Mapping[str, float]) -> NamedModel:
     Raises:
         ValueError: the look-ahead distance is 0.
     """
-    p = {**LANE_FOLLOWING_DEFAULTS, **parameters}
-    if p["look_ahead"] == 0:
+    if look_ahead == 0:
         raise ValueError("parameters.look_ahead: the look-ahead distance cannot be 0")
     A = np.array([
-        [p["a11"], p["a12"], 0.0, 0.0],
-        [p["a21"], p["a22"], 0.0, 0.0],
+        [a11, a12, 0.0, 0.0],
+        [a21, a22, 0.0, 0.0],
         [0.0, 1.0, 0.0, 0.0],
-        [1.0, 0.0, p["speed"], 0.0],
+        [1.0, 0.0, speed, 0.0],
     ])  # fmt: skip
-    B = np.array([[p["b1"], 0.0], [0.0, p["b2"]], [0.0, 0.0], [0.0, 0.0]])
-    row = [0.0, 0.0, -p["gain"], p["gain"] / p["look_ahead"]]
+    B = np.array([[b1, 0.0], [0.0, b2], [0.0, 0.0], [0.0, 0.0]])
+    row = [0.0, 0.0, -gain, gain / look_ahead]
     return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
 
 
-SINGLE_TRACK_LANE_DEFAULTS: Mapping[str, float] = {
-    "mass_kg": 1093.3, "inertia_kg_m2": 1791.6, "front_m": 1.1562, "rear_m": 1.4227,
-    "front_n_per_rad": 129_697.0, "rear_n_per_rad": 105_400.0,
-    "speed_m_per_s": 15.0, "look_ahead_m": 20.0, "gain": 0.5,
-}  # fmt: skip
-"""The BMW 320i of CommonRoad's vehicle models, with its tyres under the static load."""
-
-
-def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
+def single_track_lane(
+    *, mass_kg: float = 1093.3, inertia_kg_m2: float = 1791.6,
+    front_m: float = 1.1562, rear_m: float = 1.4227,
+    front_n_per_rad: float = 129_697.0, rear_n_per_rad: float = 105_400.0,
+    speed_m_per_s: float = 15.0, look_ahead_m: float = 20.0, gain: float = 0.5,
+) -> NamedModel:  # fmt: skip
     """A car on a lane, as the linear single-track model (Riekert and Schunck, 1940).
 
     The car has mass m and moment of inertia I about the vertical axis. Its axles are at distances a
@@ -69,17 +66,21 @@ def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
 
     The states are those of :func:`lane_following`, with its lateral axis, which has the opposite
     direction: V = −v_y, yaw rate r, yaw ψ, lateral position Y_g with Ẏ_g = V − v ψ. Input: δ = gain
-    · (Y_g/look_ahead − ψ).
+    · (Y_g/look_ahead − ψ). By default the car is the BMW 320i of CommonRoad's vehicle models, with
+    its tyres under the static load.
 
     Raises:
         ValueError: a parameter that is a divisor is 0.
     """
-    p = {**SINGLE_TRACK_LANE_DEFAULTS, **parameters}
-    for name in ("mass_kg", "inertia_kg_m2", "speed_m_per_s", "look_ahead_m"):
-        if p[name] == 0:
+    divisors = {
+        "mass_kg": mass_kg, "inertia_kg_m2": inertia_kg_m2, "speed_m_per_s": speed_m_per_s,
+        "look_ahead_m": look_ahead_m,
+    }  # fmt: skip
+    for name, value in divisors.items():
+        if value == 0:
             raise ValueError(f"parameters.{name}: cannot be 0")
-    m, inertia, v = p["mass_kg"], p["inertia_kg_m2"], p["speed_m_per_s"]
-    (a, b), (c_f, c_r) = (p["front_m"], p["rear_m"]), (p["front_n_per_rad"], p["rear_n_per_rad"])
+    m, inertia, v = mass_kg, inertia_kg_m2, speed_m_per_s
+    a, b, c_f, c_r = front_m, rear_m, front_n_per_rad, rear_n_per_rad
     uneven = a * c_f - b * c_r
     A = np.array([
         [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
@@ -88,30 +89,23 @@ def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
         [1.0, 0.0, -v, 0.0],
     ])  # fmt: skip
     B = np.array([[-c_f / m], [a * c_f / inertia], [0.0], [0.0]])
-    K = np.array([[0.0, 0.0, -p["gain"], p["gain"] / p["look_ahead_m"]]])
+    K = np.array([[0.0, 0.0, -gain, gain / look_ahead_m]])
     return NamedModel(A, B, K, ("V", "r", "psi", "Y_g"), ("steering",))
 
 
-def double_integrator(parameters: Mapping[str, float]) -> NamedModel:
+def double_integrator(*, stiffness: float = 1.0, damping: float = 1.5) -> NamedModel:
     """A unit mass driven by a force: ``ẍ = u``, with ``u = −stiffness·x − damping·ẋ``."""
-    p = {"stiffness": 1.0, "damping": 1.5, **parameters}
-    return NamedModel(
-        np.array([[0.0, 1.0], [0.0, 0.0]]),
-        np.array([[0.0], [1.0]]),
-        np.array([[-p["stiffness"], -p["damping"]]]),
-        ("position", "velocity"),
-        ("force",),
-    )
+    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), [-stiffness, -damping]
+    return NamedModel(A, B, np.array([K]), ("position", "velocity"), ("force",))
 
 
-NAMED_MODELS: Mapping[str, Callable[[Mapping[str, float]], NamedModel]] = {
+NAMED_MODELS: Mapping[str, Callable[..., NamedModel]] = {
     "lane_following": lane_following,
     "single_track_lane": single_track_lane,
     "double_integrator": double_integrator,
 }
 
-MODEL_PARAMETERS: Mapping[str, tuple[str, ...]] = {
-    "lane_following": tuple(LANE_FOLLOWING_DEFAULTS),
-    "single_track_lane": tuple(SINGLE_TRACK_LANE_DEFAULTS),
-    "double_integrator": ("stiffness", "damping"),
-}
+
+def parameters_of(name: str) -> tuple[str, ...]:
+    """Return the parameters of a named model."""
+    return tuple(signature(NAMED_MODELS[name]).parameters)

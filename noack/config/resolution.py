@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from noack.config.named_models import NAMED_MODELS
 from noack.config.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
 from noack.config.scenario_checks import input_at
 from noack.config.sections import AnyObserver, ModelSection
@@ -164,7 +163,7 @@ def _resolved(loops: Sequence[Scenario]) -> list[Scenario]:
 
 def _explicit_model(model: ModelSection) -> ModelSection:
     if model.name is not None:
-        named = NAMED_MODELS[model.name](model.parameters)
+        named = model.named
         return ModelSection(
             A=rows_of(named.A),
             B=rows_of(named.B),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
+from noack.config.named_models import NAMED_MODELS, NamedModel, parameters_of
 from noack.controllers.controller_settings import ControllerSettings
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
@@ -111,7 +111,7 @@ class ModelSection(ScenarioSection):
 
     def _require_stable(self) -> None:
         (A, B), own = self.matrices, self.gain is None  # a named model's own gain
-        K = NAMED_MODELS[self.name or ""](self.parameters).K if own else np.array(self.gain)
+        K = self.named.K if own else np.array(self.gain)
         key = "parameters" if own else "gain"
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
@@ -123,14 +123,13 @@ class ModelSection(ScenarioSection):
     def _check_named(self, name: str) -> None:
         if self.A is not None or self.B is not None:
             raise ValueError("name: a named model has its own A and B; give one or the other")
-        known = MODEL_PARAMETERS[name]
+        known = parameters_of(name)
         for key in self.parameters:
             if key not in known:
                 raise ValueError(
                     f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}"
                 )
-        named = NAMED_MODELS[name](self.parameters)
-        if not all(np.isfinite(matrix).all() for matrix in (named.A, named.B, named.K)):
+        if not all(np.isfinite(matrix).all() for matrix in self.named[:3]):
             raise ValueError("parameters: these give matrices with infinite entries")
 
     def _check_explicit(self) -> None:
@@ -149,10 +148,15 @@ class ModelSection(ScenarioSection):
         require_shape(self.B, "B", (n, m), "one row per state")
 
     @property
+    def named(self) -> NamedModel:
+        """The model of its name, which must be given."""
+        return NAMED_MODELS[self.name or ""](**self.parameters)
+
+    @property
     def dimensions(self) -> tuple[int, int]:
         """Number of states n and of inputs m."""
         if self.name is not None:
-            n, m = NAMED_MODELS[self.name](self.parameters).B.shape
+            n, m = self.named.B.shape
             return n, m
         return (len(self.B), len(self.B[0])) if self.B else (0, 0)
 
@@ -160,8 +164,7 @@ class ModelSection(ScenarioSection):
     def matrices(self) -> tuple[Matrix, Matrix]:
         """Â, (n, n), and B̂, (n, m)."""
         if self.name is not None:
-            named = NAMED_MODELS[self.name](self.parameters)
-            return named.A, named.B
+            return self.named.A, self.named.B
         return np.array(self.A), np.array(self.B)
 
 

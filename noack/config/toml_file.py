@@ -232,9 +232,9 @@ def nearest_key(key: str, known: Iterable[str]) -> str | None:
     return best if similarity(best)[0] >= _SIMILAR else None
 
 
-def keys(section: type[BaseModel], prefix: str = "") -> list[str]:
+def keys(section: type[BaseModel]) -> list[str]:
     """Return the keys of a settings file, each once; of a union of tables, the keys of all."""
-    return list(dict.fromkeys(_keys(section, prefix, ())))
+    return list(dict.fromkeys(_keys(section, "", ())))
 
 
 def _keys(

@@ -1,12 +1,13 @@
 """Impairments of a link: a file per loss model, kind of impairment, discipline and constraint.
 
-Each file holds the settings, the words of the command line, the description, the prediction and
-examples. A file of the same name in native/impairments holds the behaviour. The packages import
-their files automatically; the JSON schema, the emulator, the words, the explanation and the
-property tests use what they import. What stands around them, in the order in which one reads it:
+Each file holds the settings, the words of the command line, the description and the prediction. A
+file of the same name in native/impairments holds the behaviour. The packages import their files
+automatically; the JSON schema, the emulator, the words, the explanation and the property tests use
+what they import. What stands around them, in the order in which one reads it:
 
 * ``feature.py``: the base classes, and what several features share;
-* ``words.py``: the words of the command line, and quantities in the syntax of ``tc``;
+* ``clauses.py``: the words of a feature as data, from which its reading, writing and help follow;
+* ``words.py``: words of the command line, and quantities in the syntax of ``tc``;
 * ``loss_guarantee.py``: the rules that a network keeps, as counters over the outcomes of packets;
 * ``link_settings.py``: the settings of one direction of a link, made of all these;
 * ``markov_chain.py``, ``loss_prediction.py``: the expected loss rate, with and without a guarantee.

@@ -5,9 +5,9 @@ between successive packets of a flow. The probability itself stays exact, unlike
 the end are what reports and recorded packet fates use of a link; native/noack.h declares the rest.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import astuple, dataclass
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -79,8 +79,7 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
             )
 
 
-@dataclass(slots=True)
-class RecordedDecision:
+class RecordedDecision(NamedTuple):
     """A recorded decision for a packet: the fields of ``noack_recorded``."""
 
     fate: int
@@ -88,6 +87,10 @@ class RecordedDecision:
     copy_delay_ns: int
     bit: int
     copy_bit: int
+
+
+Decisions = Sequence[Collection[RecordedDecision]]
+"""Recorded decisions of each flow, in the order of its packets; or arrays of ``noack_recorded``."""
 
 
 @dataclass(slots=True)

@@ -52,7 +52,6 @@ def read_trace(
     place: str = "",
     clocks_differ: bool = False,
     most_packets: int = MAX_PACKETS,
-    formats: Sequence[TraceFormat] = (),
     others: Sequence[str] = (),
 ) -> PacketTrace:
     """Return the trace in a file.
@@ -62,13 +61,12 @@ def read_trace(
         place: what messages begin with; by default the path.
         clocks_differ: see :func:`noack.traces.packet_trace.packet_trace`.
         most_packets: most packets of the trace.
-        formats: further formats, beside those of this folder.
         others: what the caller reads besides; for a message.
 
     Raises:
         CallerError: one line; the file cannot be read, or is not a trace.
     """
-    known = [*formats, *_formats()]
+    known = _formats()
     try:
         with open_regular(path) as file:
             head, file = _decompressed(file)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from netem.link_state import LinkState
 from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.impairments.kinds.opportunities import Opportunities
-from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import NEVER_NS, Decisions, LinkSettings, RecordedDecision
 from tests.netem.any_settings import capped, computable, harsh
 
 LATEST_NS, LARGEST_BYTES = 2**61, 65_535
@@ -56,7 +56,7 @@ def test_random_links(
     settings_in_order: Sequence[LinkSettings],
     arriving: Sequence[tuple[int, int, int, bool]],
     now_ns: int,
-    decisions: Sequence[Sequence[RecordedDecision]],
+    decisions: Decisions,
     restarted: bool,
 ) -> None:
     link = LinkState(settings_in_order[0], 1, "any", decisions=decisions, restarted=restarted)

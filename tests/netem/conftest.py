@@ -1,6 +1,6 @@
 """Fixtures for netem's tests: many compiled decisions, and what their receiver observes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.link_settings import Decisions, LinkSettings
 
 MOST = 1_000_000
 
@@ -48,7 +48,7 @@ def decide() -> Decide:
         flows: ArrayLike = 0,
         sizes_bytes: ArrayLike = 100,
         arrivals_ns: ArrayLike | None = None,
-        recorded: Sequence[Sequence[RecordedDecision]] = (),
+        recorded: Decisions = (),
     ) -> Decided:
         if isinstance(settings, str):
             settings = settings_of(settings).model_copy(update={"limit": MOST})

@@ -14,7 +14,7 @@ from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped
 from netem.link_state import LinkState
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
-from noack.impairments.link_settings import NEVER_NS, Counters, LinkSettings, RecordedDecision
+from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -61,7 +61,7 @@ class Link:
         settings: LinkSettings,
         seed: int,
         *name: str,
-        decisions: Sequence[Sequence[RecordedDecision]] = (),
+        decisions: Decisions = (),
         first_number: int = 0,
         schedule: ChangeSchedule | None = None,
         restarted: bool = False,

@@ -95,10 +95,10 @@ def _eigenvalues() -> Numbers:
     """Return the numbers of the example as printed, and with the other sign of U."""
     found: Numbers = {}
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
-        model = lane_following({"speed": speed})
+        model = lane_following(speed=speed)
         eigenvalues = np.linalg.eigvals(model.A + model.B @ model.K)
         found[name] = sorted([value.real, value.imag] for value in eigenvalues.tolist())
-    A = lane_following({}).A
+    A = lane_following().A
     found["open"] = sorted(open_loop_eigenvalues(A).real.tolist())
     found["rank"] = int(np.linalg.matrix_rank(A))
     found["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
@@ -362,7 +362,7 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
 
     run = run_continuous(resolved_draw(scenario, representative, "zoh"))
     beta, alpha_per_s = run.system.decaying.level, run.system.decaying.rate_per_s
-    gamma = float(open_loop_eigenvalues(lane_following({}).A).real.max())
+    gamma = float(open_loop_eigenvalues(lane_following().A).real.max())
 
     def solved_s(eta: float, level: float) -> float:
         def excess(delta_s: float) -> float:

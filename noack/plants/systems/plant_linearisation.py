@@ -9,7 +9,7 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.plants.plant_settings import PlantSystem
 
 _STEP_NS = 10_000_000
-_OFF = 1e-4
+_OFF = 1e-4  # size of a deviation, in each coordinate's units
 _SINGULAR = 1e-9
 """If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
@@ -19,12 +19,7 @@ state."""
 
 
 def linearise(
-    system_at: Callable[[Vector], PlantSystem],
-    n: int,
-    m: int,
-    *,
-    off: float = _OFF,
-    settling_s: float = 0.0,
+    system_at: Callable[[Vector], PlantSystem], n: int, m: int, *, settling_s: float = 0.0
 ) -> tuple[Matrix, Matrix]:
     """Linearise a system about x = 0, u = 0 from its response to small deviations.
 
@@ -37,7 +32,6 @@ def linearise(
         system_at: makes the system at an initial state, shape (n,).
         n: number of states.
         m: number of inputs.
-        off: size of a deviation, in each coordinate's units.
         settling_s: settling time; 0 for a system with the state x.
 
     Returns:
@@ -58,9 +52,9 @@ def linearise(
     before, after, later = (np.eye(n + m) for _ in range(3))
     for i in range(n + m):
         change = np.zeros(n + m)
-        change[i] = off
+        change[i] = _OFF
         plus, minus = (followed(sign * change[:n], sign * change[n:]) for sign in (1.0, -1.0))
-        before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off)
+        before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * _OFF)
     unknown = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(before).all() and np.isfinite(later).all()):
         return unknown

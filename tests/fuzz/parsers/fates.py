@@ -68,7 +68,7 @@ def _replay(path: Path, links: list[str] | None) -> None:
     for place, flows in fates.decisions.items():
         link = Link(LinkSettings(**fates.guarantees[place]), 0, *place, decisions=flows)
         for flow, decisions in enumerate(flows):
-            for decision in decisions:
+            for _, delay_ns, copy_delay_ns, *_ in decisions:
                 # The compiled relay adds in signed 64 bits.
-                assert _LATEST_NS + max(decision.delay_ns, decision.copy_delay_ns) < 2**63
+                assert _LATEST_NS + int(max(delay_ns, copy_delay_ns)) < 2**63
                 link.decide(flow, 100, 0)

@@ -84,8 +84,6 @@ MISTAKES = [
     ("set --link up lozz 5%", "lozz: "),
     ("set lba --link up loss 5%", "no emulator 'lba'; running: lab"),
     ("set lab loss 5%", "which link? Links: up, down"),
-    ("set --link left loss 5%", "no link 'left'; links: up, down"),
-    ("show lba", "no emulator 'lba'; running: lab"),
     ("show --control lba", "no emulator 'lba'; running: lab"),
     ("show lab --control lba", "--control lba: NAME is lab already"),
     ("watch lba", "no emulator 'lba'; running: lab"),

@@ -24,16 +24,6 @@ def test_a_session_is_found_while_it_lasts() -> None:
     assert list(path.parent.iterdir()) == []
 
 
-def test_a_name_is_used_once() -> None:
-    with published(LAB):
-        with (
-            pytest.raises(CallerError, match="--control lab: an emulator of this name runs"),
-            published(LAB),
-        ):
-            pass
-        assert find("lab") == LAB
-
-
 def test_an_error_of_the_emulator_itself_is_not_taken_for_a_used_name() -> None:
     with pytest.raises(FileExistsError, match="capture"), published(LAB):
         raise FileExistsError("capture.pcapng")

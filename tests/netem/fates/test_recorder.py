@@ -81,7 +81,7 @@ def test_directions_are_separate_and_a_flow_may_have_packets_in_only_one(path: P
         ("up", "forward"): [],
         ("up", "reverse"): [],
     }
-    assert [decision.fate for decision in fates["a", "reverse"][1]] == [Fate.DROPPED] * 2
+    assert [fate for fate, *_ in fates["a", "reverse"][1]] == [Fate.DROPPED] * 2
     assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "reverse")}
 
 

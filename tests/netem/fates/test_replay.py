@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from netem.fates import read_fates
 from netem.tc_words import settings_of
-from noack.impairments.link_settings import LinkSettings, RecordedDecision
+from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.netem.any_settings import harsh as settings
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fates")
 
 
-def fates_of(folder: Path) -> Sequence[Sequence[RecordedDecision]]:
+def fates_of(folder: Path) -> Decisions:
     return read_fates(folder / "fates.parquet").decisions["a", "forward"]
 
 
@@ -90,7 +90,7 @@ def check_moved(
     before: Run,
     moved: list[Arrival],
     link: LinkSettings,
-    fates: Sequence[Sequence[RecordedDecision]],
+    fates: Decisions,
 ) -> None:
     again = drive(Link(link, 8, "b", decisions=fates), moved)
     for old, old_came, new, new_came in zip(

@@ -104,7 +104,7 @@ def test_words_are_parsed_into_impairments(words: str, impairments: list[Given])
     parsed = parse(words)
     expected = LinkSettings.model_validate_json(json.dumps({"impairments": impairments}))
     assert parsed == (expected, None)
-    assert parse(text_of(*parsed)) == parsed
+    assert settings_of(text_of(expected)) == expected
 
 
 def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
@@ -112,7 +112,7 @@ def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
     settings, seed = parse(words)
     assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
     assert [one.kind for one in settings.impairments] == ["delay", "loss", "delay"]
-    assert text_of(settings, seed) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50 seed 7"
+    assert text_of(settings) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50"
 
 
 @pytest.mark.parametrize(
@@ -130,14 +130,12 @@ def test_words_may_be_one_string_or_a_list(words: str | list[str]) -> None:
     assert [one.text() for one in settings.impairments] == ["loss trace 'my file'"]
 
 
-@given(settings, st.none() | st.integers(0, 2**64 - 1))
-def test_all_settings_survive_being_written_and_read(
-    settings: LinkSettings, seed: int | None
-) -> None:
+@given(settings)
+def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> None:
     assume(words_can_say(settings))  # another test covers refused settings
-    text = text_of(settings, seed)
-    assert parse(text) == (settings, seed)
-    assert "'" in text or parse(text.split()) == (settings, seed)
+    text = text_of(settings)
+    assert settings_of(text) == settings
+    assert "'" in text or settings_of(text.split()) == settings
 
 
 @given(st.floats(-3600, 3600))
@@ -190,15 +188,11 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("loss 5% 100%", "loss 5% 100%: expected a correlation from 0% to below 100%, e.g. 25%"),
         ("loss random", "loss random: a value is missing: a percentage from 0% to 100%"),
         ("loss state 90% 20% 81%", "loss state 90% 20% 81%: p31: p31 + p32 must not exceed 1"),
-        ("loss burst 90% 2", "loss burst 90% 2: mean_burst: so much loss needs longer bursts"),
         ("loss periodic 2", "loss periodic 2: expected losses per packets, e.g. 2/100"),
-        ("loss periodic 3/2", "loss periodic 3/2: burst: must not exceed the period, 2"),
-        ("loss script 3,2", "loss script 3,2: lost: the numbers must ascend"),
         ("loss script 3,x", "loss script 3,x: expected the numbers of the lost packets"),
         ("loss trace", "loss trace: a value is missing: a file of zeros and ones"),
         ("delay", "delay: a value is missing: a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 10mm", "delay 10mm: expected a time in s, ms, us or ns, e.g. 10ms"),
-        ("delay -1ms", "delay -1ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 2h", "delay 2h: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 4000s", "delay 4000s: delay_s should be less than or equal to 3600"),
         ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
@@ -212,7 +206,6 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("delay 1ms lossrel 5%", "lossrel: needs a loss before it"),
         ("delay 1ms loss 5% lossrel 5%", "lossrel: goes right after delay TIME"),
         ("delay 1ms samples 1,2", "delay 1ms samples 1,2: expected delays with their units"),
-        ("delay 1ms samples 1ms", "samples 1ms: samples_s should have at least 2 items"),
         ("delay 1ms reorder", "reorder: a value is missing: a percentage"),
         ("reorder 25%", "reorder 25%: nothing before it delays a packet; it goes after delay"),
         ("delay 1ms gap 5 reorder 25%", "reorder 25%: there is a reorder, or a gap, before it; "),
@@ -242,8 +235,6 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("delay 1ms samples 1%,2ms", "delay 1ms samples 1%,2ms: expected delays with their units"),
         ("loss trace 'a\nb", r"loss trace 'a\nb: a quotation is not closed"),
         ("blackout 2s", "blackout 2s: expected intervals of time, e.g. 2s-3s,5s-5500ms"),
-        ("blackout 3s-2s", "blackout 3s-2s: intervals_s: each must end after it begins"),
-        ("blackout 1s-3s every 2s", "every_s: the intervals last longer, until 3 s"),
         ("mansd", "mansd: a value is missing: a whole number, e.g. 5"),
         ("mansd -1", "mansd -1: expected a whole number, e.g. 5"),
         ("mansd 1000001", "mansd 1000001: mansd should be less than or equal to 1000000"),
@@ -252,8 +243,6 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("limit 0", "limit 0: limit should be greater than or equal to 1"),
         ("slot 800us", "slot: this emulator does not gather packets into slots"),
         ("loss 5% ecn", "loss 5% ecn: this emulator cannot mark packets"),
-        ("loss 5% delay 1ms ecn", "ecn: this emulator cannot mark packets"),
-        ("loss trace 'a", "loss trace 'a: a quotation is not closed"),
     ],
 )
 def test_a_mistake_gets_one_line_that_names_the_word(words: str, says: str) -> None:
@@ -262,8 +251,3 @@ def test_a_mistake_gets_one_line_that_names_the_word(words: str, says: str) -> N
     line = str(caught.value)
     assert says in line
     assert "\n" not in line
-
-
-def test_a_seed_for_one_direction_is_refused() -> None:
-    with pytest.raises(CallerError, match="seed 7: belongs to the link"):
-        settings_of("loss 5% seed 7")

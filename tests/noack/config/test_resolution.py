@@ -144,7 +144,7 @@ def test_the_gain_of_a_named_model_may_be_replaced(content: dict[str, Any]) -> N
 def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     """Â, B̂, K, β, α, M − 1 and the box of Section V."""
     scenario = load(SCENARIOS / "lane_following.toml")
-    loop, paper = loop_of(resolve(scenario)), lane_following({})
+    loop, paper = loop_of(resolve(scenario)), lane_following()
     for found, expected in ((loop.A_model, paper.A), (loop.B_model, paper.B), (loop.K, paper.K)):
         np.testing.assert_array_equal(found, expected)
     rule = scenario.trigger

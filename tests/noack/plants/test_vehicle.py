@@ -80,9 +80,8 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
     p, v = parameters(car), 18.0
     per_weight = -p.tire.p_ky1 * p.m * 9.81 / (p.a + p.b)
     model = single_track_lane(
-        {"mass_kg": p.m, "inertia_kg_m2": p.I_z, "front_m": p.a, "rear_m": p.b,
-         "front_n_per_rad": per_weight * p.b, "rear_n_per_rad": per_weight * p.a,
-         "speed_m_per_s": v}
+        mass_kg=p.m, inertia_kg_m2=p.I_z, front_m=p.a, rear_m=p.b,
+        front_n_per_rad=per_weight * p.b, rear_n_per_rad=per_weight * p.a, speed_m_per_s=v,
     )  # fmt: skip
     A, B = linearised(settings(parameters=car, speed_m_per_s=v))
     np.testing.assert_allclose(A, model.A, atol=2e-3)
@@ -91,7 +90,7 @@ def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
 
 def test_the_named_model_is_that_of_the_bmw() -> None:
     A, B = linearised(settings())
-    model = single_track_lane({})
+    model = single_track_lane()
     np.testing.assert_allclose(A, model.A, atol=2e-3)
     np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)
 

@@ -86,7 +86,7 @@ def test_a_small_quantile_has_the_lower_limit_zero(mass: Path) -> None:
 
 
 def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
-    A, B, *_ = lane_following({})
+    A, B, *_ = lane_following()
     Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
     K = lqr_gain(A, B, Q, R)
     closed = A + B @ K

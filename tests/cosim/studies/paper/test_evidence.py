@@ -71,7 +71,7 @@ def assert_close(first: Any, second: Any) -> None:
 def test_the_eigenvalues_are_roots_of_the_characteristic_polynomial(computed: Numbers) -> None:
     found = computed["eigenvalues"]
     for name, speed in (("printed", -12.0), ("flipped", 12.0)):
-        model = lane_following({"speed": speed})
+        model = lane_following(speed=speed)
         H = model.A + model.B @ model.K
         for real, imaginary in found[name]:
             shifted = H - (real + 1j * imaginary) * np.eye(4)
@@ -96,7 +96,7 @@ def test_the_expected_loss_rate_with_a_cap_is_the_simulated_one(computed: Number
 
 def test_with_an_exact_model_x_is_the_undisturbed_closed_loop(computed: Numbers) -> None:
     found = computed["exact_model"]
-    model = lane_following({})
+    model = lane_following()
     H, x0 = model.A + model.B @ model.K, np.array([0.5, 0.0, 0.1, 3.0])
     assert found["events"] == 1
     expected = [np.linalg.norm(expm(H * t_s) @ x0) for t_s in found["times_s"]]
@@ -135,7 +135,7 @@ def test_the_slow_models_error_is_the_closed_form(computed: Numbers) -> None:
 
 def test_the_vehicles_rest_state_is_the_limit_of_its_free_motion(computed: Numbers) -> None:
     found = computed["standstill"]
-    model = lane_following({})
+    model = lane_following()
     x0 = np.array(found["x0"])
     assert np.abs(model.K @ x0).max() < 1e-12
     # Without input: (V, r) e^(λt), ψ(∞) = 0, Y(∞) = Y(0) + ∫(V + Uψ) dt with ψ = r/λ.
