@@ -39,7 +39,7 @@ typedef struct { /* a datagram that was received */
 typedef struct {
     struct mmsghdr in_headers[MESSAGES], out_headers[BUFFERS];
     struct iovec in_vectors[MESSAGES], out_vectors[BUFFERS];
-    control in_controls[MESSAGES], out_control;
+    control in_controls[MESSAGES];
     uint8_t in_names[MESSAGES][NOACK_NAME_BYTES];
     int64_t message_next, message_end; /* the messages of which datagrams are still to be taken */
     int64_t taken_bytes;               /* of the next one */
@@ -147,14 +147,17 @@ void noack_driver_add_datagram(
    number, or -1 if that fails: the network's interface may refuse such messages. */
 static int send_segmented(driver_scratch *own, int fd, int64_t place, int64_t count) {
     uint16_t size = (uint16_t)own->out_vectors[place].iov_len;
+    control size_control = {
+        .head = {
+            .cmsg_level = IPPROTO_UDP,
+            .cmsg_type = UDP_SEGMENT,
+            .cmsg_len = CMSG_LEN(sizeof size)}};
+    memcpy(CMSG_DATA(&size_control.head), &size, sizeof size);
     struct msghdr message = {
         .msg_iov = &own->out_vectors[place],
         .msg_iovlen = (size_t)count,
-        .msg_control = &own->out_control,
+        .msg_control = &size_control,
         .msg_controllen = CMSG_SPACE(sizeof size)};
-    own->out_control.head = (struct cmsghdr){
-        .cmsg_level = IPPROTO_UDP, .cmsg_type = UDP_SEGMENT, .cmsg_len = CMSG_LEN(sizeof size)};
-    memcpy(CMSG_DATA(&own->out_control.head), &size, sizeof size);
     if (sendmsg(fd, &message, MSG_DONTWAIT) >= 0)
         return (int)count;
     own->is_unsegmented = errno == EINVAL || errno == EIO || errno == EMSGSIZE;
