@@ -22,6 +22,7 @@ def blocks(page: str, language: str) -> list[str]:
 def fill(folder: Path) -> Path:
     """Give a folder the repository's files and a short run; return it."""
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
+    (folder / "docs").symlink_to(ROOT / "docs")
     (links,) = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:

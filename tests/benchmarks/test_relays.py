@@ -28,6 +28,7 @@ def test_the_goals_of_the_rates() -> None:
     per_s = {
         relays.PLAIN: 260e3, relays.SEGMENTS: 700e3,
         "socat": 120e3, "C relay": 330e3, "C relay, segments": 890e3,
+        "C relay, senders' addresses": 320e3, "C relay, segments, senders' addresses": 850e3,
         relays.DIRECT: 420e3,
     }  # fmt: skip
     rounds = Rounds()

@@ -47,7 +47,7 @@ def test_matrices_and_states_of_any_numbers(
             shape
         )
 
-    trigger = area_rule(0.1, None) if area else decaying_rule(0.5, 1.0, 0.1)
+    trigger = area_rule(0.1, n=n) if area else decaying_rule(0.5, 1.0, 0.1, n=n)
     simulation = ExactSimulation(
         any_of(n, n), any_of(1, n), trigger, horizon_s=2.0, known_start=measure > 2,
         delivered=np.array([True, False]), most_events=20, measure=measure,
