@@ -110,8 +110,10 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
     assert (run_dir / "report.html").stat().st_size > 100_000
 
     summary = json.loads((run_dir / "summary.json").read_text())
-    assert summary["exit"] == {"status": 1, "reason": reason}
-    assert reason in (run_dir / "report.html").read_text()
+    assert summary["exit"]["status"] == 1
+    failed = summary["exit"]["reason"]
+    assert lines[0] == f"noack: the run failed: {failed}"
+    assert failed in (run_dir / "report.html").read_text()
     missing = summary["loops"][0]["missing_samples"]
     # Fill the disk before the summary is written, then before the report is written.
     for path in (run_dir / "summary.json", run_dir / "report.html"):
@@ -122,7 +124,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(
         reopen(run_dir)
     small.fill(but_bytes=1 << 16)
     again = reopen(run_dir)
-    assert (again.reason, again.summary.loops[0].missing_samples) == (reason, missing)
+    assert (again.reason, again.summary.loops[0].missing_samples) == (failed, missing)
     warning = capsys.readouterr().err
     assert warning.startswith(f"noack: warning: no report.html: {run_dir}")
     assert warning.endswith("No space left on device\n")
