@@ -6,9 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.api.scenarios import Source, load, plain
+from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import write_whole
 from noack.core.number_format import as_text
+
+with lazy_modules():
+    from cosim.interactive import draft as drafts
+    from cosim.interactive import exploration_figure as explored
+    from cosim.output import figure_drawing
 
 if TYPE_CHECKING:
     from ipywidgets import Widget
@@ -16,7 +22,6 @@ if TYPE_CHECKING:
 
     from cosim.interactive.ensemble import Ensemble
     from cosim.interactive.exploration import Exploration
-    from cosim.interactive.exploration_figure import DraftResults
     from cosim.interactive.scenario_guarantee import Guarantee, Margin
     from noack.config.scenario import Scenario
 
@@ -28,7 +33,7 @@ class Explorer:
     the explorer as sliders beside the figure.
     """
 
-    def __init__(self, results: "DraftResults") -> None:
+    def __init__(self, results: "explored.DraftResults") -> None:
         self._results = results
         self._widget: Widget | None = None
 
@@ -105,11 +110,9 @@ class Explorer:
         Raises:
             NoackError: there is no such state.
         """
-        from cosim.interactive.exploration_figure import exploration_figure
-        from cosim.output.figure_drawing import draw
-
         _ = self.certificate
-        return draw(exploration_figure(self._results.shown(self._state(state))))
+        shown = self._results.shown(self._state(state))
+        return figure_drawing.draw(explored.exploration_figure(shown))
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the scenario as TOML, with the comments of the file that it came from.
@@ -128,7 +131,7 @@ class Explorer:
         """
         if self._widget is None:
             try:
-                from cosim.api.explorer_widget import ExplorerWidget
+                from cosim.api.explorer_widget import ExplorerWidget  # imports ipywidgets
             except ModuleNotFoundError as error:
                 if error.name != "ipywidgets":
                     raise
@@ -154,7 +157,7 @@ class Explorer:
         return as_text([*rows, *([("warning", self.warning)] if self.warning else [])])
 
     def _ipython_display_(self) -> None:
-        from IPython.display import display
+        from IPython.display import display  # of a notebook
 
         try:
             display(self.widget())  # type: ignore[no-untyped-call]
@@ -186,12 +189,10 @@ def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explor
         NoackError: one line per mistake, each with key, value and remedy; or the scenario has
             several loops.
     """
-    from cosim.interactive.draft import draft_of, open_draft
-    from cosim.interactive.exploration_figure import DraftResults
-
     scenario = load(source)  # its messages name the source
     is_name = isinstance(source, str | PathLike)
-    explorer = Explorer(DraftResults(open_draft(str(source)) if is_name else draft_of(scenario)))
+    draft = drafts.open_draft(str(source)) if is_name else drafts.draft_of(scenario)
+    explorer = Explorer(explored.DraftResults(draft))
     if settings:
         explorer.set(settings)
     return explorer

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load
+from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import (
     RECORD,
     REPORT_FILE,
@@ -23,6 +24,18 @@ from noack.config.resolution import run_tables
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
+
+with lazy_modules():
+    import cosim.analysis.replay.run_replay as run_replay
+    from cosim.analysis import fidelity, run_summary
+    from cosim.api import studies
+    from cosim.live import finalize as run_end
+    from cosim.live import launcher, simulated_run
+    from cosim.output import export as exports
+    from cosim.output import figure_drawing, figure_files, figure_format, run_figures
+    from cosim.output import run_tables as result_tables
+    from cosim.record import data_frames, run_record, table_files
+    from cosim.studies import run_archive, run_comparison, run_repetition
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -99,9 +112,9 @@ class Run:
         return {name: self._of(name) for name in self._run.names if self._loop in (None, name)}
 
     def _of(self, loop: str) -> "Run":
-        from cosim.analysis.run_summary import outcome_of_loop
-
-        return Run(self.directory, lambda: outcome_of_loop(self._outcome, loop), loop=loop)
+        return Run(
+            self.directory, lambda: run_summary.outcome_of_loop(self._outcome, loop), loop=loop
+        )
 
     @property
     def scenario(self) -> Scenario:
@@ -132,16 +145,14 @@ class Run:
         Raises:
             NoackError: there is no such table, or its file is damaged.
         """
-        from cosim.record.data_frames import with_seconds
-        from cosim.record.table_files import TableFile, arrow_table
-
         if name not in self.tables:
             known = ", ".join(self.tables)
             raise CallerError(f'"{name}": the record has no such table; it has {known}')
         if self._loop is not None:
-            return with_seconds(arrow_table(self._record[name]))
+            return data_frames.with_seconds(table_files.arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        return with_seconds(TableFile(path, run_tables(self._run.scenario)[name]).whole())
+        file = table_files.TableFile(path, run_tables(self._run.scenario)[name])
+        return data_frames.with_seconds(file.whole())
 
     def samples(self) -> "pa.Table":
         """Return plant, sensor and controller side by side, one row per measurement.
@@ -153,9 +164,7 @@ class Run:
             value after a reset. x_c is NaN at times without controller records. x is the state that
             the sensor uses; with noise or an observer it differs from the plant's state.
         """
-        from cosim.record.data_frames import samples
-
-        return samples(self._record)
+        return data_frames.samples(self._record)
 
     def events(self) -> "pa.Table":
         """Return the sensor's transmissions, one row each.
@@ -167,9 +176,7 @@ class Run:
             in_flight at the end, or none, if it did not reach the network; ``received``, whether
             the controller processed it.
         """
-        from cosim.record.data_frames import events
-
-        return events(self._record)
+        return data_frames.events(self._record)
 
     def plot(self, figure: str = "states") -> "Figure":
         """Draw a figure of the report.
@@ -182,13 +189,10 @@ class Run:
         Raises:
             NoackError: the run has no such figure.
         """
-        from cosim.output.figure_drawing import draw
-        from cosim.output.run_figures import BOUNDED
-
-        known = self._figures(bounded=figure in BOUNDED)
+        known = self._figures(bounded=figure in run_figures.BOUNDED)
         if figure not in known:
             raise CallerError(f'"{figure}": no such figure of this run; it has {", ".join(known)}')
-        return draw(known[figure]())
+        return figure_drawing.draw(known[figure]())
 
     def save_figures(
         self,
@@ -208,12 +212,10 @@ class Run:
         Raises:
             NoackError: there is no such format or width, or a file cannot be written.
         """
-        from cosim.output.figure_files import save_figures
-        from cosim.output.figure_format import figure_files
-
         page = self.directory / file_of_loop(REPORT_FILE, self._loop)
         figures = (describe() for describe in self._figures(bounded=True).values())
-        return save_figures(figures, page, figure_files(format, width))
+        files = figure_format.figure_files(format, width)
+        return figure_files.save_figures(figures, page, files)
 
     def save_tables(self, folder: Folder) -> list[Path]:
         """Write the tables of the summary: :func:`noack.save_tables` of this run.
@@ -221,9 +223,7 @@ class Run:
         Raises:
             NoackError: a file cannot be written.
         """
-        from cosim.api.studies import save_tables
-
-        return save_tables(self, folder)
+        return studies.save_tables(self, folder)
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
@@ -231,9 +231,7 @@ class Run:
         Raises:
             NoackError: the file cannot be written.
         """
-        from cosim.live.finalize import run_report
-
-        return run_report(self.directory, self._loop, again=True)
+        return run_end.run_report(self.directory, self._loop, again=True)
 
     def export(self, path: Folder, *, certificates: bool = True) -> list[Path]:
         """Write the run for other programs; return the written files.
@@ -247,10 +245,10 @@ class Run:
         Raises:
             NoackError: the path has another ending, or a file cannot be written.
         """
-        from cosim.output.export import export_run
-
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        return export_run(self.directory, Path(path), loop=self._loop, certificates=certificates)
+        return exports.export_run(
+            self.directory, Path(path), loop=self._loop, certificates=certificates
+        )
 
     def archive(self, path: Folder) -> Path:
         """Write the run as one file, which :func:`noack.reproduce` repeats; return its path.
@@ -258,10 +256,8 @@ class Run:
         Raises:
             NoackError: the file cannot be written.
         """
-        from cosim.studies.run_archive import write_archive
-
         self.summary  # noqa: B018  # of a temporary run, it is computed now
-        write_archive(self.directory, Path(path))
+        run_archive.write_archive(self.directory, Path(path))
         return Path(path)
 
     def replay(self) -> "Replay":
@@ -270,9 +266,7 @@ class Run:
         Returns:
             The result: ``bit_exact``, ``first_difference``, ``gaps``, and more.
         """
-        from cosim.analysis.replay.run_replay import replay_run
-
-        return replay_run(self._run, self._loop)
+        return run_replay.replay_run(self._run, self._loop)
 
     def fidelity(self) -> "Fidelity":
         """Compare the run with the ideal loop in continuous time, effect by effect.
@@ -283,15 +277,13 @@ class Run:
         Raises:
             NoackError: the scenario has no ideal loop, or the record is incomplete.
         """
-        from cosim.analysis.fidelity import compute_fidelity
-
-        return compute_fidelity(self._record)
+        return fidelity.compute_fidelity(self._record)
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        from cosim.output.run_figures import page_figures
-
-        return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
+        return run_figures.page_figures(
+            self._run, lambda: self.summary, self._loop, bounded=bounded
+        )
 
     @cached_property
     def _outcome(self) -> "Outcome":
@@ -299,18 +291,16 @@ class Run:
 
     @cached_property
     def _run(self) -> "RecordedRun":
-        from cosim.record.run_record import load_run
 
-        return load_run(self.directory)
+        return run_record.load_run(self.directory)
 
     @cached_property
     def _record(self) -> "RunRecord":
         return self._run.loop(self._loop)
 
     def _facts(self) -> list[tuple[str, str]]:
-        from cosim.output.run_tables import run_facts
 
-        return run_facts(self.summary, self.directory)
+        return result_tables.run_facts(self.summary, self.directory)
 
     def __repr__(self) -> str:
         return as_text(self._facts())
@@ -337,13 +327,12 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     Raises:
         NoackError: the scenario is wrong, or the run directory cannot be written.
     """
-    from cosim.live.finalize import finalize
-    from cosim.live.simulated_run import simulate_run
-
     loaded = load(scenario)
     with _folder(runs) as (folder, temporary):
-        ending, view = simulate_run(loaded, folder), temporary is None
-        made = Run(ending.run_dir, lambda: finalize(ending, report=False, view=view), temporary)
+        ending, view = simulated_run.simulate_run(loaded, folder), temporary is None
+        made = Run(
+            ending.run_dir, lambda: run_end.finalize(ending, report=False, view=view), temporary
+        )
     if temporary is None:
         made.summary  # noqa: B018  # writes it into the run directory
     return made
@@ -365,20 +354,16 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
             or the caller is not the main thread, which receives the signals.
     """
-    from cosim.live.finalize import finalize
-    from cosim.live.launcher import launch
-    from cosim.live.progress import PipeSafeConsole, progress_line
-
     loaded = load(scenario)
     if threading.current_thread() is not threading.main_thread():
         raise CallerError(
             "noack.run: a live run is started by the main thread, which signals go to"
         )
     with _folder(runs) as (folder, temporary):
-        console = PipeSafeConsole(stderr=True, quiet=not progress)
-        with progress_line(console, loaded) as watcher:
-            ending = launch(loaded, folder, watcher=watcher)
-        outcome = finalize(ending, report=False, view=temporary is None)
+        console = progress.PipeSafeConsole(stderr=True, quiet=not progress)
+        with progress.progress_line(console, loaded) as watcher:
+            ending = launcher.launch(loaded, folder, watcher=watcher)
+        outcome = run_end.finalize(ending, report=False, view=temporary is None)
         return Run(ending.run_dir, lambda: outcome, temporary)
 
 
@@ -392,12 +377,10 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         NoackError: it is not a run directory, ``latest`` belongs to another user, the record is
             damaged, or the run is still active.
     """
-    from cosim.live.finalize import reopen
-
     path = chosen_run(Path(directory), Path(directory).parent)
     if not (path / SCENARIO_FILE).is_file():
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
-    outcome = reopen(path.resolve())
+    outcome = run_end.reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
 
 
@@ -418,9 +401,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "R
         NoackError: the file is not such an archive, is damaged, or contains code without
             ``run_code`` or a long run without ``long``.
     """
-    from cosim.studies.run_repetition import repeat_archive
-
-    return repeat_archive(Path(path), run_code=run_code, long=long)
+    return run_repetition.repeat_archive(Path(path), run_code=run_code, long=long)
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":
@@ -437,12 +418,12 @@ def compare(*runs: Run | Folder) -> "RunComparison":
         NoackError: there are fewer than two or more than seven runs, or their plants have different
             numbers of states.
     """
-    from cosim.studies.run_comparison import compare_runs
-
     for one in runs:
         if isinstance(one, Run):
             one.summary  # noqa: B018  # a temporary run computes it at the first access
-    return compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
+    return run_comparison.compare_runs(
+        [one.directory if isinstance(one, Run) else Path(one) for one in runs]
+    )
 
 
 @contextmanager

@@ -14,18 +14,40 @@ from typing import TYPE_CHECKING, Any, Literal
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load
+from cosim.lazy_modules import lazy_modules
 from cosim.measurement.measurement_outputs import write_network
 from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
 from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
 from cosim.output.certificates import Certificates, certificates_of
 from cosim.shipped_files import find_shipped
+from noack.config import toml_file
 from noack.config.resolution import resolve
 from noack.core.errors import CallerError
 from noack.core.number_format import Rows, as_html, as_text
 from noack.core.process_limits import cores
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.traces.trace_formats import find_trace
+
+with lazy_modules():
+    from cosim.live import progress as progress_display
+    from cosim.measurement import measurement_page
+    from cosim.output import certificate_report, figure_drawing, result_tables, run_tables
+    from cosim.studies.campaign import (
+        campaign_figures,
+        campaign_file,
+        campaign_report,
+        campaign_summary,
+        campaign_workers,
+        finished_campaign,
+    )
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+_TABLE = Path("campaign")
+"""Stands for the file of a campaign that is given as a table."""
 
 
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
@@ -87,10 +109,7 @@ class Measurement(NetworkMeasurement):
         Raises:
             NoackError: the name has another ending, or the file cannot be written.
         """
-        # Here: it imports matplotlib, which a measurement without a page does not need.
-        from cosim.measurement.measurement_page import write_page
-
-        write_page(self, None, Path(path))
+        measurement_page.write_page(self, None, Path(path))
 
     def write_network(
         self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
@@ -132,20 +151,12 @@ def measure(
     return Measurement(trace, options, " ".join(str(Path(one)) for one in sources), trace.notes)
 
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from matplotlib.figure import Figure
-
-    from cosim.studies.campaign.finished_campaign import FinishedCampaign
-
-_TABLE = Path("campaign")
-"""Stands for the file of a campaign that is given as a table."""
-
-
 class CampaignResult:
     """A finished campaign; :func:`noack.campaign` returns it."""
 
-    def __init__(self, finished: "FinishedCampaign", temporary: Path | None = None) -> None:
+    def __init__(
+        self, finished: "finished_campaign.FinishedCampaign", temporary: Path | None = None
+    ) -> None:
         self._finished = finished
         if temporary is not None:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
@@ -204,16 +215,14 @@ class CampaignResult:
         Raises:
             NoackError: there is no such grid point.
         """
-        import pyarrow as pa
-
-        from cosim.studies.campaign.campaign_file import label_of
-        from cosim.studies.campaign.campaign_summary import runs_at
-
-        wanted = {name: label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
+        wanted = {name: campaign_file.label_of(value) for name, value in axes.items()}  # type: ignore[arg-type]
         points = [one.point for one in self._finished.summary.found]
         for point in points:
             if dict(point.labels) == wanted:
-                metrics, _ = runs_at(point, self._finished.store)
+                metrics, _ = campaign_summary.runs_at(point, self._finished.store)
+                # importing pyarrow takes 0.1 s
+                import pyarrow as pa
+
                 return pa.table({str(name): values for name, values in metrics.items()})
         known = "; ".join(
             f"{axis.name} is one of {', '.join(axis.labels)}"
@@ -230,27 +239,21 @@ class CampaignResult:
         Raises:
             NoackError: the campaign has no such figure.
         """
-        from cosim.output.figure_drawing import draw
-        from cosim.studies.campaign.campaign_figures import figures
-
         known = []
-        for described in figures(self._finished.summary, self._finished.store):
+        for described in campaign_figures.figures(self._finished.summary, self._finished.store):
             if figure in (None, described.name):
-                return draw(described)
+                return figure_drawing.draw(described)
             known.append(described.name)
         named = f'"{figure}": no such figure' if figure else "no figure"
         raise CallerError(f"{named} in this campaign; it has {', '.join(known) or 'none'}")
 
     def report(self) -> Path:
         """Return the path of the page with all tables and figures."""
-        from cosim.studies.campaign.campaign_report import PAGE
-
-        return self.folder / PAGE
+        return self.folder / campaign_report.PAGE
 
     def _rows(self) -> Rows:
-        from cosim.studies.campaign.campaign_report import campaign_tables
 
-        table = next(iter(campaign_tables(self._finished.summary)))
+        table = next(iter(campaign_report.campaign_tables(self._finished.summary)))
         return [(*table.headings,), *((*row,) for row in table.rows)]
 
     def __repr__(self) -> str:
@@ -299,28 +302,22 @@ def campaign(
     Raises:
         NoackError: one line per mistake in the campaign; or it was interrupted.
     """
-    from cosim.studies.campaign.campaign_file import Campaign, load
-    from cosim.studies.campaign.campaign_workers import local
-    from cosim.studies.campaign.finished_campaign import finish_campaign
-    from noack.config import toml_file
-
     if isinstance(source, Mapping):
         path = _TABLE
-        plan = toml_file.validated(Campaign, source, str(path))
+        plan = toml_file.validated(campaign_file.Campaign, source, str(path))
     else:
         path = find_shipped(str(source), "campaigns")
-        plan = load(path)
+        plan = campaign_file.load(path)
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
-    bar = None
-    if progress:
-        from cosim.live.progress import PipeSafeConsole, runs_bar
-
-        bar = runs_bar(PipeSafeConsole(file=sys.stderr))
-    start = partial(local, workers or cores())
+    start = partial(campaign_workers.local, workers or cores())
     try:
-        finished = finish_campaign(
+        finished = finished_campaign.finish_campaign(
             plan, path, Path(folder or temporary or ""), start, draws=draws,
-            show=lambda text: nullcontext(), bar=bar,
+            show=lambda text: nullcontext(),
+            bar=(
+                progress_display.runs_bar(progress_display.PipeSafeConsole(file=sys.stderr))
+                if progress else None
+            ),
         )  # fmt: skip
     except BaseException:
         if temporary is not None:
@@ -330,13 +327,11 @@ def campaign(
 
 
 def _table(rows: list[dict[str, Any]]) -> "pa.Table":
+    # importing pyarrow takes 0.1 s
     import pyarrow as pa
 
     return pa.Table.from_pylist(rows)
 
-
-if TYPE_CHECKING:
-    from cosim.output.result_tables import ResultTable
 
 Result = Run | Certificates | MarginResult | CampaignResult
 
@@ -362,28 +357,18 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
     Raises:
         NoackError: it is another object, or a file cannot be written.
     """
-    from cosim.output.result_tables import save_tables as save
-
-    return save(_tables(result), Path(folder))
+    return result_tables.save_tables(_tables(result), Path(folder))
 
 
-def _tables(result: Result) -> "Iterable[ResultTable]":
+def _tables(result: Result) -> "Iterable[result_tables.ResultTable]":
     """Return the tables that the command of such a result prints."""
     match result:
         case Run():
-            from cosim.output.run_tables import summary_tables
-
-            return summary_tables(result.summary)
+            return run_tables.summary_tables(result.summary)
         case Certificates():
-            from cosim.output.certificate_report import certificate_tables
-
-            return certificate_tables(result)
+            return certificate_report.certificate_tables(result)
         case MarginResult():
-            from cosim.output.certificate_report import margin_tables
-
-            return margin_tables(result)
+            return certificate_report.margin_tables(result)
         case CampaignResult():
-            from cosim.studies.campaign.campaign_report import campaign_tables
-
-            return campaign_tables(result._finished.summary)
+            return campaign_report.campaign_tables(result._finished.summary)
     raise CallerError(f"{type(result).__name__}: has no tables")

@@ -1,20 +1,28 @@
 """The command line ``noack``: one file per command in :mod:`cosim.cli.commands`."""
 
 import gc
+import os
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
+
+from cosim.lazy_modules import lazy_modules
+from noack.core.errors import NoackError
+from noack.core.process_limits import exhausted_limit
+from noack.runtime.command_line import failed, stoppable_imports
+
+with lazy_modules():
+    from cosim.cli import command
+    from cosim.live import fork_server
 
 if TYPE_CHECKING:
     from cosim.cli.command import app, find_scenario
-    from cosim.live.fork_server import ForkServer
 else:
 
     def __getattr__(name: str) -> Any:
         """Import the program with all its commands when a name of it is first used (PEP 562)."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from cosim.cli import command
-
         command.register_commands()
         return getattr(command, name)
 
@@ -27,20 +35,14 @@ _NEW_OBJECTS = 100_000
 
 def main() -> None:
     """Entry point."""
-    from noack.core.errors import NoackError
-    from noack.core.process_limits import exhausted_limit
-    from noack.runtime.command_line import failed, stoppable_imports
-
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]
     as_json = "--json" in words
     with stoppable_imports():
         try:
             server = _fork_server(words)
-            from cosim.cli.command import register_commands, run_program
-
-            register_commands(*words[:1])
-            run_program(server)  # a command handles signals itself
+            command.register_commands(*(words or _completed_words())[:1])
+            command.run_program(server)  # a command handles signals itself
         except NoackError as error:
             sys.exit(failed(str(error), error.exit_status, who="noack", as_json=as_json))
         except Exception as error:
@@ -49,16 +51,17 @@ def main() -> None:
             sys.exit(failed(line, NoackError.exit_status, who="noack", as_json=as_json))
 
 
-def _fork_server(words: list[str]) -> "ForkServer | None":
+def _completed_words() -> list[str]:
+    """Return the words before which a shell asks for completions; none if it does not ask."""
+    line = os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", ""))
+    return line.split()[1:] if "_NOACK_COMPLETE" in os.environ else []
+
+
+def _fork_server(words: list[str]) -> "fork_server.ForkServer | None":
     """Fork the fork server of a live run, which imports while this process does."""
     if sys.platform != "linux" or "--help" in words or not words or words[0] not in _LIVE:
         return None
-    import os
-    from contextlib import suppress
-
-    from cosim.live.fork_server import QUICK_IMPORTS, ForkServer
-
-    os.environ.update(QUICK_IMPORTS)
+    os.environ.update(fork_server.QUICK_IMPORTS)
     with suppress(OSError):  # the command reports it
-        return ForkServer(of_itself=True)
+        return fork_server.ForkServer(of_itself=True)
     return None

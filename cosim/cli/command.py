@@ -1,40 +1,55 @@
 """Declaration of ``noack``'s commands, their shared functions, and the entry point."""
 
+import inspect
 import math
 import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from copy import copy
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import wraps
 from importlib import import_module
-from inspect import cleandoc
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Concatenate,
+    ParamSpec,
+    TypeVar,
+    dataclass_transform,
+)
 
 import typer
 from typer import Argument, Option
 
 from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, ignore_broken_pipes
-from cosim.output.figure_format import FigureFormat
+from cosim.lazy_modules import lazy_modules
+from cosim.output.figure_format import FigureFiles, FigureFormat, figure_files
 from cosim.record.run_directory import DEFAULT_RUNS as DEFAULT_RUNS
+from cosim.record.run_directory import chosen_run
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
 from noack.core.process_limits import cores as cores
 from noack.core.process_limits import exhausted_limit
-from noack.runtime.command_line import LogFormat as LogFormat
-from noack.runtime.command_line import StopRequestError, failed, log_format, stop_requests_raised
+from noack.runtime.command_line import StopRequestError, failed, stop_requests_raised
+
+with lazy_modules():
+    from importlib import metadata
+
+    from cosim.live import fork_server, progress
+    from cosim.output import result_tables
+    from noack.config import scenario_file
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-    from cosim.live.fork_server import ForkServer
-    from cosim.output.result_tables import ResultTable
     from noack.config.scenario import Scenario
 
 _TOUR = (
@@ -50,6 +65,7 @@ _TOUR = (
 )
 """A first session: commands and their descriptions."""
 _MOST_COLUMNS = 78
+_SECTION = re.compile(r"\n\n(Options|Examples):\n")
 _ARGUMENT = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
 """An option and its help, in a docstring."""
 
@@ -61,6 +77,8 @@ PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 """The panels of the help, in order."""
 
 P = ParamSpec("P")
+T = TypeVar("T")
+Found = TypeVar("Found")
 _order: dict[Any, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
 
@@ -139,53 +157,6 @@ TriggerOption = Annotated[
     ),
 ]
 RunsOption = Annotated[Path, Option("--runs", help="Folder of the run directories.")]
-LiveOption = Annotated[
-    bool,
-    Option(
-        "--live",
-        help="Show the run in the rerun viewer: in a window, or without a display in a browser, at "
-        "the address that is printed.",
-    ),
-]
-
-
-def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
-    """Write standard error in this format until the command ends."""
-    stack = ExitStack()
-    stack.enter_context(log_format(wanted))
-    context.find_root().call_on_close(stack.close)
-    return wanted
-
-
-LogFormatOption = Annotated[
-    LogFormat,
-    Option(
-        "--log-format",
-        callback=_log_format,
-        is_eager=True,
-        help="Format of standard error: text, or JSON Lines for log collectors.",
-    ),
-]
-MetricsOption = Annotated[
-    str | None,
-    Option(
-        "--metrics",
-        metavar="[HOST]:PORT",
-        help="Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback "
-        "without a HOST.",
-    ),
-]
-ReportOption = Annotated[
-    bool,
-    Option(
-        "--report/--no-report",
-        help="Write report.html, which takes some seconds; `noack report` writes it later.",
-    ),
-]
-FormatOption = Annotated[
-    FigureFormat | None,
-    Option("--format", help="Write each figure as a file, too; a PDF has the fonts of LaTeX."),
-]
 WidthOption = Annotated[
     str | None,
     Option(
@@ -211,14 +182,73 @@ JsonOption = Annotated[
 ]
 SeedOption = Annotated[int, Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
 SESSION = Option("--session", help="Session name that the processes of a run share.")
-SessionOption = Annotated[str, SESSION]
+
+
+@dataclass_transform()
+def option_group(group: type[T]) -> type[T]:
+    """Make a dataclass of options. With all methods that it could have, it would take 1 ms."""
+    return dataclass(eq=False, repr=False)(group)
+
+
+@option_group
+class ScenarioOptions:
+    """A scenario, and the values of ``--set``."""
+
+    scenario: ScenarioArgument
+    settings: SetOption = None
+
+    def load(self, *more: str) -> "Scenario":
+        """Load the scenario, with more settings as for ``--set``."""
+        return load_scenario(self.scenario, [*(self.settings or ()), *more])
+
+
+@option_group
+class ExampleOptions(ScenarioOptions):
+    """The same; the paper's example by default."""
+
+    scenario: ScenarioArgument = "lane_following"
+
+
+@option_group
+class RunOptions:
+    """An earlier run."""
+
+    run_dir: RunArgument = None
+    runs: RunsOption = DEFAULT_RUNS
+
+    @property
+    def path(self) -> Path:
+        """Its directory; raise CallerError if there is none."""
+        return chosen_run(self.run_dir, self.runs)
+
+
+@option_group
+class LoopOptions(RunOptions):
+    """An earlier run, or one of its loops."""
+
+    loop: LoopOption = None
+
+
+@option_group
+class FigureOptions:
+    """How figures are written as files.
+
+    Options:
+        figure_format: Write each figure as a file, too; a PDF has the fonts of LaTeX.
+    """
+
+    figure_format: Annotated[FigureFormat | None, Option("--format")] = None
+    width: WidthOption = None
+
+    @property
+    def files(self) -> FigureFiles | None:
+        """The files of the figures, if any; raise CallerError if the width is wrong."""
+        return figure_files(self.figure_format, self.width)
 
 
 def _version(requested: bool) -> None:
     if requested:
-        from importlib.metadata import version
-
-        print(f"noack {version('noack')}")
+        print(f"noack {metadata.version('noack')}")
         raise typer.Exit
 
 
@@ -232,26 +262,34 @@ def options(
 
 
 def command(
-    panel: str, place: int, examples: Sequence[tuple[str, str]] = (), **settings: Any
-) -> Callable[[Callable[..., int]], Callable[..., None]]:
+    panel: str, place: int, **settings: Any
+) -> Callable[[Callable[..., int | None]], Callable[..., None]]:
     """Register a command. Its result is the exit status; an error or Ctrl-C is printed as one line.
 
-    The help of an option is under ``Options:`` in its docstring, unless this module declares it.
+    The fields of a parameter that is a dataclass are options. The help of an option is under
+    ``Options:`` in the docstring of the command or the dataclass, unless this module declares it;
+    the examples at the end of the command's help are under ``Examples:``.
 
     Args:
         panel: panel of the help, one of :data:`PANELS`.
         place: sort key within the panel, ascending.
-        examples: commands and their descriptions, shown at the end of the command's help.
         settings: keyword arguments of :meth:`typer.Typer.command`.
     """
 
-    def register(function: Callable[..., int]) -> Callable[..., None]:
+    def register(function: Callable[..., int | None]) -> Callable[..., None]:
+        text, examples = _describe_options(function)
+        parameters, groups = _parameters(function)
+
         @wraps(function)
-        def reported(*arguments: Any, **options: Any) -> None:
-            as_json = bool(options.get("json"))
+        def reported(**given: Any) -> None:
+            as_json = bool(given.get("json"))
+            for name, group in groups.items():
+                given[name] = group(
+                    **{field.name: given.pop(field.name) for field in fields(group)}
+                )
             try:
                 with stop_requests_raised():
-                    status = function(*arguments, **options)
+                    status = function(**given) or ExitStatus.OK
                 if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
             except KeyboardInterrupt as error:
@@ -266,27 +304,51 @@ def command(
                 status = failed(line, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
-        epilog = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
+        reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        reported.__annotations__ = {option.name: option.annotation for option in parameters}
         _order[reported] = PANELS.index(panel), place
-        text = _describe_options(function)
+        shown = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
         registered: Callable[..., None] = app.command(
-            rich_help_panel=panel, epilog=epilog, help=text, **settings
+            rich_help_panel=panel, epilog=shown, help=text, **settings
         )(reported)
         return registered
 
     return register
 
 
-def _describe_options(function: Callable[..., int]) -> str:
-    """Give the options of a command the help of its docstring; return the docstring before it."""
-    text, _, arguments = cleandoc(function.__doc__ or "").partition("\n\nOptions:\n")
-    for name, words in _ARGUMENT.findall(arguments):
-        of = function.__annotations__[name]
+def _describe_options(described: Any) -> tuple[str, list[tuple[str, str]]]:
+    """Give options the help of the docstring; return the text before it, and the examples."""
+    text, *sections = _SECTION.split(inspect.cleandoc(described.__doc__ or ""))
+    parts = dict(zip(sections[::2], sections[1::2], strict=True))
+    for name, words in _ARGUMENT.findall(parts.get("Options", "")):
+        of = described.__annotations__[name]
         metadata = getattr(of, "__metadata__", ())
-        described = copy(metadata[0]) if metadata else Option()
-        described.help = " ".join(words.split())
-        function.__annotations__[name] = Annotated[of.__origin__ if metadata else of, described]
-    return text
+        option = copy(metadata[0]) if metadata else Option()
+        option.help = " ".join(words.split())
+        described.__annotations__[name] = Annotated[of.__origin__ if metadata else of, option]
+    lines = (line.strip().partition("   ") for line in parts.get("Examples", "").splitlines())
+    return text, [(example, what) for example, _, what in lines]
+
+
+def _parameters(
+    function: Callable[..., int | None],
+) -> tuple[list[inspect.Parameter], dict[str, type[Any]]]:
+    """Return the options of a command, and the dataclasses that group them, by parameter."""
+    parameters, groups = [], {}
+    for parameter in inspect.signature(function).parameters.values():
+        members, types = [parameter], function.__annotations__
+        if is_dataclass(group := parameter.annotation):
+            assert isinstance(group, type)
+            groups[parameter.name], types = group, {}
+            members = [*inspect.signature(group).parameters.values()]
+            for base in group.__mro__[-2::-1]:
+                _describe_options(base)
+                types |= vars(base).get("__annotations__", {})
+        parameters += [
+            option.replace(kind=option.KEYWORD_ONLY, annotation=types[option.name])
+            for option in members
+        ]
+    return parameters, groups
 
 
 def _why_not_written(error: Exception) -> str | None:
@@ -322,13 +384,12 @@ def find_scenario(name: str) -> Path:
 
 def load_scenario(name: str, settings: Sequence[str] | None) -> "Scenario":
     """Load a scenario given by path or name, with the values of ``--set``."""
-    from noack.config.scenario_file import load
-
-    return load(find_scenario(name), settings or ())
+    return scenario_file.load(find_scenario(name), settings or ())
 
 
 def console() -> "Console":
-    """Return a console on standard output; importing rich takes 0.05 s."""
+    """Return a console on standard output."""
+    # importing rich takes 0.05 s
     from rich.console import Console
 
     return Console()
@@ -336,17 +397,29 @@ def console() -> "Console":
 
 def status(what: str) -> "AbstractContextManager[Status]":
     """Show within the context what a command is doing, on a terminal only."""
-    from cosim.live.progress import error_console
-
-    return error_console().status(what)
+    return progress.error_console().status(what)
 
 
-def write_tables(tables: "Iterable[ResultTable]", folder: Path | None, *, json: bool) -> None:
+def write_tables(
+    tables: "Iterable[result_tables.ResultTable]", folder: Path | None, *, json: bool
+) -> None:
     """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
     if folder is not None:
-        from cosim.output.result_tables import save_tables
+        print_paths(result_tables.save_tables(tables, folder), json=json)
 
-        print_paths(save_tables(tables, folder), json=json)
+
+def show_with_files(
+    json: bool,
+    document: dict[str, Any],
+    files: Iterable[Path],
+    show_text: "Callable[[Console, Found], object]",
+    found: Found,
+) -> None:
+    """Print a result as :func:`show` does, with the paths of the files that were written."""
+    names = [str(file) for file in files]
+    show(json, lambda: document | {"files": names}, show_text, found)
+    if not json:
+        print(*names, sep="\n")
 
 
 def print_paths(paths: Iterable[Path], *, json: bool) -> None:
@@ -382,7 +455,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def run_program(server: "ForkServer | None" = None) -> None:
+def run_program(server: "fork_server.ForkServer | None" = None) -> None:
     """Run the command of the command line; a live run uses the server."""
     if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
         ignore_broken_pipes()

@@ -1,7 +1,12 @@
 """Shell completion: names of shipped files, run directories, keys of a scenario."""
 
+from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import shipped_names
+
+with lazy_modules():
+    from noack.config import runtime_parameters as parameters
+    from noack.config import scenario, toml_file
 
 
 def scenarios(incomplete: str) -> list[str]:
@@ -28,18 +33,14 @@ def run_directories(incomplete: str) -> list[str]:
 
 def settings(incomplete: str) -> list[str]:
     """Return matching keys for ``--set``, each with its =."""
-    from noack.config.runtime_parameters import SHORT
-    from noack.config.scenario import Scenario
-    from noack.config.toml_file import keys
-
-    return _matching(incomplete, [f"{key}=" for key in (*SHORT, *keys(Scenario))])
+    known = (*parameters.SHORT, *toml_file.keys(scenario.Scenario))
+    return _matching(incomplete, [f"{key}=" for key in known])
 
 
 def runtime_parameters(incomplete: str) -> list[str]:
     """Return matching names of the runtime parameters, short and full."""
-    from noack.config.runtime_parameters import SHORT
-
-    return _matching(incomplete, [*SHORT, *SHORT.values()])
+    short = parameters.SHORT
+    return _matching(incomplete, [*short, *short.values()])
 
 
 def _matching(incomplete: str, words: list[str]) -> list[str]:

@@ -5,154 +5,162 @@ All processes of a run wait for the slowest one: what the start does not need is
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from cosim.cli import command as cli
-from noack.core.errors import CallerError
+from cosim.lazy_modules import lazy_modules
+from noack.core.errors import CallerError, PeerError
+from noack.runtime.command_line import LogFormat, log_format, print_to_stderr
+
+with lazy_modules():
+    from cosim.live import (
+        finalize,
+        fork_server,
+        launcher,
+        progress,
+        remote_access,
+        run_metrics,
+        run_watcher,
+    )
+    from cosim.output import run_verdict
+    from cosim.record import run_directory
+    from cosim.studies.campaign import campaign_file, campaign_workers, finished_campaign
+    from noack.config import link_load, resolution, scenario
+    from noack.protocol import topology
+    from noack.runtime import address, metrics_server, run_registry
+    from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from cosim.live.fork_server import ForkServer
-    from cosim.live.remote_access import Listening
-    from cosim.live.run_watcher import Watcher
     from cosim.output.figure_format import FigureFiles
-    from cosim.record.run_directory import RunEnding
-    from cosim.studies.campaign.campaign_file import Campaign
-    from cosim.studies.campaign.finished_campaign import FinishedCampaign
-    from noack.config.scenario import Scenario
 
 _PER_CORE = 4
 """Maximum worker processes per core; more gain nothing, and use memory."""
-Workers = Annotated[
-    int | None, typer.Option(help="Worker processes; one per core by default.", min=1)
-]
+Workers = Annotated[int | None, Option(help="Worker processes; one per core by default.", min=1)]
 
 
-@dataclass(frozen=True)
-class RunOutput:
-    """What a command prints and writes at the end of a run."""
+@cli.option_group
+class OutputOptions:
+    """What a command prints and writes at the end of a run.
 
-    report: bool
-    """Write ``report.html``."""
-    verbose: bool
-    """Print all tables."""
-    json: bool
-    """Print the summary as JSON instead."""
+    Options:
+        report: Write report.html, which takes some seconds; `noack report` writes it later.
+    """
+
+    report: bool = True
+    verbose: cli.VerboseOption = False
+    json: cli.JsonOption = False
+
+
+def _log_format(context: typer.Context, wanted: LogFormat) -> LogFormat:
+    """Write standard error in this format until the command ends."""
+    stack = ExitStack()
+    stack.enter_context(log_format(wanted))
+    context.find_root().call_on_close(stack.close)
+    return wanted
+
+
+@cli.option_group
+class LiveOptions(OutputOptions):
+    """How a live run is made.
+
+    Options:
+        live: Show the run in the rerun viewer: in a window, or without a display in a browser, at
+            the address that is printed.
+        metrics: Serve the run's metrics for Prometheus (OpenMetrics) at this address; the loopback
+            without a HOST.
+        log_format: Format of standard error: text, or JSON Lines for log collectors.
+    """
+
+    runs: cli.RunsOption = cli.DEFAULT_RUNS
+    live: Annotated[bool, Option("--live")] = False
+    metrics: Annotated[str | None, Option(metavar="[HOST]:PORT")] = None
+    log_format: Annotated[LogFormat, Option(callback=_log_format, is_eager=True)] = LogFormat.TEXT
 
 
 def run_processes(
-    load: Callable[[], "Scenario"],
-    runs: Path,
-    output: RunOutput,
+    load: "Callable[[], scenario.Scenario]",
+    options: LiveOptions,
     *,
     spawn: Sequence[str] | None = None,
     session: str | None = None,
-    live: bool = False,
-    server: "ForkServer | None" = None,
-    listening: "Listening | None" = None,
-    metrics: str | None = None,
+    server: "fork_server.ForkServer | None" = None,
+    listening: "remote_access.Listening | None" = None,
 ) -> int:
     """Run a scenario live; print its verdict and return the exit status.
 
     Args:
         load: loads the scenario.
-        runs: folder of the run directories.
-        output: what is printed and written at the end.
+        options: of the command.
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
-        live: show the run in the viewer.
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
-        metrics: address at which the run's metrics are served.
     """
-    from cosim.live.fork_server import fork_server
-
-    with fork_server(server) as server:
-        from cosim.live.launcher import launch
-        from cosim.live.run_watcher import RunLog, Watcher, joint_watcher, later_watcher
-        from noack.config.link_load import require_capacity
-        from noack.protocol.topology import ROLES
-
-        scenario, ending = load(), None
-        require_capacity(scenario)
+    with fork_server.fork_server(server) as server:
+        loaded, ending = load(), None
+        link_load.require_capacity(loaded)
         warn_of_other_runs()
         # Those of the theory come at the start: nothing waits for the launcher then.
-        warnings = Watcher(started=lambda run_dir: warn_of_violations(scenario))
+        warnings = run_watcher.Watcher(started=lambda run_dir: warn_of_violations(loaded))
         try:
             with ExitStack() as stack:
-                line = later_watcher(lambda: stack.enter_context(_progress(scenario, session)))
-                watchers = [warnings, line, RunLog().watcher()]
-                if metrics is not None:
-                    watchers.append(stack.enter_context(_served_metrics(scenario, metrics)))
-                ending = launch(
-                    scenario, runs, spawn=spawn or ROLES, session=session, live=live,
-                    watcher=joint_watcher(watchers), server=server, listening=listening,
+                line = run_watcher.later_watcher(
+                    lambda: stack.enter_context(
+                        progress.progress_line(progress.error_console(), loaded, session)
+                    )
+                )
+                watchers = [warnings, line, run_watcher.RunLog().watcher()]
+                if options.metrics is not None:
+                    watchers.append(stack.enter_context(_served_metrics(loaded, options.metrics)))
+                ending = launcher.launch(
+                    loaded, options.runs, spawn=spawn or topology.ROLES, session=session,
+                    live=options.live, watcher=run_watcher.joint_watcher(watchers),
+                    server=server, listening=listening,
                 )  # fmt: skip
         except OSError:  # a closed terminal must not end the run
             if ending is None:
                 raise
-    return finalize_run(ending, output)
-
-
-def _progress(scenario: "Scenario", session: str | None) -> "AbstractContextManager[Watcher]":
-    """Give what shows the progress of a run; importing rich takes 0.05 s."""
-    from cosim.live.progress import error_console, progress_line
-
-    return progress_line(error_console(), scenario, session)
+    return finalize_run(ending, options)
 
 
 @contextmanager
-def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
+def _served_metrics(loaded: "scenario.Scenario", where: str) -> "Iterator[run_watcher.Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
-    from noack.runtime.address import text_of
-    from noack.runtime.command_line import print_to_stderr
-    from noack.runtime.metrics_server import metrics_server, require_package
-
-    require_package()
-    from cosim.live.run_metrics import RunMetrics
-
-    found = RunMetrics(scenario)
-    with metrics_server(where, found.collect) as address:
-        print_to_stderr(f"noack: metrics: http://{text_of(address)}/metrics")
+    metrics_server.require_package()
+    found = run_metrics.RunMetrics(loaded)
+    with metrics_server.metrics_server(where, found.collect) as at:
+        print_to_stderr(f"noack: metrics: http://{address.text_of(at)}/metrics")
         yield found.watcher()
 
 
-def warn_of_violations(scenario: "Scenario") -> None:
+def warn_of_violations(loaded: "scenario.Scenario") -> None:
     """Print the assumptions of Theorem 2 that the scenario violates, on standard error.
 
     Loops that share a network: also what may go wrong at their bottleneck.
     """
-    from noack.config.link_load import link_loads, load_warnings
-    from noack.config.resolution import resolve
-    from noack.config.scenario import loop_names, loop_scenario, loop_sections
-    from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
-
-    shares = len(loop_names(scenario)) > 1
-    for line in load_warnings(link_loads(scenario), scenario) if shares else ():
+    shares = len(scenario.loop_names(loaded)) > 1
+    for line in link_load.load_warnings(link_load.link_loads(loaded), loaded) if shares else ():
         print(f"noack: warning: {line}", file=sys.stderr)
-    for section in loop_sections(scenario):
+    for section in scenario.loop_sections(loaded):
         whose = f"{section.name}: " if shares else ""
-        for assumption in assumptions(resolve(loop_scenario(scenario, section))):
-            if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
+        resolved = resolution.resolve(scenario.loop_scenario(loaded, section))
+        for found in assumptions.assumptions(resolved):
+            is_violated = found.verdict == assumptions.AssumptionStatus.VIOLATED
+            if is_violated and found.source == "Theorem 2":
                 print(
-                    f"noack: warning: {whose}violated: {assumption.what}: {assumption.why}",
-                    file=sys.stderr,
+                    f"noack: warning: {whose}violated: {found.what}: {found.why}", file=sys.stderr
                 )
 
 
 def warn_of_other_runs() -> None:
     """Print on standard error which runs are active: each may make the others late."""
-    from noack.core.errors import PeerError
-    from noack.runtime.run_registry import active_runs
-
     try:
-        others = active_runs()
+        others = run_registry.active_runs()
     except PeerError:  # a damaged file of another run must not prevent this one
         return
     for run in others:
@@ -163,47 +171,40 @@ def warn_of_other_runs() -> None:
         )
 
 
-def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
+def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
-    from cosim.live.finalize import finalize
-    from cosim.live.run_watcher import log_end
-    from cosim.output.run_verdict import print_outcome
-
     try:
         # This takes minutes for a run of an hour.
         with cli.status("replaying the run and checking its claims"):
-            outcome = finalize(ending, report=output.report)
+            outcome = finalize.finalize(ending, report=options.report)
     except KeyboardInterrupt as error:
         error.add_note(f"`noack summary {ending.run_dir}` completes its record")
         raise
-    log_end(outcome.status, outcome.reason, outcome.run_dir)
-    document = outcome.summary.to_json
-    cli.show(output.json, document, print_outcome, outcome, verbose=output.verbose)
+    run_watcher.log_end(outcome.status, outcome.reason, outcome.run_dir)
+    document, text = outcome.summary.to_json, run_verdict.print_outcome
+    cli.show(options.json, document, text, outcome, verbose=options.verbose)
     return outcome.status
 
 
 def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[Any], Any]:
     """Return a function that starts the workers; its argument is a function that prints a line."""
-    from cosim.studies.campaign.campaign_workers import cluster, local
-
     if scheduler is not None:
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
-        return lambda say: cluster(scheduler, say)
+        return lambda say: campaign_workers.cluster(scheduler, say)
     number = workers or cli.cores()
     if number > (most := _PER_CORE * cli.cores()):
         raise CallerError(f"--workers {number}: on this machine at most {most}")
-    return lambda say: local(number)
+    return lambda say: campaign_workers.local(number)
 
 
 def execute_campaign(
-    console: "Console", plan: "Campaign", path: Path, start: Callable[[Any], Any], *,
+    plan: "campaign_file.Campaign", path: Path, start: Callable[[Any], Any], *,
     folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
-) -> "FinishedCampaign":  # fmt: skip
+) -> "finished_campaign.FinishedCampaign":  # fmt: skip
     """Run or continue a campaign; write its page.
 
     Args:
-        console: shows the progress.
         plan: the campaign.
         path: its file, in whose folder its scenario may be.
         start: starts the workers, see :func:`worker_pool`.
@@ -211,13 +212,12 @@ def execute_campaign(
         draws: number of draws; the campaign's by default.
         figure_files: write each figure as a file, too.
     """
-    from cosim.live.progress import runs_bar
-    from cosim.studies.campaign.finished_campaign import finish_campaign
+    console = progress.error_console()
 
     def say(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
-    return finish_campaign(
+    return finished_campaign.finish_campaign(
         plan, path, folder, lambda: start(say), draws=draws, figure_files=figure_files,
-        show=console.status, bar=runs_bar(console),
+        show=console.status, bar=progress.runs_bar(console),
     )  # fmt: skip

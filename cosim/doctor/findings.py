@@ -1,15 +1,27 @@
-"""Findings on a machine, from its measurements: their meaning for a run, remedies, a table."""
+"""Findings on a machine, from its measurements: their meaning for a run, remedies, a table.
 
-from collections.abc import Iterator, Sequence
+A check of the doctor is a function with the decorator ``_check``; its place here is that in the
+table. It yields a verdict for each thing that it found.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cosim.doctor.machine_measures import Lateness, MachineFacts, RunRequirements
+from cosim.doctor.machine_measures import (
+    EXTRAS,
+    Buffer,
+    Disk,
+    Lateness,
+    MachineFacts,
+    RoundTrips,
+    RunRequirements,
+)
 from noack.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5
@@ -33,15 +45,6 @@ _REMEDIES = {
     "sched_fifo": _PRIVILEGES,
     "memory_lock": _PRIVILEGES,
     "cpu_dma_latency": "let this user write to /dev/cpu_dma_latency, e.g. by a udev rule",
-}
-_EXTRAS = {
-    "fmi": 'plants of kind "fmu"',
-    "vehicle": 'plants of kind "vehicle"',
-    "cluster": "`noack campaign --scheduler`",
-    "mcap": "`noack export --format mcap`",
-    "metrics": "`--metrics`",
-    "lab": "`noack lab`",
-    "notebook": "sliders of `noack.explore`",
 }
 
 
@@ -75,26 +78,42 @@ _VERDICTS = {
 """Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
+T = TypeVar("T")
+Outcome = tuple[FindingStatus, *tuple[str, ...]]
+"""As a finding, without ``what``."""
+_checks: list[Callable[[MachineFacts, RunRequirements], Iterator[MachineFinding]]] = []
+
+
+def _check(
+    what: str,
+    fact: Callable[[MachineFacts], T | str],
+    failed: tuple[FindingStatus, str, str] = (BAD, "", ""),
+) -> Callable[[Callable[[T, RunRequirements], Iterator[Outcome]]], None]:
+    """Register a check.
+
+    Args:
+        what: it finds; ``{}`` is the scenario's name.
+        fact: the measurement that it is given.
+        failed: verdict, meaning and remedy if the measurement failed: then it is the reason.
+    """
+
+    def register(check: Callable[[T, RunRequirements], Iterator[Outcome]]) -> None:
+        def judged(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
+            title, found = what.format(wanted.name), fact(machine)
+            if isinstance(found, str):
+                verdict, means, remedy = failed
+                yield MachineFinding(title, verdict, found, means, remedy)
+            else:
+                yield from (MachineFinding(title, *outcome) for outcome in check(found, wanted))
+
+        _checks.append(judged)
+
+    return register
+
+
 def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding]:
     """Return the findings for a scenario's runs on this machine."""
-    return [
-        _cores(machine),
-        *_settings(machine, wanted),
-        _timer(machine),
-        _wake_ups("wake-ups without real-time settings", machine.plain, wanted,
-                  in_force=not wanted.realtime),
-        _wake_ups("wake-ups with the real-time settings applied", machine.realtime, wanted,
-                  in_force=wanted.realtime),
-        _loopback(machine),
-        _buffer(machine, wanted),
-        *_ports(machine, wanted),
-        _control(machine),
-        _disk(machine, wanted),
-        _runtime_folder(machine),
-        _viewer(machine),
-        *_extras(machine),
-        _versions(machine),
-    ]  # fmt: skip
+    return [finding for check in _checks for finding in check(machine, wanted)]
 
 
 def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
@@ -103,30 +122,32 @@ def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
     return max((finding.verdict for finding in findings), key=order.index)
 
 
-def _cores(machine: MachineFacts) -> MachineFinding:
+@_check("cores", lambda machine: machine)
+def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     known = [f"{machine.cores} of {machine.cores_online} usable"]
     if machine.load is not None:
         known.append(f"load {machine.load:.1f}")
     if machine.governor is not None:
         known.append(f"governor {machine.governor}")
-    what, found = "cores", ", ".join(known)
+    found = ", ".join(known)
     if machine.cores < 2:
         means = f"the {LOOP_PROCESSES} processes of a run compete for one core"
-        return MachineFinding(what, LIMITED, found, means, "use two cores or more")
-    if machine.load is not None and machine.load > machine.cores:
+        yield LIMITED, found, means, "use two cores or more"
+    elif machine.load is not None and machine.load > machine.cores:
         means = "other programs use the cores: the measurements below are of a busy machine"
-        return MachineFinding(what, LIMITED, found, means, "measure again when it is idle")
-    if machine.governor == "powersave":
+        yield LIMITED, found, means, "measure again when it is idle"
+    elif machine.governor == "powersave":
         remedy = "`sudo cpupower frequency-set --governor performance`"
-        return MachineFinding(what, LIMITED, found, "cores run slowly after waking up", remedy)
-    return MachineFinding(what, GOOD, found)
+        yield LIMITED, found, "cores run slowly after waking up", remedy
+    else:
+        yield GOOD, found
 
 
-def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
+@_check("real-time settings", lambda machine: machine)
+def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
     applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "applied"]
-    what = "real-time settings"
     if applied:
-        yield MachineFinding(what, GOOD, f"applied: {', '.join(applied)}")
+        yield GOOD, f"applied: {', '.join(applied)}"
     for key, name in _SETTINGS.items():
         answer = machine.granted.get(key, "not known")
         if not answer.startswith("not permitted"):
@@ -134,27 +155,40 @@ def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Machin
         verdict, means = GOOD, f"{wanted.name} does not use it"
         if wanted.realtime:
             verdict, means = LIMITED, "runs work without it, and report it"
-        yield MachineFinding(what, verdict, f"{name}: {answer}", means, _REMEDIES.get(key, ""))
+        yield verdict, f"{name}: {answer}", means, _REMEDIES.get(key, "")
 
 
-def _timer(machine: MachineFacts) -> MachineFinding:
+@_check("timers", lambda machine: machine)
+def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     slack = machine.timer_slack_ns
-    known = [f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"]
+    found = f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"
     if slack is not None:
-        known.append(f"default slack {duration(slack * 1e-9)}")
-    found = ", ".join(known)
+        found += f", default slack {duration(slack * 1e-9)}"
     if machine.timer_resolution_ns >= _SLOW_TIMER_NS:
-        means = "shorter steps cannot be distinguished"
-        return MachineFinding("timers", LIMITED, found, means, "lower plant.rate_hz")
-    return MachineFinding("timers", GOOD, found)
+        yield LIMITED, found, "shorter steps cannot be distinguished", "lower plant.rate_hz"
+    else:
+        yield GOOD, found
 
 
-def _wake_ups(
-    what: str, found: Lateness | str, wanted: RunRequirements, *, in_force: bool
-) -> MachineFinding:
+_UNKNOWN_LATENESS = LIMITED, "the lateness of a run cannot be predicted", ""
+
+
+@_check("wake-ups without real-time settings", lambda machine: machine.plain, _UNKNOWN_LATENESS)
+def _plain_wake_ups(found: Lateness, wanted: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(found, wanted, in_force=not wanted.realtime)
+
+
+@_check(
+    "wake-ups with the real-time settings applied",
+    lambda machine: machine.realtime,
+    _UNKNOWN_LATENESS,
+)
+def _realtime_wake_ups(found: Lateness, wanted: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(found, wanted, in_force=wanted.realtime)
+
+
+def _wake_ups(found: Lateness, wanted: RunRequirements, *, in_force: bool) -> Outcome:
     """Compare the lateness of an idle loop with the lateness that the certificates allow."""
-    if isinstance(found, str):
-        return MachineFinding(what, LIMITED, found, "the lateness of a run cannot be predicted")
     late = (
         f"late by {found.p50_us:.3g} µs (median), {duration(found.p99_us * 1e-6)} (p99), "
         f"{duration(found.max_us * 1e-6)} (max) over {found.wakes:,} wake-ups at "
@@ -164,7 +198,7 @@ def _wake_ups(
     if not found.beyond:
         near = found.max_us * 1e3 > wanted.allowance_ns / 2
         means = f"all within {allowed}" + (", some above half of it" if near else "")
-        return MachineFinding(what, GOOD, late, f"{means}; a longer run may exceed the maximum")
+        return GOOD, late, f"{means}; a longer run may exceed the maximum"
     share = 100 * found.beyond / found.wakes
     first_s = found.wakes / found.beyond / wanted.rate_hz
     means = (
@@ -172,130 +206,133 @@ def _wake_ups(
         f"{first_s:.2g} s of a run of {wanted.duration_s:g} s; the first makes its claims void"
     )
     if not in_force:
-        return MachineFinding(what, GOOD, late, f"{means}. Runs use real-time settings")
+        return GOOD, late, f"{means}. Runs use real-time settings"
     remedy = "raise certificate.late_periods, lower speed or rates, or permit SCHED_FIFO"
-    return MachineFinding(what, LIMITED, late, means, remedy)
+    return LIMITED, late, means, remedy
 
 
-def _loopback(machine: MachineFacts) -> MachineFinding:
-    what, found = "UDP on the loopback", machine.round_trips
-    if isinstance(found, str):
-        means = "the processes of a run cannot communicate"
-        remedy = "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1"
-        return MachineFinding(what, BAD, found, means, remedy)
+@_check("UDP on the loopback", lambda machine: machine.round_trips, (
+    BAD, "the processes of a run cannot communicate",
+    "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1",
+))  # fmt: skip
+def _loopback(found: RoundTrips, _: RunRequirements) -> Iterator[Outcome]:
     p50, p99 = duration(found.p50_us * 1e-6), duration(found.p99_us * 1e-6)
     text = f"round trip {p50} (median), {p99} (p99)"
     if found.lost:
-        lost = f"{text}; {found.lost} of {found.sent} lost"
         means = "unintended losses break the bound on consecutive losses"
-        return MachineFinding(what, LIMITED, lost, means, "check the firewall and `tc qdisc show`")
-    return MachineFinding(what, GOOD, text)
+        lost = f"{text}; {found.lost} of {found.sent} lost"
+        yield LIMITED, lost, means, "check the firewall and `tc qdisc show`"
+    else:
+        yield GOOD, text
 
 
-def _buffer(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
-    what, found = "receive buffer", machine.buffer
-    if isinstance(found, str):
-        return MachineFinding(what, BAD, found, "no process of a run can receive")
+@_check(
+    "receive buffer",
+    lambda machine: machine.buffer,
+    (BAD, "no process of a run can receive", ""),
+)
+def _buffer(found: Buffer, wanted: RunRequirements) -> Iterator[Outcome]:
     text = f"{found.datagrams:,} datagrams ({found.granted_bytes // 1024:,} KiB)"
     if found.most_bytes is not None:
         text += f"; net.core.rmem_max is {found.most_bytes:,} bytes"
     stall_s = found.datagrams / wanted.rate_hz
     means = f"the receive buffer covers a {stall_s:.2g} s stall before packets are lost"
     if found.datagrams >= PLENTY_OF_DATAGRAMS:
-        return MachineFinding(what, GOOD, text, means)
-    return MachineFinding(what, LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`")
+        yield GOOD, text, means
+    else:
+        yield LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`"
 
 
-def _ports(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
-    what, means = f"ports of {wanted.name}", f"{wanted.name} cannot run on its configured ports"
+@_check("ports of {}", lambda machine: machine.ports_taken)
+def _ports(taken: Sequence[str], wanted: RunRequirements) -> Iterator[Outcome]:
     remedy = "stop the program that uses the port, or `--set ports={}`"
-    for line in machine.ports_taken:
-        yield MachineFinding(what, BAD, line, means, remedy)
-    if not machine.ports_taken:
+    for line in taken:
+        yield BAD, line, f"{wanted.name} cannot run on its configured ports", remedy
+    if not taken:
         numbers = ", ".join(str(port) for port in wanted.ports.values())
-        yield MachineFinding(what, GOOD, f"{numbers} free" if numbers else "any free port")
+        yield GOOD, f"{numbers} free" if numbers else "any free port"
 
 
-def _control(machine: MachineFacts) -> MachineFinding:
-    what, found = "control plane", machine.control
-    if isinstance(found, str):
-        means = "the processes of a run cannot join it"
-        remedy = "set XDG_RUNTIME_DIR to a folder of yours that is closed to others"
-        return MachineFinding(what, BAD, found, means, remedy)
-    return MachineFinding(what, GOOD, f"zenoh over a Unix socket answers in {duration(found)}")
+@_check("control plane", lambda machine: machine.control, (
+    BAD, "the processes of a run cannot join it",
+    "set XDG_RUNTIME_DIR to a folder of yours that is closed to others",
+))  # fmt: skip
+def _control(answered_s: float, _: RunRequirements) -> Iterator[Outcome]:
+    yield GOOD, f"zenoh over a Unix socket answers in {duration(answered_s)}"
 
 
-def _disk(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
-    what, found = "disk", machine.disk
-    remedy = "choose another folder by --runs"
-    if isinstance(found, str):
-        return MachineFinding(what, BAD, found, "nothing can be recorded", remedy)
+_ANOTHER_FOLDER = "choose another folder by --runs"
+
+
+@_check("disk", lambda machine: machine.disk, (BAD, "nothing can be recorded", _ANOTHER_FOLDER))
+def _disk(found: Disk, wanted: RunRequirements) -> Iterator[Outcome]:
     text = (
         f"{found.folder}: {byte_size(found.free_bytes)} free, writes "
         f"{byte_size(found.write_bytes_per_s)}/s"
     )
     needs = f"{wanted.name} needs {byte_size(found.needed_bytes)} plus its events"
     if found.free_bytes < found.needed_bytes:
-        return MachineFinding(what, BAD, text, needs, f"{remedy}, or shorten horizon_s")
-    if found.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
-        return MachineFinding(what, LIMITED, text, f"{needs}; ending a run takes long", remedy)
-    return MachineFinding(what, GOOD, text, needs)
+        yield BAD, text, needs, f"{_ANOTHER_FOLDER}, or shorten horizon_s"
+    elif found.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
+        yield LIMITED, text, f"{needs}; ending a run takes long", _ANOTHER_FOLDER
+    else:
+        yield GOOD, text, needs
 
 
-def _runtime_folder(machine: MachineFacts) -> MachineFinding:
-    what, problem = "runtime folder", machine.runtime_folder
-    if problem is None:
-        return MachineFinding(what, GOOD, "private to this user")
-    means = "`noack record` cannot open a run for other terminals, and `noack set` finds no run"
-    remedy = "set XDG_RUNTIME_DIR to a folder that you own"
-    return MachineFinding(what, LIMITED, problem, means, remedy)
+@_check("runtime folder", lambda machine: machine.runtime_folder, (
+    LIMITED,
+    "`noack record` cannot open a run for other terminals, and `noack set` finds no run",
+    "set XDG_RUNTIME_DIR to a folder that you own",
+))  # fmt: skip
+def _runtime_folder(_found: None, _: RunRequirements) -> Iterator[Outcome]:
+    yield GOOD, "private to this user"
 
 
-def _viewer(machine: MachineFacts) -> MachineFinding:
-    what = "viewer"
-    if machine.viewer is None:
-        means = "no recording is written or shown"
-        remedy = "`pip install --force-reinstall noack`"
-        return MachineFinding(what, BAD, "rerun cannot be imported", means, remedy)
+@_check("viewer", lambda machine: machine)
+def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     text = f"rerun {machine.viewer}"
-    if machine.display:
-        return MachineFinding(what, GOOD, f"{text}, and a display")
-    means = "`noack view` and --live open in a browser, not in a window"
-    remedy = "from another machine, forward the port: `ssh -L PORT:127.0.0.1:PORT`"
-    return MachineFinding(what, LIMITED, f"{text}, no display", means, remedy)
+    if machine.viewer is None:
+        remedy = "`pip install --force-reinstall noack`"
+        yield BAD, "rerun cannot be imported", "no recording is written or shown", remedy
+    elif machine.display:
+        yield GOOD, f"{text}, and a display"
+    else:
+        means = "`noack view` and --live open in a browser, not in a window"
+        remedy = "from another machine, forward the port: `ssh -L PORT:127.0.0.1:PORT`"
+        yield LIMITED, f"{text}, no display", means, remedy
 
 
-def _extras(machine: MachineFacts) -> Iterator[MachineFinding]:
+@_checks.append
+def _extras(machine: MachineFacts, _: RunRequirements) -> Iterator[MachineFinding]:
     for name, installed in machine.extras.items():
-        what, of = f"extra: {name}", _EXTRAS[name]
+        what, (_module, use) = f"extra: {name}", EXTRAS[name]
         if installed:
-            yield MachineFinding(what, GOOD, f"installed, for {of}")
+            yield MachineFinding(what, GOOD, f"installed, for {use}")
         else:
             remedy = f"`pip install 'noack[{name}]'`"
-            yield MachineFinding(what, LIMITED, "not installed", f"no {of}", remedy)
+            yield MachineFinding(what, LIMITED, "not installed", f"no {use}", remedy)
 
 
-def _versions(machine: MachineFacts) -> MachineFinding:
+@_check("versions", lambda machine: machine)
+def _versions(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     known = [f"{name} {version}" for name, version in machine.versions.items() if version]
     missing = [name for name, version in machine.versions.items() if not version]
-    if not missing:
-        return MachineFinding("versions", GOOD, ", ".join(known))
     means = f"{', '.join(missing)}: not installed as a package, so runs cannot record the version"
-    return MachineFinding("versions", LIMITED, ", ".join(known), means, "`pip install noack`")
+    if missing:
+        yield LIMITED, ", ".join(known), means, "`pip install noack`"
+    else:
+        yield GOOD, ", ".join(known)
 
 
 def document(
     machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
     return {
-        "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
+        "scenario": asdict(wanted),
         "verdict": worst(findings),
         "findings": [finding._asdict() for finding in findings],
-        "measured": {
-            name: value._asdict() if hasattr(value, "_asdict") else value
-            for name, value in asdict(machine).items()
-        },
+        "measured": asdict(machine),
     }
 
 

@@ -17,7 +17,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import zenoh
@@ -35,10 +35,16 @@ from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
 
 T = TypeVar("T")
-EXTRAS = {"fmi": "fmpy", "vehicle": "vehiclemodels", "cluster": "distributed",
-          "mcap": "mcap", "metrics": "prometheus_client", "lab": "nicegui",
-          "notebook": "ipywidgets"}  # fmt: skip
-"""Extras of noack by name, and one module that each installs."""
+EXTRAS = {
+    "fmi": ("fmpy", 'plants of kind "fmu"'),
+    "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
+    "cluster": ("distributed", "`noack campaign --scheduler`"),
+    "mcap": ("mcap", "`noack export --format mcap`"),
+    "metrics": ("prometheus_client", "`--metrics`"),
+    "lab": ("nicegui", "`noack lab`"),
+    "notebook": ("ipywidgets", "sliders of `noack.explore`"),
+}
+"""Extras of noack by name: one module that each installs, and what it is for."""
 _DATAGRAM = bytes(72)
 _ROUND_TRIPS = 1000
 _FLOOD = 20_000
@@ -48,7 +54,8 @@ _ANSWER_S = 2.0
 _PR_GET_TIMERSLACK = 30
 
 
-class RunRequirements(NamedTuple):
+@dataclass(frozen=True)
+class RunRequirements:
     """What a scenario requires of the machine; times are wall time."""
 
     name: str
@@ -87,7 +94,8 @@ def requirements_of(resolved: Scenario) -> RunRequirements:
     )
 
 
-class Lateness(NamedTuple):
+@dataclass(frozen=True)
+class Lateness:
     """Lateness of an idle loop that wakes up at the plant's rate."""
 
     wakes: int
@@ -98,7 +106,8 @@ class Lateness(NamedTuple):
     """Number of wake-ups that were later than the certificates allow."""
 
 
-class RoundTrips(NamedTuple):
+@dataclass(frozen=True)
+class RoundTrips:
     """Round trips of datagrams to another process over UDP on the loopback."""
 
     sent: int
@@ -107,7 +116,8 @@ class RoundTrips(NamedTuple):
     p99_us: float
 
 
-class Buffer(NamedTuple):
+@dataclass(frozen=True)
+class Buffer:
     """The receive buffer of a run's sockets."""
 
     datagrams: int
@@ -117,7 +127,8 @@ class Buffer(NamedTuple):
     """Largest size without privileges; None if unknown."""
 
 
-class Disk(NamedTuple):
+@dataclass(frozen=True)
+class Disk:
     """The folder of the run directories."""
 
     folder: str
@@ -195,7 +206,7 @@ def measure(
         runtime_folder=_runtime_folder(),
         display=has_display(),
         viewer=about["packages"].get("rerun-sdk") if find_spec("rerun") else None,
-        extras={name: find_spec(module) is not None for name, module in EXTRAS.items()},
+        extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
         versions={"python": about["python"], **about["packages"]},
     )
 

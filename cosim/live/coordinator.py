@@ -10,9 +10,10 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import zenoh
+from pydantic import JsonValue
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.config.parameter_changes import (
@@ -118,7 +119,7 @@ class Coordinator:
         """The process of each role that has joined last."""
         self._replaceable: dict[str, str] = {}
         """Roles that a restarted process may take, and how the process before it ended."""
-        self.joined: dict[str, dict[str, Any]] = {}
+        self.joined: dict[str, dict[str, str | int]] = {}
         """The processes that passed the start barrier, by instance: ``process``, ``generation``."""
         self._reported: dict[str, str] = {}
         self._stopped: str | None = None
@@ -305,18 +306,16 @@ class Coordinator:
         current = self._members.get(role)
         if current is not member:
             current = self._vacant(role)
-        if member is None or (
-            current is not None and current is not member
-            and member.generation <= current.generation
-        ):  # fmt: skip
+        other = None if current is member else current
+        if member is None or (other is not None and member.generation <= other.generation):
             raise PeerError("it was not admitted")
         if (request.address is None) == (role in LOOP_ROLES):
             raise PeerError("a process of the loop needs an address, the recorder has none")
         if self._clock is not None and request.address != member.address:
             raise PeerError("it must use the address of the process before it")
         member.apply(Event.JOIN)
-        if current is not None and current is not member:
-            current.apply(Event.REPLACE)
+        if other is not None:
+            other.apply(Event.REPLACE)
         member.address, member.query = request.address, query
         self._members[role] = member
         if self._clock is not None:
@@ -442,7 +441,7 @@ class ChangeRequests:
     def _schedules(self) -> tuple[ChangeSchedule, ...]:
         return (self._schedule, *self._entries.values())
 
-    def _parameters(self) -> dict[str, dict[str, Any]]:
+    def _parameters(self) -> dict[str, dict[str, JsonValue]]:
         return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
 
     def _add(

@@ -24,9 +24,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO
 
+from cosim.lazy_modules import lazy_modules
 from noack.core.errors import MachineError
 from noack.core.process_limits import python_command, require_limits
 from noack.runtime.command_line import TICKET_ON_STDIN
+
+with lazy_modules():
+    import noack.impairments.kinds.loss as loss
+    from noack.config import scenario, scenario_checks
+    from noack.impairments import link_settings
+    from noack.runtime import control_messages, join_ticket
 
 _COMMON = (
     "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
@@ -133,7 +140,7 @@ class ForkServer:
         That is one thread, open standard streams, and UTF-8 for files and streams.
         """
         _import(_COMMON)
-        _build_scenario()
+        scenario.Scenario.model_rebuild()  # the launcher needs its validators, too
         threads = len([*Path("/proc/self/task").iterdir()])
         is_closed = None in (sys.stdin, sys.stdout, sys.stderr)
         if threads > 1 or is_closed or sys.getfilesystemencoding() != "utf-8":
@@ -259,27 +266,14 @@ def _fork_twice() -> int:
     return pid
 
 
-def _build_scenario() -> None:
-    """Build the validators of a scenario, which the launcher needs, too."""
-    from noack.config.scenario import Scenario
-
-    Scenario.model_rebuild()
-
-
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
-    from noack.config.scenario_checks import prepare_changes
-    from noack.impairments.kinds.loss import LossOf
-    from noack.impairments.link_settings import LinkSettings
-    from noack.runtime.control_messages import ControlMessage
-    from noack.runtime.join_ticket import Ticket
-
-    _build_scenario()
-    for section in (Ticket, LinkSettings, LossOf):
+    for section in (
+        scenario.Scenario, join_ticket.Ticket, link_settings.LinkSettings, loss.LossOf,
+        *control_messages.ControlMessage.__subclasses__(),
+    ):  # fmt: skip
         section.model_rebuild()
-    for message in ControlMessage.__subclasses__():
-        message.model_rebuild()
-    prepare_changes()
+    scenario_checks.prepare_changes()
 
 
 def main() -> None:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING
 
+from cosim.lazy_modules import lazy_modules
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ForkServer, fork_server
@@ -52,8 +52,8 @@ from noack.runtime.control_plane import run_name
 from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 
-if TYPE_CHECKING:
-    from cosim.live.remote_access import Listening
+with lazy_modules():  # asyncio and TLS
+    from cosim.live import remote_access
 
 _STOP_TIMEOUT_S = 15.0
 DEFAULT_S = 30.0
@@ -76,7 +76,7 @@ def launch(
     live: bool = False,
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
-    listening: "Listening | None" = None,
+    listening: "remote_access.Listening | None" = None,
 ) -> RunEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
@@ -96,9 +96,7 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     if listening is not None:
-        from cosim.live.remote_access import open_to_hosts, with_clocks  # asyncio and TLS
-
-        scenario = with_clocks(scenario)
+        scenario = remote_access.with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         loops = resolved_loops(scenario)
@@ -108,8 +106,6 @@ def launch(
             # Compile now: the start barrier has a time limit.
             for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
                 system.prepare()
-        away = {} if listening is None else listening.hosts
-        here = [role for role in spawn if role not in away]
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
@@ -117,26 +113,26 @@ def launch(
         stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         _publish_run(stack, ticket, session)  # first: its file leads to a killed run's socket
-        coordinator = Coordinator(ticket, here)
+        away = {} if listening is None else listening.hosts
+        coordinator = Coordinator(ticket, [role for role in spawn if role not in away])
         stack.callback(coordinator.close)
-        watcher, remote = joint_watcher([] if watcher is None else [watcher]), None
-        notices: SimpleQueue[str] = SimpleQueue()
+        watcher, opened = joint_watcher([] if watcher is None else [watcher]), None
         with _no_directory_if_refused(run_dir):
             if listening is not None:
                 ticket = ticket.model_copy(update={"host": listening.address[0]})
-                opened = stack.enter_context(open_to_hosts(listening, ticket, coordinator))
-                notices = opened.notices
-                remote = RemoteStart(away, opened.invitation.model_dump_json())
+                to_hosts = remote_access.open_to_hosts(listening, ticket, coordinator)
+                opened = stack.enter_context(to_hosts)
             if session is not None:
                 by_hand = ticket.model_copy(update={"launched": False})
                 stack.enter_context(published(by_hand, session))
-            if listening is not None:
+            if listening is not None and opened is not None:
                 if listening.invitation is not None:  # last: it replaces that of an earlier run
                     stack.enter_context(invitation_file(listening.invitation, opened.invitation))
                 watcher.listening(text_of(opened.address), listening)
+        remote = opened and RemoteStart(away, opened.invitation.model_dump_json())
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
-        run = _Run(ticket, run_dir, coordinator, children, watcher, notices)
+        run = _Run(ticket, run_dir, coordinator, children, watcher, opened and opened.notices)
         status, reason = run.watch(signals, ending.store)
         if coordinator.epoch_ns is None:
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
@@ -173,7 +169,7 @@ class _Run:
         coordinator: Coordinator,
         children: ChildProcesses,
         watcher: Watcher,
-        notices: SimpleQueue[str],
+        notices: "SimpleQueue[str] | None" = None,
     ) -> None:
         self._notices = notices
         self._scenario, self._run_id = ticket.scenario, ticket.run_id
@@ -264,7 +260,7 @@ class _Run:
     def _notify_progress(self) -> None:
         if (progress := self._coordinator.progress()) is not None:
             self._watcher.progress(progress)
-        while not self._notices.empty():
+        while self._notices is not None and not self._notices.empty():
             self._watcher.notice(self._notices.get_nowait())
 
     def _start_within_s(self) -> float:

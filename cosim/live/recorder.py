@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import zenoh
@@ -19,6 +19,7 @@ from pydantic import ConfigDict
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.analysis.value_reduction import is_long
+from cosim.lazy_modules import lazy_modules
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
@@ -40,12 +41,21 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_messages import ChangeAnnouncement, RunProgress, message_json
+from noack.runtime.control_messages import (
+    ChangeAnnouncement,
+    ProcessReport,
+    RunProgress,
+    message_json,
+)
 from noack.runtime.control_plane import ControlPlane, header_of
 from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
+
+with lazy_modules():
+    from cosim.live import claim_monitor
+    from cosim.output.viewer import live_viewer, run_feed, run_recording
 
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding
@@ -182,8 +192,8 @@ class Recorder:
         )
         self._report_queries = session.declare_queryable(key("report", "*"), FifoChannel(64))
         self._tokens = ProcessTokens(plane, restarted=start.is_restart)
-        self._reports: dict[str, dict[str, Any]] = {}
-        """Final reports by instance."""
+        self._reports: dict[str, tuple[str, ProcessReport]] = {}
+        """Roles and final reports, by instance."""
         self.view_is_incomplete = start.is_restart
         """Whether batches came late or out of order, so that the view must be written again."""
         self._invalid = 0
@@ -197,9 +207,7 @@ class Recorder:
     @cached_property
     def _monitor(self) -> "ClaimMonitor":
         """Checks claims. It imports the theory, for which the other processes do not wait."""
-        from cosim.live.claim_monitor import ClaimMonitor
-
-        return ClaimMonitor(self._scenario)
+        return claim_monitor.ClaimMonitor(self._scenario)
 
     @property
     def finished(self) -> bool:
@@ -209,14 +217,12 @@ class Recorder:
     @property
     def without_report(self) -> list[str]:
         """Processes of the loop that have not reported their end to this recorder."""
-        reported = {report["process"] for report in self._reports.values()}
+        reported = dict(self._reports.values())
         return [role for role in LOOP_ROLES if role not in reported]
 
     def show_in(self, view: "RunView | NetworkRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        from cosim.output.viewer.run_feed import feed_of
-
-        self._feed = feed_of(self._scenario, view, self._progress.add_warning)
+        self._feed = run_feed.feed_of(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -281,7 +287,12 @@ class Recorder:
 
     def report(self) -> None:
         """Write the final reports of the processes; raise MachineError if that fails."""
-        write_reports(self._run_dir, self._reports.values())
+        defaults = {"generation": 0, "instance": ""}
+        reports = self._reports.values()
+        write_reports(
+            self._run_dir,
+            [defaults | report.fields() | {"process": role} for role, report in reports],
+        )
 
     def _take(self, sample: zenoh.Sample) -> None:
         role, table = str(sample.key_expr).split("/")[-2:]
@@ -344,29 +355,23 @@ class Recorder:
         try:
             if role not in LOOP_ROLES:
                 raise PeerError(f"{role} has nothing to report")
-            fields = report_of(role, payload, self.store.types)
+            report = report_of(role, payload, self.store.types)
         except PeerError as error:
             self._plane.refuse(query, str(error))
             return
-        report: dict[str, Any] = {"generation": 0, "instance": ""} | fields | {"process": role}
-        if stored := self.store.add_stored(report):
+        if stored := self.store.add_stored(role, report):
             text = f"{role}: {stored} rows were written to disk by itself: the recorder was slow"
-            self.store.add_own_notice(Notice(report.get("reached_ns") or 0, "info", text))
+            self.store.add_own_notice(Notice(report.reached_ns or 0, "info", text))
         # Telemetry has a lower priority: batches that were sent earlier may still be in flight.
-        self._await_rows(report)
-        missing = self.store.missing(report)
-        if not missing:
-            self._reports[report["instance"]] = report
-        self._plane.answer(query, {"rows": missing})
-
-    def _await_rows(self, report: dict[str, Any]) -> None:
         deadline_s = time.monotonic() + _ROWS_IN_FLIGHT_S
-        while self.store.missing(report) and time.monotonic() < deadline_s:
-            sample = self._batches.try_recv()
-            if sample is None:
+        while (missing := self.store.missing(role, report)) and time.monotonic() < deadline_s:
+            if (sample := self._batches.try_recv()) is None:
                 time.sleep(0.005)
             else:
                 self._take(sample)
+        if not missing:
+            self._reports[report.instance] = role, report
+        self._plane.answer(query, {"rows": missing})
 
     def give_up_view(self, error: MachineError) -> None:
         """Show the run no longer; the view is written again at the end."""
@@ -382,9 +387,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         stack.enter_context(active_run(Path(process.ticket.run_dir)))
         live_view = None
         if live and not process.start.is_restart:
-            from cosim.output.viewer.live_viewer import LiveView
-
-            live_view = LiveView()
+            live_view = live_viewer.LiveView()
             stack.callback(live_view.close)  # it would not exit by itself
         _record(process, live_view)
     return ExitStatus.OK
@@ -437,10 +440,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
 
 
 def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | NetworkRecording":
-    scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
-    from cosim.output.viewer.run_recording import open_view
-
-    return open_view(scenario, Path(run_dir), run_id, live_view)
+    ticket = process.ticket
+    return run_recording.open_view(process.scenario, Path(ticket.run_dir), ticket.run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

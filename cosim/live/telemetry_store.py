@@ -2,7 +2,7 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from noack.core.errors import PeerError
 from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import (
     NOTICES,
     SPOOL,
@@ -88,11 +88,11 @@ class TelemetryStore:
         received.add(first, first + len(rows))
         return rows, follows
 
-    def add_stored(self, report: Mapping[str, Any]) -> int:
+    def add_stored(self, role: str, report: ProcessReport) -> int:
         """Count the rows that a process has stored itself; return the number of new ones."""
-        role, generation, count = report["process"], report["generation"], 0
-        for table, ranges in report.get("stored", {}).items():
-            received = self._received[role, table, generation]
+        count = 0
+        for table, ranges in report.stored.items():
+            received = self._received[role, table, report.generation]
             before = received.count
             for first, end in ranges:
                 received.add(first, end)
@@ -118,17 +118,16 @@ class TelemetryStore:
                 end = first + len(lines_in(payload))
                 self._received[role, NOTICES, generation].add(first, end)
 
-    def missing(self, report: Mapping[str, Any]) -> dict[str, list[tuple[int, int]]]:
+    def missing(self, role: str, report: ProcessReport) -> dict[str, list[tuple[int, int]]]:
         """Ranges of rows that a process has reported and that are not stored, by table."""
-        role, generation = report["process"], report["generation"]
         missing = {
-            table: self._received[role, table, generation].missing(total)
-            for table, total in report["rows"].items()
+            table: self._received[role, table, report.generation].missing(total)
+            for table, total in report.rows.items()
             if table == NOTICES or OWNER.get(table) == role
         }
         return {table: ranges for table, ranges in missing.items() if ranges}
 
-    def acknowledgements(self) -> Iterator[tuple[str, dict[str, Any]]]:
+    def acknowledgements(self) -> Iterator[tuple[str, dict[str, object]]]:
         """Yield, for the newest process of each role, which of its rows are on disk.
 
         Raise MachineError if files of the spool were deleted or moved.

@@ -28,14 +28,14 @@ from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
 _EARLIER = "earlier"
 
 
-def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
+def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> ProcessReport:
     """Return a process's final report from its JSON.
 
     Raises:
         PeerError: the text is no report, or has no entry for a table of the process.
     """
-    report = parse_message(ProcessReport, text).fields()
-    if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
+    report = parse_message(ProcessReport, text)
+    if not report.rows.keys() >= {table for table in tables if OWNER[table] == role}:
         raise PeerError("the report lacks the number of rows of a table")
     return report
 
@@ -160,7 +160,7 @@ def valid_reports(
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
-            report = report_of(role, json.dumps(entry), tables)
+            report = report_of(role, json.dumps(entry), tables).fields()
             owned = [table for table in tables if OWNER[table] == role]
             if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
                 earlier.append(report | {"process": role})

@@ -15,14 +15,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus, MachineError, NoackError, why
 from noack.core.file_access import copy_whole, locked, open_growing, read_regular, write_whole
 from noack.core.process_limits import cores
+
+with lazy_modules():
+    from importlib import metadata
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario

@@ -3,37 +3,39 @@
 import json as json_module
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
-from typer import Argument, Option
+import typer
+from typer import Option
 
 from cosim.cli import command as cli
 from cosim.cli import completion
 from cosim.cli.execute_run import Workers, execute_campaign, worker_pool
+from cosim.lazy_modules import lazy_modules
+from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.file_access import write_whole
 from noack.runtime.command_line import print_to_stderr
 
-if TYPE_CHECKING:
-    from cosim.studies.design.design_search import DesignLimits
-    from noack.config.scenario import Scenario
-    from noack.core.linear_systems import Matrix
+with lazy_modules():
+    from cosim.live import progress
+    from cosim.output import result_tables
+    from cosim.studies.campaign import campaign_file, campaign_report
+    from cosim.studies.design import design_page, design_search, design_space
+    from cosim.studies.paper import paper_page
+    from noack.config import scenario, scenario_file
+    from noack.core import linear_systems
 
 
-@cli.command(cli.CAMPAIGNS, 10, [
-    ("noack campaign mb_vs_zoh", "compare a model with a hold"),
-    ("noack campaign mansd_sweep --draws 200 --json", "fewer draws at each grid point"),
-    ("noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786", "on a Dask cluster"),
-])  # fmt: skip
+@cli.command(cli.CAMPAIGNS, 10)
 def campaign(
-    file: Annotated[str, Argument(autocompletion=completion.campaigns)],
+    file: Annotated[str, typer.Argument(autocompletion=completion.campaigns)],
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
     workers: Workers = None,
     scheduler: Annotated[str | None, Option(metavar="tcp://HOST:PORT")] = None,
     out: cli.OutOption = None,
-    figure_format: cli.FormatOption = None,
-    width: cli.WidthOption = None,
+    figures: cli.FigureOptions,
     tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
 ) -> int:
@@ -48,39 +50,32 @@ def campaign(
         draws: Runs at each grid point; the campaign file's number by default.
         scheduler: Run on the Dask cluster of this scheduler.
         out: Folder of the campaign; runs/campaigns/NAME by default.
-    """
-    from cosim.live.progress import error_console
-    from cosim.output.figure_format import figure_files
-    from cosim.shipped_files import find_shipped
-    from cosim.studies.campaign.campaign_file import load
-    from cosim.studies.campaign.campaign_report import campaign_tables, print_summary
 
-    start = worker_pool(workers, scheduler)
-    files_of_figures = figure_files(figure_format, width)
-    console = error_console()
+    Examples:
+        noack campaign mb_vs_zoh   compare a model with a hold
+        noack campaign mansd_sweep --draws 200 --json   fewer draws at each grid point
+        noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786   on a Dask cluster
+    """
+    start, figure_files = worker_pool(workers, scheduler), figures.files
     path = find_shipped(file, "campaigns")
-    plan = load(path)
+    plan = campaign_file.load(path)
     folder = out or cli.DEFAULT_RUNS / "campaigns" / plan.name
     summary, _, _, made, files = execute_campaign(
-        console, plan, path, start, folder=folder, draws=draws, figure_files=files_of_figures
+        plan, path, start, folder=folder, draws=draws, figure_files=figure_files
     )
-    document = summary.document() | {"made": made, "files": [str(file) for file in files]}
-    cli.show(json, lambda: document, print_summary, summary)
-    cli.print_paths(files, json=json)
-    cli.write_tables(campaign_tables(summary), tables, json=json)
+    document = summary.document() | {"made": made}
+    cli.show_with_files(json, document, files, campaign_report.print_summary, summary)
+    cli.write_tables(campaign_report.campaign_tables(summary), tables, json=json)
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
 
 
-@cli.command(cli.THEORY, 30, [
-    ("noack paper", "1,000 draws into runs/paper"),
-    ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
-])  # fmt: skip
+@cli.command(cli.THEORY, 30)
 def paper(
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
     out: Path = cli.DEFAULT_RUNS / "paper",
     json: cli.JsonOption = False,
-) -> int:
+) -> None:
     """Reproduce the paper's Section V: a page with figures, tables and verdicts.
 
     The runs are those of the campaign paper, in runs/campaigns/paper.
@@ -88,61 +83,30 @@ def paper(
     Options:
         draws: Number of random plants, losses and initial states; 1,000 by default.
         out: Folder for paper.md and its figures.
-    """
-    from cosim.live.progress import error_console
-    from cosim.output.result_tables import terminal_table
-    from cosim.shipped_files import find_shipped
-    from cosim.studies.campaign.campaign_file import load
-    from cosim.studies.campaign.campaign_report import claims_table
-    from cosim.studies.paper import paper_page
 
+    Examples:
+        noack paper   1,000 draws into runs/paper
+        noack paper --draws 50 --out paper --json   fewer draws, as JSON
+    """
     paper_page.make_folder(out)
-    path, console = find_shipped("paper", "campaigns"), error_console()
-    folder = cli.DEFAULT_RUNS / "campaigns" / "paper"
-    done = execute_campaign(
-        console, load(path), path, worker_pool(None), folder=folder, draws=draws
-    )
-    with console.status("computing the examples"):
+    path, folder = find_shipped("paper", "campaigns"), cli.DEFAULT_RUNS / "campaigns" / "paper"
+    plan = campaign_file.load(path)
+    done = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
+    with cli.status("computing the examples"):
         found, files = paper_page.write_page(done, out)
     names = [str(file) for file in files]
     if json:
         shown = {"draws": done.summary.draws, "representative": found["representative"]}
         cli.print_json(shown | {"claims": found["summary"]["claims"], "files": names})
     else:
-        cli.console().print(terminal_table(claims_table(done.summary), left=range(3)))
+        table = campaign_report.claims_table(done.summary)
+        cli.console().print(result_tables.terminal_table(table, left=range(3)))
         print(*names, sep="\n")
-    return ExitStatus.OK
 
 
-@cli.command(cli.CAMPAIGNS, 20, [
-    ("noack design lane_following --settling 14", "the fewest transmissions"),
-    ("noack design lane_following --settling 14 --bound error=3 --out mine.toml", ""),
-    ("noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json", ""),
-])  # fmt: skip
-def design(
-    scenario: cli.ScenarioArgument,
-    *,
-    settling: Annotated[float, Option(metavar="SECONDS")],
-    quantile: float = 0.95,
-    settle: float = 0.02,
-    bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None,
-    under: str = "paper",
-    weights: str = "identity,chosen",
-    gain: str = "given",
-    Q: Annotated[str | None, Option("--Q")] = None,
-    R: Annotated[str | None, Option("--R")] = None,
-    draws: Annotated[int, Option(min=20)] = 2000,
-    seed: cli.SeedOption = 0,
-    settings: cli.SetOption = None,
-    out: cli.OutOption = None,
-    page: Path | None = None,
-    figure_format: cli.FormatOption = None,
-    width: cli.WidthOption = None,
-    json: cli.JsonOption = False,
-) -> int:
-    """Choose α, β and the norm: the fewest transmissions that meet your limits.
-
-    Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
+@cli.option_group
+class LimitOptions:
+    """What a design must meet.
 
     Options:
         settling: Largest settling time allowed.
@@ -150,98 +114,130 @@ def design(
         settle: A run has settled when ‖x‖ stays below this share of ‖x(0)‖.
         bound: Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.
         under: Conditions of the certificates: the `paper`'s, or the scenario's `schedule`.
-        weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
+    """
+
+    settling: Annotated[float, Option(metavar="SECONDS")]
+    quantile: float = 0.95
+    settle: float = 0.02
+    bound: Annotated[list[str] | None, Option(metavar="state=X|error=X")] = None
+    under: str = "paper"
+
+    def limits(self) -> "design_search.DesignLimits":
+        """Return the limits; raise CallerError if one is wrong."""
+        for option, most in (("settling", math.inf), ("quantile", 1), ("settle", 1)):
+            if not 0 < (value := getattr(self, option)) < most:
+                allowed = "positive" if most == math.inf else "between 0 and 1"
+                raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
+        if self.under not in ("paper", "schedule"):
+            raise CallerError(f'--under: paper or schedule, not "{self.under}"')
+        return design_search.DesignLimits(
+            self.settling, self.quantile, self.settle, self._bounds(), self.under == "schedule"
+        )
+
+    def _bounds(self) -> "dict[design_search.Bounded, float]":
+        found: dict[design_search.Bounded, float] = {}
+        for text in self.bound or ():
+            name, _, value = text.partition("=")
+            try:
+                limit = float(value)
+            except ValueError:
+                limit = math.nan
+            bounded: dict[str, design_search.Bounded] = {"state": "state", "error": "error"}
+            if name not in bounded or not 0 < limit < math.inf:
+                raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
+            if bounded[name] in found:
+                raise CallerError(f"--bound {text}: {name} is given twice")
+            found[bounded[name]] = limit
+        return found
+
+
+@cli.option_group
+class GainOptions:
+    """The gain of a design.
+
+    Options:
         gain: Gain K: `given` in the scenario, or `lqr` of the nominal model.
         Q: LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.
         R: LQR input cost: rows, or a diagonal.
+    """
+
+    gain: str = "given"
+    Q: Annotated[str | None, Option("--Q")] = None
+    R: Annotated[str | None, Option("--R")] = None
+
+    def regulator(
+        self, given: "scenario.Scenario"
+    ) -> "tuple[linear_systems.Matrix, linear_systems.Matrix] | None":
+        """Return the LQR costs Q (n, n) and R (m, m); None for the scenario's gain.
+
+        Raise CallerError if one is wrong.
+        """
+        if self.gain not in ("given", "lqr"):
+            raise CallerError(f'--gain: given or lqr, not "{self.gain}"')
+        if self.gain == "lqr":
+            n, m = given.model.dimensions
+            return _matrix("--Q", self.Q, n), _matrix("--R", self.R, m)
+        if self.Q or self.R:
+            raise CallerError("--Q, --R: are for --gain lqr only")
+        return None
+
+
+@cli.command(cli.CAMPAIGNS, 20)
+def design(
+    given: cli.ScenarioOptions,
+    *,
+    wanted: LimitOptions,
+    weights: str = "identity,chosen",
+    feedback: GainOptions,
+    draws: Annotated[int, Option(min=20)] = 2000,
+    seed: cli.SeedOption = 0,
+    out: cli.OutOption = None,
+    page: Path | None = None,
+    figures: cli.FigureOptions,
+    json: cli.JsonOption = False,
+) -> int:
+    """Choose α, β and the norm: the fewest transmissions that meet your limits.
+
+    Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
+
+    Options:
+        weights: Norms to try: `identity`, `given` in the scenario, `chosen` by noack.
         draws: Draws that choose the trigger; the same number of new draws confirm it.
         out: Write the chosen scenario to this file (TOML).
         page: File of the page (HTML); runs/design/NAME.html by default.
-    """
-    from cosim.live.progress import work_bar
-    from cosim.output.figure_format import figure_files
-    from cosim.studies.design import design_page as pages
-    from cosim.studies.design.design_search import design as designed
-    from cosim.studies.design.design_space import families_of
-    from noack.config.scenario_file import dumps
 
-    files_of_figures = figure_files(figure_format, width)
-    loaded = cli.load_scenario(scenario, settings)
+    Examples:
+        noack design lane_following --settling 14   the fewest transmissions
+        noack design lane_following --settling 14 --bound error=3 --out mine.toml
+        noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json
+    """
+    figure_files, loaded = figures.files, given.load()
     loaded.decaying  # noqa: B018 - raises for another policy
-    limits = _limits(settling, quantile, settle, bound or [], under)
+    limits = wanted.limits()
     if out is not None and not out.parent.is_dir():
         raise CallerError(f"--out {out}: there is no folder {out.parent}")
     norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
-    with work_bar("choosing norms") as progress:
-        families = families_of(loaded, norms, _regulator(loaded, gain, Q, R), progress)
-    with work_bar("trying candidates") as progress:
-        found = designed(families, limits, draws=draws, seed=seed, progress=progress)
+    with progress.work_bar("choosing norms") as bar:
+        families = design_space.families_of(loaded, norms, feedback.regulator(loaded), bar)
+    with progress.work_bar("trying candidates") as bar:
+        found = design_search.design(families, limits, draws=draws, seed=seed, progress=bar)
     path = page or cli.DEFAULT_RUNS / "design" / f"{loaded.name}.html"
-    written = pages.write_page(found, path, files_of_figures)
+    written = design_page.write_page(found, path, figure_files)
     if out is not None and found.feasible:
-        written.append(write_whole(out, dumps(found.scenario)))
-    document = found.document() | {"files": [str(path) for path in written]}
-    cli.show(json, lambda: document, pages.print_found, found)
-    cli.print_paths(written, json=json)
+        written.append(write_whole(out, scenario_file.dumps(found.scenario)))
+    cli.show_with_files(json, found.document(), written, design_page.print_found, found)
     if not found.confirmed:
         print_to_stderr(f"noack: {found.verdict()}")
     return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
 
 
-def _limits(
-    settling: float, quantile: float, settle: float, bounds: list[str], under: str
-) -> "DesignLimits":
-    from cosim.studies.design.design_search import DesignLimits
-
-    for option, value, most in (
-        ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),
-    ):  # fmt: skip
-        if not 0 < value < most:
-            allowed = "positive" if most == math.inf else "between 0 and 1"
-            raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
-    if under not in ("paper", "schedule"):
-        raise CallerError(f'--under: paper or schedule, not "{under}"')
-    return DesignLimits(settling, quantile, settle, _bounds(bounds), under == "schedule")
-
-
-def _bounds(given: list[str]) -> dict[Any, float]:
-    found: dict[Any, float] = {}
-    for text in given:
-        name, _, value = text.partition("=")
-        if name in found:
-            raise CallerError(f"--bound {text}: {name} is given twice")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            found[name] = math.nan
-        if name not in ("state", "error") or not 0 < found[name] < math.inf:
-            raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
-    return found
-
-
-def _regulator(
-    loaded: "Scenario", gain: str, Q: str | None, R: str | None
-) -> "tuple[Matrix, Matrix] | None":
-    """Return the LQR costs Q (n, n) and R (m, m); None for the scenario's gain."""
-    if gain not in ("given", "lqr"):
-        raise CallerError(f'--gain: given or lqr, not "{gain}"')
-    if gain == "lqr":
-        n, m = loaded.model.dimensions
-        return _matrix("--Q", Q, n), _matrix("--R", R, m)
-    if Q or R:
-        raise CallerError("--Q, --R: are for --gain lqr only")
-    return None
-
-
-def _matrix(option: str, text: str | None, size: int) -> "Matrix":
-    import numpy as np
-
-    from noack.config.scenario_file import value_of
+def _matrix(option: str, text: str | None, size: int) -> "linear_systems.Matrix":
+    import numpy as np  # help and completion need none
 
     if text is None:
         return np.eye(size)
     try:
-        value = np.array(value_of(text, option), dtype=np.float64)
+        value = np.array(scenario_file.value_of(text, option), dtype=np.float64)
     except (CallerError, ValueError, TypeError):
         value = np.empty(0)
     if value.ndim == 1:

@@ -7,46 +7,47 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
-from cosim.output.export import FORMATS
+from cosim.lazy_modules import lazy_modules
+from cosim.output.export import FORMATS, export_run, export_suffix
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import ExitStatus
 
+with lazy_modules():
+    import cosim.analysis.replay.replay_result as replay_result
+    import cosim.analysis.replay.run_replay as run_replay
+    import cosim.api.runs as run_library
+    from cosim.analysis import fidelity as fidelity_analysis
+    from cosim.analysis import run_summary
+    from cosim.live import finalize
+    from cosim.output import figure_files, run_tables, run_verdict, signal_figures
+    from cosim.output.viewer import live_viewer
+    from cosim.record import run_directory, run_record
 
-@cli.command(cli.RUNS, 50, [
-    ("noack summary", "the last run"),
-    ("noack summary --verbose", "with timing, assumptions and each claim"),
-    ("noack summary --tables tables", "its tables for a paper, as LaTeX and CSV"),
-    ("noack summary runs/latest --json", "all numbers, as JSON"),
-])  # fmt: skip
+
+@cli.command(cli.RUNS, 50)
 def summary(
-    run_dir: cli.RunArgument = None,
+    run: cli.LoopOptions,
     *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
     verbose: cli.VerboseOption = False,
     tables: cli.TablesOption = None,
     json: cli.JsonOption = False,
-) -> int:
+) -> None:
     """Show a run's summary; finalise an interrupted run first.
 
     Exit status 0: the summary was shown, also that of a failed run.
+
+    Examples:
+        noack summary   the last run
+        noack summary --verbose   with timing, assumptions and each claim
+        noack summary --tables tables   its tables for a paper, as LaTeX and CSV
+        noack summary runs/latest --json   all numbers, as JSON
     """
-    from cosim.analysis.run_summary import outcome_of_loop
-    from cosim.live.finalize import reopen
-    from cosim.output.run_tables import summary_tables
-    from cosim.output.run_verdict import print_outcome
-
-    outcome = outcome_of_loop(reopen(chosen_run(run_dir, runs)), loop)
-    cli.show(json, outcome.summary.to_json, print_outcome, outcome, verbose=verbose)
-    cli.write_tables(summary_tables(outcome.summary), tables, json=json)
-    return ExitStatus.OK
+    outcome = run_summary.outcome_of_loop(finalize.reopen(run.path), run.loop)
+    cli.show(json, outcome.summary.to_json, run_verdict.print_outcome, outcome, verbose=verbose)
+    cli.write_tables(run_tables.summary_tables(outcome.summary), tables, json=json)
 
 
-@cli.command(cli.RUNS, 40, [
-    ("noack view", "the last run, in a window if there is a display"),
-    ("noack view runs/latest --web", "in a browser on this machine"),
-    ("noack view --loop pendulum-07", "one loop of a run of several, in detail"),
-])  # fmt: skip
+@cli.command(cli.RUNS, 40)
 def view(
     recording: cli.RunArgument = None,
     *,
@@ -62,99 +63,76 @@ def view(
     Options:
         recording: Run directory or .rrd file; the last run by default.
         web: Show it in a browser on this machine.
-    """
-    from cosim.output.viewer.live_viewer import view_recording
 
+    Examples:
+        noack view   the last run, in a window if there is a display
+        noack view runs/latest --web   in a browser on this machine
+        noack view --loop pendulum-07   one loop of a run of several, in detail
+    """
     path = chosen_run(recording, runs)
     path = path / file_of_loop(RECORDING_FILE, loop) if path.is_dir() else path
     if (path.parent / SCENARIO_FILE).is_file() and not path.is_file():
-        from cosim.live.finalize import write_recording
-
         with cli.status("writing the recording"):
-            write_recording(path.parent, loop)
+            finalize.write_recording(path.parent, loop)
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
-    view_recording(path, native=False if web else None)
+    live_viewer.view_recording(path, native=False if web else None)
     return ExitStatus.OK
 
 
-@cli.command(cli.RUNS, 90, [
-    ("noack report", "the report of the last run"),
-    ("noack report --format pdf", "with its figures for a paper"),
-    ("noack report runs/latest --json", "print the path as JSON"),
-])  # fmt: skip
+@cli.command(cli.RUNS, 90)
 def report(
-    run_dir: cli.RunArgument = None,
+    run: cli.LoopOptions,
     *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
     again: Annotated[bool, Option("--again")] = False,
-    figure_format: cli.FormatOption = None,
-    width: cli.WidthOption = None,
+    figures: cli.FigureOptions,
     json: cli.JsonOption = False,
-) -> int:
+) -> None:
     """Print the path of a run's report (one HTML page with all figures); write it if missing.
 
     Options:
         again: Write the report again, even if there is one.
-    """
-    from cosim.api.runs import open_run
-    from cosim.live.finalize import run_report
-    from cosim.output.figure_format import figure_files
 
-    chosen = chosen_run(run_dir, runs)
-    figure_files(figure_format, width)  # refuses a wrong width before anything is drawn
-    path, figures = run_report(chosen, loop, again=again), []
-    if figure_format is not None:
-        opened = open_run(chosen)
-        shown = opened if loop is None else opened.loops[loop]
-        figures = shown.save_figures(figure_format, width)
+    Examples:
+        noack report   the report of the last run
+        noack report --format pdf   with its figures for a paper
+        noack report runs/latest --json   print the path as JSON
+    """
+    files = figures.files  # refuses a wrong width before anything is drawn
+    path, drawn = finalize.run_report(run.path, run.loop, again=again), []
+    if files is not None:
+        opened = run_library.open_run(run.path)
+        shown = opened if run.loop is None else opened.loops[run.loop]
+        drawn = shown.save_figures(files.kind, files.width_in)
     if json:
-        written = {"figures": [str(figure) for figure in figures]} if figures else {}
+        written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
         cli.print_json({"report": str(path)} | written)
     else:
-        print(path, *figures, sep="\n")
-    return ExitStatus.OK
+        print(path, *drawn, sep="\n")
 
 
-@cli.command(cli.RUNS, 70, [
-    ("noack replay", "the last run; exit status 1 if a bit differs"),
-    ("noack replay runs/latest --json", "as JSON"),
-])  # fmt: skip
-def replay(
-    run_dir: cli.RunArgument = None,
-    *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
-    json: cli.JsonOption = False,
-) -> int:
-    """Replay a run's recorded inputs; compare the outputs bit for bit."""
-    from cosim.analysis.replay.replay_result import print_replay
-    from cosim.analysis.replay.run_replay import replay_run
-    from cosim.record.run_directory import changed_since
-    from cosim.record.run_record import load_run
+@cli.command(cli.RUNS, 70)
+def replay(run: cli.LoopOptions, *, json: cli.JsonOption = False) -> int:
+    """Replay a run's recorded inputs; compare the outputs bit for bit.
 
-    path = chosen_run(run_dir, runs)
+    Examples:
+        noack replay   the last run; exit status 1 if a bit differs
+        noack replay runs/latest --json   as JSON
+    """
+    path = run.path
     with cli.status("replaying"):
-        found = replay_run(load_run(path), loop)
-    changed = changed_since(path)
-    cli.show(
-        json, lambda: found.document() | {"changed_since": changed}, print_replay, found, changed
-    )
+        found = run_replay.replay_run(run_record.load_run(path), run.loop)
+    changed = run_directory.changed_since(path)
+    document = found.document() | {"changed_since": changed}
+    cli.show(json, lambda: document, replay_result.print_replay, found, changed)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
-@cli.command(cli.RUNS, 60, [
-    ("noack fidelity", "effects of sampling, delay and hold on the last run"),
-    ("noack fidelity --out fidelity.png", "with a figure"),
-    ("noack fidelity runs/latest --json", "as JSON"),
-])  # fmt: skip
+@cli.command(cli.RUNS, 60)
 def fidelity(
-    run_dir: cli.RunArgument = None,
+    run: cli.LoopOptions,
     *,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
     out: cli.OutOption = None,
     width: cli.WidthOption = None,
     json: cli.JsonOption = False,
@@ -163,19 +141,17 @@ def fidelity(
 
     Options:
         out: Write a figure of the differences over time (.svg, .png, .pdf).
-    """
-    from cosim.analysis.fidelity import compute_fidelity
-    from cosim.output.figure_files import save_figure
-    from cosim.output.run_verdict import print_fidelity
-    from cosim.output.signal_figures import fidelity_figure
-    from cosim.record.run_record import load_record
 
-    path = chosen_run(run_dir, runs)
+    Examples:
+        noack fidelity   effects of sampling, delay and hold on the last run
+        noack fidelity --out fidelity.png   with a figure
+        noack fidelity runs/latest --json   as JSON
+    """
     with cli.status("comparing"):
-        found = compute_fidelity(load_record(path, loop))
+        found = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
-            save_figure(fidelity_figure(found), out, width)
-    cli.show(json, found.as_json, print_fidelity, found)
+            figure_files.save_figure(signal_figures.fidelity_figure(found), out, width)
+    cli.show(json, found.as_json, run_verdict.print_fidelity, found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED
 
 
@@ -185,13 +161,9 @@ def _known_format(name: str) -> str:
     return name
 
 
-@cli.command(cli.RUNS, 96, [
-    ("noack export --format mat", "the last run for MATLAB and Octave"),
-    ("noack export --format mcap --out run.mcap", "for Foxglove and PlotJuggler"),
-    ("noack export runs/latest --format csv --json", "a folder of CSV files"),
-])  # fmt: skip
+@cli.command(cli.RUNS, 96)
 def export(
-    run_dir: cli.RunArgument = None,
+    run: cli.LoopOptions,
     *,
     file_format: Annotated[
         str,
@@ -203,29 +175,25 @@ def export(
         ),
     ],
     out: cli.OutOption = None,
-    runs: cli.RunsOption = cli.DEFAULT_RUNS,
-    loop: cli.LoopOption = None,
     certificates: bool = True,
     json: cli.JsonOption = False,
-) -> int:
+) -> None:
     """Export a run for other programs: its tables, its summary and its certificates.
 
     Options:
         file_format: Format of the file, or of the folder's files.
         out: File, or folder of CSV; RUN.mat and so on by default.
         certificates: Certificates of each loop in a file of MATLAB; about a second for each loop.
-    """
-    from cosim.live.finalize import reopen
-    from cosim.output.export import export_run, export_suffix
 
-    chosen = chosen_run(run_dir, runs)
-    reopen(chosen)
-    name = chosen.resolve().name if loop is None else loop
+    Examples:
+        noack export --format mat   the last run for MATLAB and Octave
+        noack export --format mcap --out run.mcap   for Foxglove and PlotJuggler
+        noack export runs/latest --format csv --json   a folder of CSV files
+    """
+    finalize.reopen(chosen := run.path)
+    name = run.loop or chosen.resolve().name
     path = out or Path(f"{name}{export_suffix(file_format)}")
     with cli.status("exporting"):
-        written = export_run(chosen, path, file_format, loop=loop, certificates=certificates)
-    if json:
-        cli.print_json({"files": [str(path) for path in written]})
-    else:
-        print(*written, sep="\n")
-    return ExitStatus.OK
+        written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
+    names = [str(path) for path in written]
+    cli.print_json({"files": names}) if json else print(*names, sep="\n")

@@ -7,18 +7,25 @@ import typer
 from typer import Option
 
 from cosim.cli import command as cli
+from cosim.cli.execute_run import LiveOptions, run_processes
+from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, ExitStatus
 
+with lazy_modules():
+    import cosim.analysis.adversary.worst_run as worst_run
+    from cosim.analysis import adversary as adversary_search
+    from cosim.analysis import margin_search
+    from cosim.live import progress
+    from cosim.output import certificate_report, certificates
+    from cosim.output.export import mat_export
+    from noack.config import resolution
+    from noack.theory.certificates import scenario_certificates
 
-@cli.command(cli.THEORY, 10, [
-    ("noack certify lane_following", "its plant, and all plants of its uncertainty box"),
-    ("noack certify lane_following --weight chosen", "with a norm that certifies more"),
-    ("noack certify lane_weighted --late 6 --json", "allow 6 steps of lateness"),
-])  # fmt: skip
+
+@cli.command(cli.THEORY, 10)
 def certify(
-    scenario: cli.ScenarioArgument,
+    given: cli.ScenarioOptions,
     *,
-    settings: cli.SetOption = None,
     weight: str = "given",
     late: Annotated[int | None, Option(min=0, max=1000)] = None,
     tables: cli.TablesOption = None,
@@ -33,38 +40,31 @@ def certify(
         weight: Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack.
         late: Allowed lateness in steps of the plant; certificate.late_periods by default.
         out: Write the certificates for MATLAB and Octave (.mat).
+
+    Examples:
+        noack certify lane_following   its plant, and all plants of its uncertainty box
+        noack certify lane_following --weight chosen   with a norm that certifies more
+        noack certify lane_weighted --late 6 --json   allow 6 steps of lateness
     """
-    from cosim.output.certificate_report import certificate_tables, print_certificates
-    from cosim.output.certificates import certificates_of
-
-    loaded = cli.load_scenario(scenario, settings)
+    loaded = given.load()
     if weight == "chosen":
-        from cosim.live.progress import work_bar
-
-        with work_bar("choosing the weight") as progress:
-            found = certificates_of(loaded, weight, late, progress)
+        with progress.work_bar("choosing the weight") as bar:
+            found = certificates.certificates_of(loaded, weight, late, bar)
     else:
-        found = certificates_of(loaded, weight, late)
-    cli.show(json, found.to_json, print_certificates, found)
-    cli.write_tables(certificate_tables(found), tables, json=json)
+        found = certificates.certificates_of(loaded, weight, late)
+    cli.show(json, found.to_json, certificate_report.print_certificates, found)
+    cli.write_tables(certificate_report.certificate_tables(found), tables, json=json)
     if out is not None:
-        from cosim.output.export.mat_export import save_mat
-
-        save_mat(found.to_json(), out)
+        mat_export.save_mat(found.to_json(), out)
     certified = any(certificate.constants for _, certificate in found)
     return ExitStatus.OK if certified else ExitStatus.FAILED
 
 
-@cli.command(cli.THEORY, 30, [
-    ("noack margin lane_periodic", "the largest M and the longest period"),
-    ("noack margin lane_periodic --play", "play the destabilising pattern live"),
-    ("noack margin lane_periodic --set mode=zoh --no-period --json", "hold the input; as JSON"),
-])  # fmt: skip
+@cli.command(cli.THEORY, 30)
 def margin(
     context: typer.Context,
-    scenario: cli.ScenarioArgument,
+    given: cli.ScenarioOptions,
     *,
-    settings: cli.SetOption = None,
     most: Annotated[int, Option(min=1, max=1000)] = 16,
     accuracy: float = 2e-4,
     period: bool = True,
@@ -85,32 +85,28 @@ def margin(
         accuracy: Wanted ratio of the bounds, minus 1; finer where they include 1.
         period: Search for the longest period with the scenario's own M, too.
         play: Play the destabilising pattern in a live run.
-    """
-    from cosim.analysis.margin_search import find_margin
-    from cosim.output.certificate_report import margin_tables, print_margin
-    from noack.config.resolution import resolve
 
+    Examples:
+        noack margin lane_periodic   the largest M and the longest period
+        noack margin lane_periodic --play   play the destabilising pattern live
+        noack margin lane_periodic --set mode=zoh --no-period --json   hold the input; as JSON
+    """
     if play and json:
         raise CallerError("--play: has an output of its own; leave out --json")
-    resolved = resolve(cli.load_scenario(scenario, settings))
+    resolved = resolution.resolve(given.load())
     with cli.status("examining") as status:
-        found = find_margin(
+        found = margin_search.find_margin(
             resolved, most_m=most, accuracy=accuracy, with_period=period,
             progress=lambda text: status.update(f"examining {text}"),
         )  # fmt: skip
-    cli.show(json, found.to_json, print_margin, found)
-    cli.write_tables(margin_tables(found), tables, json=json)
+    cli.show(json, found.to_json, certificate_report.print_margin, found)
+    cli.write_tables(certificate_report.margin_tables(found), tables, json=json)
     if not play:
         return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
-    if found.destabilised is None:
+    if (pattern := found.destabilised) is None:
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
-
-    from cosim.cli.execute_run import RunOutput, run_processes
-
-    played = [*(settings or ()), *found.destabilised.settings]
-    output = RunOutput(report=True, verbose=False, json=False)
     return run_processes(
-        lambda: cli.load_scenario(scenario, played), runs, output, server=context.obj
+        lambda: given.load(*pattern.settings), LiveOptions(runs=runs), server=context.obj
     )
 
 
@@ -124,21 +120,15 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-@cli.command(cli.THEORY, 20, [
-    ("noack adversary lane_following", "all objectives"),
-    ("noack adversary lane_following --objective error --json", "the controller's error only"),
-    ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
-    ("noack adversary lane_following --trigger continuous", "the paper's loop, in exact time"),
-])  # fmt: skip
+@cli.command(cli.THEORY, 20)
 def adversary(
-    scenario: cli.ScenarioArgument,
+    given: cli.ScenarioOptions,
     *,
     objective: AdversaryAim = AdversaryAim.ALL,
     horizon: float | None = None,
     nodes: Annotated[int, Option(min=0)] = 500_000,
     beam: Annotated[int, Option(min=0)] = 512,
     trigger: cli.TriggerOption = cli.TriggerMode.SAMPLED,
-    settings: cli.SetOption = None,
     json: cli.JsonOption = False,
 ) -> int:
     """Search for the worst losses that the network may cause; compare them with the bounds.
@@ -153,26 +143,28 @@ def adversary(
         nodes: Limit of the exhaustive search, in segments between events; at the limit, the result
             of the beam search may be better.
         beam: Width of the beam search, in runs.
-    """
-    from cosim.analysis.adversary import Objective, conditions_of, find_worst
-    from cosim.analysis.adversary.worst_run import document, print_worst
-    from cosim.live.progress import search_status
-    from noack.config.resolution import resolve
-    from noack.theory.certificates.scenario_certificates import certify
 
-    given = [] if horizon is None else [f"horizon_s={horizon}"]
-    resolved = resolve(cli.load_scenario(scenario, [*(settings or ()), *given]))
+    Examples:
+        noack adversary lane_following   all objectives
+        noack adversary lane_following --objective error --json   the controller's error only
+        noack adversary unstable_pendulum --horizon 2 --beam 64   a faster search
+        noack adversary lane_following --trigger continuous   the paper's loop, in exact time
+    """
+    resolved = resolution.resolve(
+        given.load(*([] if horizon is None else [f"horizon_s={horizon}"]))
+    )
     continuous = trigger is cli.TriggerMode.CONTINUOUS
-    certificate = certify(resolved, conditions_of(resolved, continuous=continuous))
-    aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
-    with search_status() as report:
+    conditions = adversary_search.conditions_of(resolved, continuous=continuous)
+    certificate = scenario_certificates.certify(resolved, conditions)
+    kinds, is_all = adversary_search.Objective, objective is AdversaryAim.ALL
+    with progress.search_status() as report:
         found = [
-            find_worst(
+            adversary_search.find_worst(
                 resolved, aim, continuous=continuous, most_nodes=nodes, beam=beam,
                 certificate=certificate, report=report(aim.value),
             )
-            for aim in aims
+            for aim in (kinds if is_all else (kinds(objective.value),))
         ]  # fmt: skip
     about = found, resolved, certificate, trigger.value
-    cli.show(json, lambda: document(*about), print_worst, *about)
+    cli.show(json, lambda: worst_run.document(*about), worst_run.print_worst, *about)
     return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

@@ -113,7 +113,7 @@ def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
 def test_unused_settings_do_not_affect_the_findings() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
     assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
-    without = WANTED._replace(realtime=False)
+    without = replace(WANTED, realtime=False)
     assert about("wake-ups", without, plain=late).verdict is FindingStatus.LIMITED
     assert about("wake-ups", without, realtime=late).verdict is FindingStatus.GOOD
     refused = {"sched_fifo": "not permitted: Operation not permitted"}

@@ -1,0 +1,87 @@
+"""Modules that are loaded when one of their names is first used.
+
+Commands and the library import at the top of their files, within :func:`lazy_modules`. So nothing
+waits for what it does not use: help and completion of a command need none of its modules (up to
+2 s of imports), `noack summary` no viewer, and `noack run` no analysis before its processes run.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from threading import RLock
+from types import ModuleType
+from typing import Any
+
+_IS_LAZY = ContextVar("is_lazy", default=False)
+"""Whether this thread imports lazily; not while it loads a module."""
+_KNOWN = ("__class__", "__dict__", "__loader__", "__path__")
+"""Attributes that a module has before it is loaded, beside its submodules."""
+
+
+class _LazyModule(ModuleType):
+    def __getattribute__(self, name: str) -> Any:
+        get = super().__getattribute__
+        is_known = name in _KNOWN or isinstance(get("__dict__").get(name), ModuleType)
+        # An import that is not lazy reads __spec__, and needs the module.
+        if not is_known and not (name == "__spec__" and _IS_LAZY.get()):
+            loader = get("__loader__")
+            assert isinstance(loader, _LazyLoader)
+            loader.load(self)
+        return get(name)
+
+
+class _LazyLoader(Loader):
+    """As :class:`importlib.util.LazyLoader`, which threads cannot share before Python 3.11.9."""
+
+    def __init__(self, loader: Loader) -> None:
+        self._loader, self._lock, self._loads = loader, RLock(), False
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return self._loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__class__ = _LazyModule
+
+    def load(self, module: ModuleType) -> None:
+        """Load a module, unless this thread is loading it; another thread waits for the end."""
+        with self._lock:
+            if self._loads or module.__class__ is ModuleType:
+                return
+            self._loads, token = True, _IS_LAZY.set(False)
+            try:
+                self._loader.exec_module(module)
+                module.__class__ = ModuleType
+            finally:
+                self._loads = False
+                _IS_LAZY.reset(token)
+
+
+class _LazyFinder(MetaPathFinder):
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        for finder in sys.meta_path if _IS_LAZY.get() else ():
+            spec = None if finder is self else finder.find_spec(name, path, target)
+            if spec is not None and spec.loader is not None:
+                spec.loader = _LazyLoader(spec.loader)
+                return spec
+        return None
+
+
+@contextmanager
+def lazy_modules() -> Iterator[None]:
+    """Load the modules that are imported in this context when one of their names is used.
+
+    For ``from package import module``, which loads the package; ``import package.module as module``
+    does not.
+    """
+    finder, token = _LazyFinder(), _IS_LAZY.set(True)
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
+        _IS_LAZY.reset(token)
