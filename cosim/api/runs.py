@@ -27,10 +27,12 @@ from noack.core.number_format import as_html, as_text
 
 with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay
-    from cosim.analysis import fidelity, run_summary
+    from cosim.analysis import fidelity as fidelity_analysis
+    from cosim.analysis import run_summary
     from cosim.api import studies
     from cosim.live import finalize as run_end
     from cosim.live import launcher, simulated_run
+    from cosim.live import progress as progress_display
     from cosim.output import export as exports
     from cosim.output import figure_drawing, figure_files, figure_format, run_figures
     from cosim.output import run_tables as result_tables
@@ -41,14 +43,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
-    from cosim.analysis.fidelity import Fidelity
     from cosim.analysis.replay import Replay
-    from cosim.analysis.run_summary import Outcome
     from cosim.analysis.summary_model import Claim, RunSummary
     from cosim.output.figure_description import FigureDescription
-    from cosim.record.run_record import RecordedRun, RunRecord
-    from cosim.studies.run_comparison import RunComparison
-    from cosim.studies.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -66,7 +63,7 @@ class Run:
     def __init__(
         self,
         directory: Path,
-        finalize: "Callable[[], Outcome]",
+        finalize: "Callable[[], run_summary.Outcome]",
         temporary: Path | None = None,
         loop: str | None = None,
     ) -> None:
@@ -268,7 +265,7 @@ class Run:
         """
         return run_replay.replay_run(self._run, self._loop)
 
-    def fidelity(self) -> "Fidelity":
+    def fidelity(self) -> "fidelity_analysis.Fidelity":
         """Compare the run with the ideal loop in continuous time, effect by effect.
 
         Returns:
@@ -277,7 +274,7 @@ class Run:
         Raises:
             NoackError: the scenario has no ideal loop, or the record is incomplete.
         """
-        return fidelity.compute_fidelity(self._record)
+        return fidelity_analysis.compute_fidelity(self._record)
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
@@ -286,16 +283,16 @@ class Run:
         )
 
     @cached_property
-    def _outcome(self) -> "Outcome":
+    def _outcome(self) -> "run_summary.Outcome":
         return self._finalize()
 
     @cached_property
-    def _run(self) -> "RecordedRun":
+    def _run(self) -> "run_record.RecordedRun":
 
         return run_record.load_run(self.directory)
 
     @cached_property
-    def _record(self) -> "RunRecord":
+    def _record(self) -> "run_record.RunRecord":
         return self._run.loop(self._loop)
 
     def _facts(self) -> list[tuple[str, str]]:
@@ -360,8 +357,8 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
             "noack.run: a live run is started by the main thread, which signals go to"
         )
     with _folder(runs) as (folder, temporary):
-        console = progress.PipeSafeConsole(stderr=True, quiet=not progress)
-        with progress.progress_line(console, loaded) as watcher:
+        console = progress_display.PipeSafeConsole(stderr=True, quiet=not progress)
+        with progress_display.progress_line(console, loaded) as watcher:
             ending = launcher.launch(loaded, folder, watcher=watcher)
         outcome = run_end.finalize(ending, report=False, view=temporary is None)
         return Run(ending.run_dir, lambda: outcome, temporary)
@@ -384,7 +381,9 @@ def open_run(directory: Folder = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "Repetition":
+def reproduce(
+    path: Folder, *, run_code: bool = False, long: bool = False
+) -> "run_repetition.Repetition":
     """Repeat an archived run, and compare it bit for bit.
 
     Args:
@@ -404,7 +403,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "R
     return run_repetition.repeat_archive(Path(path), run_code=run_code, long=long)
 
 
-def compare(*runs: Run | Folder) -> "RunComparison":
+def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":
     """Compare two or more runs; :meth:`Run.fidelity` compares a run with the ideal loop.
 
     Args:

@@ -4,8 +4,8 @@ import shutil
 import sys
 import tempfile
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -314,16 +314,17 @@ def campaign(
         finished = finished_campaign.finish_campaign(
             plan, path, Path(folder or temporary or ""), start, draws=draws,
             show=lambda text: nullcontext(),
-            bar=(
-                progress_display.runs_bar(progress_display.PipeSafeConsole(file=sys.stderr))
-                if progress else None
-            ),
+            bar=_runs_bar() if progress else None,
         )  # fmt: skip
     except BaseException:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
         raise
     return CampaignResult(finished, temporary)
+
+
+def _runs_bar() -> "AbstractContextManager[Callable[[int, int], None]]":
+    return progress_display.runs_bar(progress_display.PipeSafeConsole(file=sys.stderr))
 
 
 def _table(rows: list[dict[str, Any]]) -> "pa.Table":

@@ -405,7 +405,9 @@ def write_tables(
 ) -> None:
     """Write the tables of ``--tables``, if it is given; print the paths, unless with ``--json``."""
     if folder is not None:
-        print_paths(result_tables.save_tables(tables, folder), json=json)
+        paths = result_tables.save_tables(tables, folder)
+        if not json:
+            print(*paths, sep="\n")
 
 
 def show_with_files(
@@ -422,10 +424,12 @@ def show_with_files(
         print(*names, sep="\n")
 
 
-def print_paths(paths: Iterable[Path], *, json: bool) -> None:
-    """Print the paths of written files, unless the document of ``--json`` has them."""
-    if not json:
-        print(*paths, sep="\n")
+def print_lines(json: bool, document: object, *lines: object) -> None:
+    """Print a result that is one line or few: the document of ``--json``, or the lines."""
+    if json:
+        print_json(document)
+    else:
+        print(*lines, sep="\n")
 
 
 def show(

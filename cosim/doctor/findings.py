@@ -7,21 +7,13 @@ table. It yields a verdict for each thing that it found.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from enum import StrEnum
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cosim.doctor.machine_measures import (
-    EXTRAS,
-    Buffer,
-    Disk,
-    Lateness,
-    MachineFacts,
-    RoundTrips,
-    RunRequirements,
-)
+from cosim.doctor.machine_measures import EXTRAS, Lateness, MachineFacts, RunRequirements
 from noack.core.number_format import byte_size, duration
 
 LOOP_PROCESSES = 5
@@ -78,35 +70,23 @@ _VERDICTS = {
 """Colour of a finding; verdict on the machine if this is the worst finding."""
 
 
-T = TypeVar("T")
 Outcome = tuple[FindingStatus, *tuple[str, ...]]
-"""As a finding, without ``what``."""
+"""A finding without ``what``."""
 _checks: list[Callable[[MachineFacts, RunRequirements], Iterator[MachineFinding]]] = []
 
 
 def _check(
     what: str,
-    fact: Callable[[MachineFacts], T | str],
-    failed: tuple[FindingStatus, str, str] = (BAD, "", ""),
-) -> Callable[[Callable[[T, RunRequirements], Iterator[Outcome]]], None]:
-    """Register a check.
+) -> Callable[[Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]], None]:
+    """Register a check of ``what``; {} in it is the scenario's name."""
 
-    Args:
-        what: it finds; ``{}`` is the scenario's name.
-        fact: the measurement that it is given.
-        failed: verdict, meaning and remedy if the measurement failed: then it is the reason.
-    """
-
-    def register(check: Callable[[T, RunRequirements], Iterator[Outcome]]) -> None:
-        def judged(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
-            title, found = what.format(wanted.name), fact(machine)
-            if isinstance(found, str):
-                verdict, means, remedy = failed
-                yield MachineFinding(title, verdict, found, means, remedy)
-            else:
-                yield from (MachineFinding(title, *outcome) for outcome in check(found, wanted))
-
-        _checks.append(judged)
+    def register(check: Callable[[MachineFacts, RunRequirements], Iterator[Outcome]]) -> None:
+        _checks.append(
+            lambda machine, wanted: (
+                MachineFinding(what.format(wanted.name), *outcome)
+                for outcome in check(machine, wanted)
+            )
+        )
 
     return register
 
@@ -122,7 +102,7 @@ def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
     return max((finding.verdict for finding in findings), key=order.index)
 
 
-@_check("cores", lambda machine: machine)
+@_check("cores")
 def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     known = [f"{machine.cores} of {machine.cores_online} usable"]
     if machine.load is not None:
@@ -143,7 +123,7 @@ def _cores(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
         yield GOOD, found
 
 
-@_check("real-time settings", lambda machine: machine)
+@_check("real-time settings")
 def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
     applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "applied"]
     if applied:
@@ -158,7 +138,7 @@ def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcom
         yield verdict, f"{name}: {answer}", means, _REMEDIES.get(key, "")
 
 
-@_check("timers", lambda machine: machine)
+@_check("timers")
 def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     slack = machine.timer_slack_ns
     found = f"resolution {duration(machine.timer_resolution_ns * 1e-9)}"
@@ -170,25 +150,20 @@ def _timer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
         yield GOOD, found
 
 
-_UNKNOWN_LATENESS = LIMITED, "the lateness of a run cannot be predicted", ""
+@_check("wake-ups without real-time settings")
+def _plain_wake_ups(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(machine.plain, wanted, in_force=not wanted.realtime)
 
 
-@_check("wake-ups without real-time settings", lambda machine: machine.plain, _UNKNOWN_LATENESS)
-def _plain_wake_ups(found: Lateness, wanted: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(found, wanted, in_force=not wanted.realtime)
+@_check("wake-ups with the real-time settings applied")
+def _realtime_wake_ups(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+    yield _wake_ups(machine.realtime, wanted, in_force=wanted.realtime)
 
 
-@_check(
-    "wake-ups with the real-time settings applied",
-    lambda machine: machine.realtime,
-    _UNKNOWN_LATENESS,
-)
-def _realtime_wake_ups(found: Lateness, wanted: RunRequirements) -> Iterator[Outcome]:
-    yield _wake_ups(found, wanted, in_force=wanted.realtime)
-
-
-def _wake_ups(found: Lateness, wanted: RunRequirements, *, in_force: bool) -> Outcome:
+def _wake_ups(found: Lateness | str, wanted: RunRequirements, *, in_force: bool) -> Outcome:
     """Compare the lateness of an idle loop with the lateness that the certificates allow."""
+    if isinstance(found, str):
+        return LIMITED, found, "the lateness of a run cannot be predicted"
     late = (
         f"late by {found.p50_us:.3g} µs (median), {duration(found.p99_us * 1e-6)} (p99), "
         f"{duration(found.max_us * 1e-6)} (max) over {found.wakes:,} wake-ups at "
@@ -211,11 +186,13 @@ def _wake_ups(found: Lateness, wanted: RunRequirements, *, in_force: bool) -> Ou
     return LIMITED, late, means, remedy
 
 
-@_check("UDP on the loopback", lambda machine: machine.round_trips, (
-    BAD, "the processes of a run cannot communicate",
-    "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1",
-))  # fmt: skip
-def _loopback(found: RoundTrips, _: RunRequirements) -> Iterator[Outcome]:
+@_check("UDP on the loopback")
+def _loopback(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
+    if isinstance(found := machine.round_trips, str):
+        means = "the processes of a run cannot communicate"
+        remedy = "`sudo ip link set lo up`; check the firewall's rules for 127.0.0.1"
+        yield BAD, found, means, remedy
+        return
     p50, p99 = duration(found.p50_us * 1e-6), duration(found.p99_us * 1e-6)
     text = f"round trip {p50} (median), {p99} (p99)"
     if found.lost:
@@ -226,12 +203,11 @@ def _loopback(found: RoundTrips, _: RunRequirements) -> Iterator[Outcome]:
         yield GOOD, text
 
 
-@_check(
-    "receive buffer",
-    lambda machine: machine.buffer,
-    (BAD, "no process of a run can receive", ""),
-)
-def _buffer(found: Buffer, wanted: RunRequirements) -> Iterator[Outcome]:
+@_check("receive buffer")
+def _buffer(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+    if isinstance(found := machine.buffer, str):
+        yield BAD, found, "no process of a run can receive"
+        return
     text = f"{found.datagrams:,} datagrams ({found.granted_bytes // 1024:,} KiB)"
     if found.most_bytes is not None:
         text += f"; net.core.rmem_max is {found.most_bytes:,} bytes"
@@ -243,52 +219,55 @@ def _buffer(found: Buffer, wanted: RunRequirements) -> Iterator[Outcome]:
         yield LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`"
 
 
-@_check("ports of {}", lambda machine: machine.ports_taken)
-def _ports(taken: Sequence[str], wanted: RunRequirements) -> Iterator[Outcome]:
+@_check("ports of {}")
+def _ports(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
     remedy = "stop the program that uses the port, or `--set ports={}`"
-    for line in taken:
+    for line in machine.ports_taken:
         yield BAD, line, f"{wanted.name} cannot run on its configured ports", remedy
-    if not taken:
+    if not machine.ports_taken:
         numbers = ", ".join(str(port) for port in wanted.ports.values())
         yield GOOD, f"{numbers} free" if numbers else "any free port"
 
 
-@_check("control plane", lambda machine: machine.control, (
-    BAD, "the processes of a run cannot join it",
-    "set XDG_RUNTIME_DIR to a folder of yours that is closed to others",
-))  # fmt: skip
-def _control(answered_s: float, _: RunRequirements) -> Iterator[Outcome]:
-    yield GOOD, f"zenoh over a Unix socket answers in {duration(answered_s)}"
+@_check("control plane")
+def _control(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
+    if isinstance(found := machine.control, str):
+        means = "the processes of a run cannot join it"
+        remedy = "set XDG_RUNTIME_DIR to a folder of yours that is closed to others"
+        yield BAD, found, means, remedy
+        return
+    yield GOOD, f"zenoh over a Unix socket answers in {duration(found)}"
 
 
-_ANOTHER_FOLDER = "choose another folder by --runs"
-
-
-@_check("disk", lambda machine: machine.disk, (BAD, "nothing can be recorded", _ANOTHER_FOLDER))
-def _disk(found: Disk, wanted: RunRequirements) -> Iterator[Outcome]:
+@_check("disk")
+def _disk(machine: MachineFacts, wanted: RunRequirements) -> Iterator[Outcome]:
+    remedy = "choose another folder by --runs"
+    if isinstance(found := machine.disk, str):
+        yield BAD, found, "nothing can be recorded", remedy
+        return
     text = (
         f"{found.folder}: {byte_size(found.free_bytes)} free, writes "
         f"{byte_size(found.write_bytes_per_s)}/s"
     )
     needs = f"{wanted.name} needs {byte_size(found.needed_bytes)} plus its events"
     if found.free_bytes < found.needed_bytes:
-        yield BAD, text, needs, f"{_ANOTHER_FOLDER}, or shorten horizon_s"
+        yield BAD, text, needs, f"{remedy}, or shorten horizon_s"
     elif found.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
-        yield LIMITED, text, f"{needs}; ending a run takes long", _ANOTHER_FOLDER
+        yield LIMITED, text, f"{needs}; ending a run takes long", remedy
     else:
         yield GOOD, text, needs
 
 
-@_check("runtime folder", lambda machine: machine.runtime_folder, (
-    LIMITED,
-    "`noack record` cannot open a run for other terminals, and `noack set` finds no run",
-    "set XDG_RUNTIME_DIR to a folder that you own",
-))  # fmt: skip
-def _runtime_folder(_found: None, _: RunRequirements) -> Iterator[Outcome]:
-    yield GOOD, "private to this user"
+@_check("runtime folder")
+def _runtime_folder(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
+    means = "`noack record` cannot open a run for other terminals, and `noack set` finds no run"
+    if (problem := machine.runtime_folder) is not None:
+        yield LIMITED, problem, means, "set XDG_RUNTIME_DIR to a folder that you own"
+    else:
+        yield GOOD, "private to this user"
 
 
-@_check("viewer", lambda machine: machine)
+@_check("viewer")
 def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     text = f"rerun {machine.viewer}"
     if machine.viewer is None:
@@ -313,7 +292,7 @@ def _extras(machine: MachineFacts, _: RunRequirements) -> Iterator[MachineFindin
             yield MachineFinding(what, LIMITED, "not installed", f"no {use}", remedy)
 
 
-@_check("versions", lambda machine: machine)
+@_check("versions")
 def _versions(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     known = [f"{name} {version}" for name, version in machine.versions.items() if version]
     missing = [name for name, version in machine.versions.items() if not version]

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import MachineError
@@ -34,6 +34,9 @@ with lazy_modules():
     from noack.config import scenario, scenario_checks
     from noack.impairments import link_settings
     from noack.runtime import control_messages, join_ticket
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 _COMMON = (
     "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
@@ -268,11 +271,15 @@ def _fork_twice() -> int:
 
 def _build_validators() -> None:
     """Build what would otherwise be built in each process."""
-    for section in (
-        scenario.Scenario, join_ticket.Ticket, link_settings.LinkSettings, loss.LossOf,
+    models: list[type[BaseModel]] = [
+        scenario.Scenario,
+        join_ticket.Ticket,
+        link_settings.LinkSettings,
+        loss.LossOf,
         *control_messages.ControlMessage.__subclasses__(),
-    ):  # fmt: skip
-        section.model_rebuild()
+    ]
+    for model in models:
+        model.model_rebuild()
     scenario_checks.prepare_changes()
 
 

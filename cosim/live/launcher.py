@@ -99,13 +99,7 @@ def launch(
         scenario = remote_access.with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
-        loops = resolved_loops(scenario)
-        resolved = resolve_run(scenario)
-        require_disk_space(loops, runs)
-        if PLANT in spawn:
-            # Compile now: the start barrier has a time limit.
-            for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
-                system.prepare()
+        resolved = _prepare(scenario, runs, spawn)
         signals = stack.enter_context(Signals().handled())
         run_dir = new_run_dir(runs, resolved.name)
         resolved = write_scenario(resolved, run_dir)
@@ -116,20 +110,14 @@ def launch(
         away = {} if listening is None else listening.hosts
         coordinator = Coordinator(ticket, [role for role in spawn if role not in away])
         stack.callback(coordinator.close)
-        watcher, opened = joint_watcher([] if watcher is None else [watcher]), None
+        watcher = joint_watcher([] if watcher is None else [watcher])
         with _no_directory_if_refused(run_dir):
-            if listening is not None:
-                ticket = ticket.model_copy(update={"host": listening.address[0]})
-                to_hosts = remote_access.open_to_hosts(listening, ticket, coordinator)
-                opened = stack.enter_context(to_hosts)
-            if session is not None:
-                by_hand = ticket.model_copy(update={"launched": False})
-                stack.enter_context(published(by_hand, session))
-            if listening is not None and opened is not None:
-                if listening.invitation is not None:  # last: it replaces that of an earlier run
-                    stack.enter_context(invitation_file(listening.invitation, opened.invitation))
-                watcher.listening(text_of(opened.address), listening)
-        remote = opened and RemoteStart(away, opened.invitation.model_dump_json())
+            opened = _open_to_others(stack, ticket, session, listening, coordinator)
+        remote = None
+        if listening is not None and opened is not None:
+            ticket = ticket.model_copy(update={"host": listening.address[0]})
+            remote = RemoteStart(away, opened.invitation.model_dump_json())
+            watcher.listening(text_of(opened.address), listening)
         children = ChildProcesses(ticket, run_dir, spawn, server, remote)
         stack.enter_context(children.started(live=live))
         run = _Run(ticket, run_dir, coordinator, children, watcher, opened and opened.notices)
@@ -139,6 +127,38 @@ def launch(
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
     return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
+
+
+def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:
+    """Return the resolved scenario, for whose record there is space on the disk."""
+    loops, resolved = resolved_loops(scenario), resolve_run(scenario)
+    require_disk_space(loops, runs)
+    if PLANT in spawn:
+        # Compile now: the start barrier has a time limit.
+        for system in {repr(loop.plant.system): loop.plant.system for loop in loops}.values():
+            system.prepare()
+    return resolved
+
+
+def _open_to_others(
+    stack: contextlib.ExitStack,
+    ticket: Ticket,
+    session: str | None,
+    listening: "remote_access.Listening | None",
+    coordinator: Coordinator,
+) -> "remote_access.Opened | None":
+    """Let processes join that are started by hand; return how those of other hosts join."""
+    opened = None
+    if listening is not None:
+        ticket = ticket.model_copy(update={"host": listening.address[0]})
+        opened = stack.enter_context(remote_access.open_to_hosts(listening, ticket, coordinator))
+    if session is not None:
+        by_hand = ticket.model_copy(update={"launched": False})
+        stack.enter_context(published(by_hand, session))
+    if opened is not None and listening is not None and listening.invitation is not None:
+        # last: it replaces that of an earlier run
+        stack.enter_context(invitation_file(listening.invitation, opened.invitation))
+    return opened
 
 
 @contextlib.contextmanager

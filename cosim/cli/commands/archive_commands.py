@@ -39,10 +39,7 @@ def archive(
     path = out or Path(f"{chosen.resolve().name}{run_archive.SUFFIX}")
     with cli.status("archiving"):
         manifest = run_archive.write_archive(chosen, path)
-    if json:
-        cli.print_json({"archive": str(path)} | manifest.model_dump(mode="json"))
-    else:
-        print(path)
+    cli.print_lines(json, {"archive": str(path)} | manifest.model_dump(mode="json"), path)
 
 
 @cli.command(cli.RUNS, 94)

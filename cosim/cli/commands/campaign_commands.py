@@ -94,14 +94,16 @@ def paper(
     done = execute_campaign(plan, path, worker_pool(None), folder=folder, draws=draws)
     with cli.status("computing the examples"):
         found, files = paper_page.write_page(done, out)
-    names = [str(file) for file in files]
-    if json:
-        shown = {"draws": done.summary.draws, "representative": found["representative"]}
-        cli.print_json(shown | {"claims": found["summary"]["claims"], "files": names})
-    else:
+    if not json:
         table = campaign_report.claims_table(done.summary)
         cli.console().print(result_tables.terminal_table(table, left=range(3)))
-        print(*names, sep="\n")
+    document = {
+        "draws": done.summary.draws,
+        "representative": found["representative"],
+        "claims": found["summary"]["claims"],
+        "files": [str(file) for file in files],
+    }
+    cli.print_lines(json, document, *files)
 
 
 @cli.option_group

@@ -92,10 +92,7 @@ def lab(
     options = lab_server.LabOptions(given.scenario, query, Path.cwd(), runs, port, browser)
 
     def announce(address: str) -> None:
-        if json:
-            cli.print_json({"address": address})
-        else:
-            print(f"noack lab: {address}  (Ctrl-C ends)")
+        cli.print_lines(json, {"address": address}, f"noack lab: {address}  (Ctrl-C ends)")
         sys.stdout.flush()  # somebody waits for it
 
     lab_server.serve(options, announce)

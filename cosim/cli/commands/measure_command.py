@@ -185,10 +185,8 @@ def measure(
     live, how = probe.live(options.deadline_s), files.source(probe.rate)
     result, name = _result(sources or [], probe.listen, live, how)
     if result.trace is None:  # the sender of a one-way probe does not know what arrived
-        if json:
-            cli.print_json({"notes": result.notes})
-        else:
-            print(*result.notes, "the listener reports what has arrived", sep="\n")
+        last = "the listener reports what has arrived"
+        cli.print_lines(json, {"notes": result.notes}, *result.notes, last)
         return ExitStatus.OK
     found = network_measurement.Measurement(result.trace, options, name, result.notes)
     document = measurement_outputs.report(found, request, None if json else cli.console())

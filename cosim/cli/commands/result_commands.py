@@ -105,11 +105,8 @@ def report(
         opened = run_library.open_run(run.path)
         shown = opened if run.loop is None else opened.loops[run.loop]
         drawn = shown.save_figures(files.kind, files.width_in)
-    if json:
-        written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
-        cli.print_json({"report": str(path)} | written)
-    else:
-        print(path, *drawn, sep="\n")
+    written = {"figures": [str(figure) for figure in drawn]} if drawn else {}
+    cli.print_lines(json, {"report": str(path)} | written, path, *drawn)
 
 
 @cli.command(cli.RUNS, 70)
@@ -195,5 +192,4 @@ def export(
     path = out or Path(f"{name}{export_suffix(file_format)}")
     with cli.status("exporting"):
         written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
-    names = [str(path) for path in written]
-    cli.print_json({"files": names}) if json else print(*names, sep="\n")
+    cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
