@@ -1,7 +1,6 @@
 """Findings on a machine, from its measurements: their meaning for a run, remedies, a table.
 
-A check of the doctor is a function with the decorator ``_check``; its place here is that in the
-table. It yields a verdict for each thing that it found.
+A check is a function with the decorator ``_check``; it yields a verdict for each thing it found.
 """
 
 from collections.abc import Callable, Iterator, Sequence

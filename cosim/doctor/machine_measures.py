@@ -80,17 +80,15 @@ class RunRequirements:
 def requirements_of(resolved: Scenario) -> RunRequirements:
     """Return what a resolved scenario requires of the machine."""
     period_ns = round(resolved.timing.plant_period_ns / resolved.speed)
-    settings = resolved.realtime
-    ports = {name: port for name, port in resolved.ports.model_dump().items() if port}
     return RunRequirements(
         name=resolved.name,
         duration_s=resolved.horizon_s / resolved.speed,
         period_ns=period_ns,
         allowance_ns=resolved.certificate.late_periods * period_ns,
-        realtime=settings.enabled,
-        fifo_priority=settings.fifo_priority,
-        spin_us=settings.spin_us,
-        ports=ports,
+        realtime=resolved.realtime.enabled,
+        fifo_priority=resolved.realtime.fifo_priority,
+        spin_us=resolved.realtime.spin_us,
+        ports={name: port for name, port in resolved.ports.model_dump().items() if port},
     )
 
 

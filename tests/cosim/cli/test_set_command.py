@@ -22,6 +22,7 @@ from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket
+from tests.fuzz.plane import Query
 
 
 @pytest.fixture
@@ -166,35 +167,12 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_only_one(
     assert list(path.parent.iterdir()) == []
 
 
-class Query:
-    """A request as the control plane delivers it."""
-
-    key_expr = ""
-
-    def __init__(self, content: object) -> None:
-        self.payload = self
-        self._content = content
-        self.answered: Any = None
-        self.refused: str | None = None
-
-    def to_bytes(self) -> bytes:
-        return json.dumps(self._content).encode()
-
-    def reply(self, _key_expr: str, text: str) -> None:
-        self.answered = json.loads(text)
-
-    def reply_err(self, why: str) -> None:
-        self.refused = why
-
-    def drop(self) -> None:
-        pass
-
-
-def test_only_active_runs_can_be_changed(ticket: Ticket, coordinator: Coordinator) -> None:
-    change, question = Query({"settings": {"network.mansd": 1}}), Query({})
+def test_only_active_runs_can_be_changed(coordinator: Coordinator) -> None:
+    change = Query("", b'{"settings": {"network.mansd": 1}}')
+    question = Query("", b"{}")
     coordinator._answer_change(change)  # type: ignore[arg-type]
-    assert change.refused == "the run has not started"
+    assert change.error == "the run has not started"
     coordinator._answer_change(question)  # type: ignore[arg-type]
-    runtime_parameters = question.answered["runtime_parameters"]
+    runtime_parameters = json.loads(question.replies[0])["runtime_parameters"]
     assert runtime_parameters["network.mansd"] == 2
     assert runtime_parameters["controller.setpoint"] == [0.0, 0.0]
