@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from threading import RLock
@@ -36,8 +37,9 @@ class _LazyModule(ModuleType):
 class _LazyLoader(Loader):
     """As :class:`importlib.util.LazyLoader`, which threads cannot share before Python 3.11.9."""
 
-    def __init__(self, loader: Loader) -> None:
-        self._loader, self._lock, self._loads = loader, RLock(), False
+    def __init__(self, loader: Loader, package: str) -> None:
+        self._loader, self._package = loader, package
+        self._lock, self._loads = RLock(), False
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
         return self._loader.create_module(spec)
@@ -46,17 +48,25 @@ class _LazyLoader(Loader):
         module.__class__ = _LazyModule
 
     def load(self, module: ModuleType) -> None:
-        """Load a module, unless this thread is loading it; another thread waits for the end."""
-        with self._lock:
-            if self._loads or module.__class__ is ModuleType:
-                return
-            self._loads, token = True, _IS_LAZY.set(False)
-            try:
-                self._loader.exec_module(module)
-                module.__class__ = ModuleType
-            finally:
-                self._loads = False
-                _IS_LAZY.reset(token)
+        """Load a module after its package, unless this thread is loading it.
+
+        If another thread is, wait for its end.
+        """
+        token = _IS_LAZY.set(False)
+        try:
+            if self._package and not self._loads:
+                import_module(self._package)
+            with self._lock:
+                if self._loads or module.__class__ is ModuleType:
+                    return
+                self._loads = True
+                try:
+                    self._loader.exec_module(module)
+                    module.__class__ = ModuleType
+                finally:
+                    self._loads = False
+        finally:
+            _IS_LAZY.reset(token)
 
 
 class _LazyFinder(MetaPathFinder):
@@ -66,7 +76,7 @@ class _LazyFinder(MetaPathFinder):
         for finder in sys.meta_path if _IS_LAZY.get() else ():
             spec = None if finder is self else finder.find_spec(name, path, target)
             if spec is not None and spec.loader is not None:
-                spec.loader = _LazyLoader(spec.loader)
+                spec.loader = _LazyLoader(spec.loader, name.rpartition(".")[0])
                 return spec
         return None
 

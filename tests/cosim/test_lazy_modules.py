@@ -16,11 +16,14 @@ from cosim.lazy_modules import lazy_modules
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A package that appends to ``sys.argv`` what is loaded."""
     folder = tmp_path / "some_package"
-    folder.mkdir()
+    (folder / "inner").mkdir(parents=True)
     for name, rest in (
         ("__init__", ""),
         ("slow", "import time\nfirst = 1\ntime.sleep(0.2)\nsecond = 2\n"),
         ("wrong", "raise RuntimeError\n"),
+        ("inner/__init__", "from some_package.inner.one import name\n"),
+        ("inner/one", "from some_package.inner import two\nname = two.name\n"),
+        ("inner/two", "name = 2\n"),
     ):
         text = f"import sys\nsys.argv.append(__name__)\n{rest}"
         (folder / f"{name}.py").write_text(text)
@@ -42,15 +45,19 @@ def test_a_module_is_loaded_when_a_name_of_it_is_used(package: str) -> None:
     assert imported(package, "slow") is module
     assert sys.argv == []
     assert module.second == 2
-    assert sys.argv == [f"{package}.slow"]
+    assert sys.argv == [package, f"{package}.slow"]
     assert type(module) is ModuleType
-    assert type(sys.modules[package]) is not ModuleType  # nothing needed the package itself
 
 
 def test_an_ordinary_import_loads_it(package: str) -> None:
     imported(package, "slow")
     importlib.import_module(f"{package}.slow")
     assert sys.argv[-1] == f"{package}.slow"
+
+
+def test_a_package_is_loaded_before_its_modules(package: str) -> None:
+    assert imported(package, "inner.one").name == 2
+    assert sys.argv == [f"{package}{name}" for name in ("", ".inner", ".inner.one", ".inner.two")]
 
 
 def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
@@ -61,7 +68,7 @@ def test_another_thread_waits_until_it_is_loaded(package: str) -> None:
     for thread in threads:
         thread.join()
     assert found == [2, 2, 2]
-    assert sys.argv == [f"{package}.slow"]
+    assert sys.argv == [package, f"{package}.slow"]
 
 
 def test_an_error_is_raised_at_each_use(package: str) -> None:
