@@ -79,7 +79,7 @@ PANELS = (RUNS, THEORY, CAMPAIGNS, MEASURING, FILES, PROCESSES)
 P = ParamSpec("P")
 T = TypeVar("T")
 Found = TypeVar("Found")
-_order: dict[Any, tuple[int, int]] = {}
+_order: dict[object, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
 
 
@@ -412,7 +412,7 @@ def write_tables(
 
 def show_with_files(
     json: bool,
-    document: dict[str, Any],
+    document: dict[str, object],
     files: Iterable[Path],
     show_text: "Callable[[Console, Found], object]",
     found: Found,
@@ -451,7 +451,7 @@ def print_json(document: object) -> None:
     print(dumps(_finite(document), indent=2, allow_nan=False))
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -4,7 +4,7 @@ import io
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import groupby
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -103,7 +103,7 @@ def ignore_broken_pipes() -> None:
     sys.stdout, sys.stderr = pipe_safe_stream(sys.stdout), pipe_safe_stream(sys.stderr)
 
 
-def pipe_safe_stream(stream: Any) -> Any:
+def pipe_safe_stream(stream: TextIO) -> TextIO:
     """Return a standard stream that discards output after its reader has closed it."""
     if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream

@@ -1,5 +1,6 @@
 """The commands, one file each.
 
-A file declares its command with :func:`cosim.cli.command.command`: panel, place in it, examples.
-Help, completion and the reference page (``tools/reference_pages.py``) are derived from that.
+A file declares its commands with :func:`cosim.cli.command.command`: panel, and place in it. The
+help of the options and the examples are in the docstrings. Help, completion and the reference page
+(``tools/reference_pages.py``) are derived from that.
 """
