@@ -31,7 +31,7 @@ LINES = {
     "cosim/doctor": 810,
     "cosim/interactive": 1600,
     "cosim/lab": 2100,
-    "cosim/live": 3530,
+    "cosim/live": 3550,
     "cosim/measurement": 2900,
     "cosim/output": 8400,
     "cosim/record": 3250,
