@@ -40,6 +40,7 @@ from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
 from noack.config.resolution import (
     LoopMatrices,
+    has_loop,
     is_of_network,
     loop_of,
     network_tables,
@@ -152,7 +153,7 @@ class RunRecord:
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
 
-        They have all columns, or only some besides ``now_ns``.
+        They have all columns, or at least some besides ``now_ns``.
 
         A short run is one part. A part of a longer one has half of ``BATCH_ROWS`` steps: what is
         computed from it is several times as large.
@@ -161,11 +162,7 @@ class RunRecord:
         if any(self.count(table) > BATCH_ROWS for table in names):
             yield from slices(self.source, names, self._slice_ns, columns)
         elif any(map(self.count, names)):
-            types = {table: with_columns(self.source.types[table], columns) for table in names}
-            yield {
-                table: joined([*self.source.batches(table, columns)], dtype)
-                for table, dtype in types.items()
-            }
+            yield {table: self.source.whole(table) for table in names}
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -312,6 +309,15 @@ class RecordedRun:
         """Return the record of a loop; see :meth:`number_of`."""
         return self.loops[self.number_of(name)]
 
+    def together(self, numbers: range) -> Sequence[RunRecord]:
+        """Return the records of some loops, whose rows are read at once and kept in memory.
+
+        The rows of one loop are read when they are used.
+        """
+        if len(numbers) > 1 and isinstance(self.loops, StoredLoops):
+            return self.loops.together(numbers)
+        return [self.loops[number] for number in numbers]
+
 
 def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     """Return the error for a name that none of a run's loops has, or for no name of several."""
@@ -324,11 +330,11 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
 
 
-class _StoredLoops(Sequence[RunRecord]):
+class StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 
     def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
-        self._kind, self._stored = network.kind, stored
+        self._kind, self._stored, self._scenario = network.kind, stored, network.scenario
         self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
@@ -348,6 +354,17 @@ class _StoredLoops(Sequence[RunRecord]):
         if self._newest is None or self._newest.number != number:
             self._newest = self._record_of(number)
         return self._newest
+
+    def together(self, numbers: range) -> list[RunRecord]:
+        """See :meth:`RecordedRun.together`."""
+        records = [self._record_of(number) for number in numbers]
+        for table in filter(has_loop, run_tables(self._scenario)):
+            having = [record for record in records if table in record.tables]
+            types = [record.tables[table] for record in having]
+            loops = [record.number for record in having]
+            for place, rows in self._stored.of_loops(table, loops, types):
+                having[place].source.keep(table, rows)
+        return records
 
     def _record_of(self, number: int) -> RunRecord:
         loop = self._loops[number]
@@ -393,7 +410,7 @@ def load_run(run_dir: Path) -> RecordedRun:
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
     kind = kind_of(run_dir)
     network = RunRecord(scenario, stored, notices, reports, kind, earlier, roles=NETWORK_ROLES)
-    return RecordedRun(network, _StoredLoops(run_dir, network, stored))
+    return RecordedRun(network, StoredLoops(run_dir, network, stored))
 
 
 def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:

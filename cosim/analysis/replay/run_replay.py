@@ -1,25 +1,30 @@
 """The replay of a run: its network, and each of its loops."""
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import MachineReplay
+from cosim.analysis.replay.machine_replay import MachineReplay, SharedMachines
 from cosim.analysis.replay.message_comparison import MessageComparison
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay
 from cosim.analysis.summary_model import ReplayDifference
-from cosim.record.run_record import RecordedRun, RunRecord
+from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.topology import LOOP_ROLES
 
 
-def replay(record: RunRecord) -> Replay:
+def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
     """Replay a run and compare it with its record; a process is replayed up to its first gap.
+
+    ``shared`` has the machines of several loops, if they are replayed in turn.
 
     In a run of several loops, the network is replayed once, for all of them: ``record`` is that of
     the network, or that of a loop, whose network is not replayed. The record is read part by part,
     so that memory does not grow with the length of the run.
     """
-    machines = {role: MachineReplay(role, record) for role in record.roles}
+    shared = shared or SharedMachines(())
+    machines = {role: MachineReplay(role, record, shared) for role in record.roles}
     messages = MessageComparison(record, machines) if "sensor" in machines else None
     with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         for part in record.slices():
@@ -43,12 +48,22 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
     processes = [one for each in found for one in each.processes]
     messages = [one for each in found for one in each.messages]
     legs = dict.fromkeys(one.leg for one in messages)
+    # A restarted process has a result of its own.
+    names = sorted(
+        dict.fromkeys(one.process for one in processes),
+        key=lambda name: LOOP_ROLES.index(name.partition(" ")[0]),
+    )
     return Replay(
         processes=tuple(
-            _process([one for one in processes if one.process == role]) for role in LOOP_ROLES
+            _process([one for one in processes if one.process == name]) for name in names
         ),
         messages=tuple(_leg([one for one in messages if one.leg == leg]) for leg in legs),
     )
+
+
+def stored_verdict(run_dir: Path) -> dict[str, Any]:
+    """Replay the only loop of a run directory; return the result for its summary."""
+    return replay(load_run(run_dir).loop()).verdict()
 
 
 def _process(found: Sequence[ProcessReplay]) -> ProcessReplay:
