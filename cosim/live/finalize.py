@@ -1,5 +1,6 @@
 """The end of a run: its record completed, its summary, report and recording written."""
 
+import gc
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,7 +55,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
-_LOOPS_AT_ONCE, _ROWS_AT_ONCE = 32, 2**17
+_LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
 """Loops that are judged together, and rows of one of their tables."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
@@ -159,6 +160,7 @@ def _judged(
 
         beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
         helpers = 0 if pool is None or loops == 1 else cores() - 1
+        gc.freeze()  # what is there stays: it need not be searched again and again
         with ThreadPoolExecutor(max(helpers, 1)) as threads:
             waiting = [threads.submit(judge_next, partial(_judged_by, pool, ending))
                        for _ in range(helpers)]  # fmt: skip
@@ -168,6 +170,7 @@ def _judged(
                 judge_next(partial(_judged_loops, run, ending, beside))
             finally:
                 blocks.clear()  # an interrupted run waits for one block at most
+                gc.unfreeze()
         for helper in waiting:
             helper.result()
     judged = [loop for block in sorted(found, key=min) for loop in found[block]]
@@ -193,11 +196,14 @@ def _steps(run: RecordedRun) -> int:
     return max(timing.horizon_ns // timing.plant_period_ns, 1)
 
 
-def _blocks(run: RecordedRun) -> list[range]:
-    """Return the loops that are judged together: as many as fit into memory with their rows."""
-    loops = len(run.loops)
-    width = min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1))
-    return [range(first, min(first + width, loops)) for first in range(0, loops, width)]
+def _blocks(run: RecordedRun) -> Iterator[range]:
+    """Yield the loops that are judged together: as many as fit into memory, at the end fewer."""
+    loops, first = len(run.loops), 0
+    most = min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1))
+    while first < loops:
+        width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), most, loops - first)
+        yield range(first, first + width)
+        first += width
 
 
 @contextmanager
@@ -220,13 +226,17 @@ def _judged_by(pool: ProcessPoolExecutor, ending: RunEnding, block: range) -> li
         return _judged_stored(ending, block)
 
 
+@cache
+def _stored_run(run_dir: Path) -> RecordedRun:
+    """Return the run of a helper, whose objects then live as long as the process."""
+    run = load_run(run_dir)
+    gc.freeze()
+    return run
+
+
 @np.errstate(all="ignore")
 def _judged_stored(ending: RunEnding, block: range) -> list[_Judged]:
     return _judged_loops(_stored_run(ending.run_dir), ending, None, block)
-
-
-_stored_run = cache(load_run)
-"""The run of a helper."""
 
 
 def _judged_loops(

@@ -5,6 +5,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -60,6 +61,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
+from noack.core.process_limits import cores
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -494,8 +496,13 @@ def write_tables(
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
-    for table, batches in tables:
-        write_table(folder / f"{table}.parquet", batches, types[table], names)
+    with ThreadPoolExecutor(cores()) as threads:  # most of the work is done without the lock
+        written = [
+            threads.submit(write_table, folder / f"{table}.parquet", batches, types[table], names)
+            for table, batches in tables
+        ]
+    for one in written:
+        one.result()
     with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 

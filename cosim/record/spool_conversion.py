@@ -123,6 +123,7 @@ def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range)
     read = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
     own = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in read]
     rows = joined(own, dtype)
+    del own  # as large as the rows
     rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
     ends = np.searchsorted(rows[LOOP], np.arange(loops.start, loops.stop), "right")
     return [in_order(rows[first:end]) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
