@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, R
 from cosim.analysis.summary_model import ReplayDifference
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.topology import LOOP_ROLES
+
+Result = TypeVar("Result", ProcessReplay, MessagesReplay)
 
 
 def replay(record: RunRecord, shared: SharedMachines | None = None) -> Replay:
@@ -45,20 +47,23 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
     if loop is not None or len(run.loops) == 1:
         return replay(run.loop(loop))
     found = [replay(run.network), *map(replay, run.loops)]
-    processes = [one for each in found for one in each.processes]
-    messages = [one for each in found for one in each.messages]
-    legs = dict.fromkeys(one.leg for one in messages)
     # A restarted process has a result of its own.
-    names = sorted(
-        dict.fromkeys(one.process for one in processes),
-        key=lambda name: LOOP_ROLES.index(name.partition(" ")[0]),
-    )
+    processes = _by_name((one.process, one) for each in found for one in each.processes)
+    messages = _by_name((one.leg, one) for each in found for one in each.messages)
     return Replay(
         processes=tuple(
-            _process([one for one in processes if one.process == name]) for name in names
+            _process(processes[name])
+            for name in sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
         ),
-        messages=tuple(_leg([one for one in messages if one.leg == leg]) for leg in legs),
+        messages=tuple(map(_leg, messages.values())),
     )
+
+
+def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
+    found: dict[str, list[Result]] = {}
+    for name, one in named:
+        found.setdefault(name, []).append(one)
+    return found
 
 
 def stored_verdict(run_dir: Path) -> dict[str, Any]:

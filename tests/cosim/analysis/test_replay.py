@@ -15,8 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.replay import replay
-from cosim.analysis.replay.replay_result import difference
+from cosim.analysis.replay import Replay, replay, run_replay
+from cosim.analysis.replay.replay_result import ProcessReplay, difference
+from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load, validate
@@ -362,3 +363,25 @@ def test_a_record_with_any_numbers_is_replayed(number: int, data: st.DataObject)
     assert json.dumps(found.document(), allow_nan=False)
     if equal:
         assert found.bit_exact
+
+
+def test_a_restarted_process_has_a_result_of_its_own_in_a_run_of_several_loops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def canned(record: RunRecord) -> Replay:
+        names = ["netem"] if record.is_network else ["plant", "sensor", "sensor (2)", "controller"]
+        results = [
+            ProcessReplay(process=name, inputs=2, compared=1, missing_from=None, end_known=True,
+                          difference=None)
+            for name in names
+        ]  # fmt: skip
+        return Replay(processes=tuple(results), messages=())
+
+    monkeypatch.setattr(run_replay, "replay", canned)
+    network = changed(RECORD)
+    network.roles = NETWORK_ROLES
+    found = run_replay.replay_run(RecordedRun(network, [RECORD, RECORD]))
+    counts = {one.process: (one.inputs, one.compared) for one in found.processes}
+    several = dict.fromkeys(("plant", "sensor", "sensor (2)", "controller"), (4, 2))
+    assert counts == several | {"netem": (2, 1)}
+    assert [*counts].index("netem") == 3
