@@ -129,7 +129,7 @@ def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range)
     return [in_order(rows[first:end]) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
-_BLOCK_BYTES = 64 * 1024 * 1024
+_BLOCK_BYTES = 32 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
 
 
