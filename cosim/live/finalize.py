@@ -22,6 +22,7 @@ from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
+    ConditionsPart,
     ExitPart,
     LoopSummary,
     ReplayPart,
@@ -275,7 +276,7 @@ class ReplayBeside:
     def part(self) -> ReplayPart | None:
         """Wait for the result; None if the process could not replay the run."""
         try:
-            return ReplayPart(**self._verdict.result())
+            return self._verdict.result()
         except Exception:  # this process then finds the reason
             return None
 
@@ -305,7 +306,7 @@ def _with_results(
     with suppress(Exception):  # the recording reports it
         if len(run.loops) > 1:
             over_time = loop_over_time(record, run.phases_ns[record.number])
-    return _Judged(summary.with_results(**results), over_time)
+    return _Judged(summary.model_copy(update=results), over_time)
 
 
 def _claim_results(
@@ -319,7 +320,7 @@ def _claim_results(
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
     return {
-        "conditions": claims.conditions,
+        "conditions": ConditionsPart(**claims.conditions),
         "claims": claims.judge(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(
@@ -331,7 +332,7 @@ def _claim_results(
 
 def _replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayPart:
     try:
-        return ReplayPart(**replay(record, shared).verdict())
+        return replay(record, shared).verdict()
     except Exception as error:  # the run itself did not fail
         return ReplayPart(bit_exact=None, error=repr(error))
 

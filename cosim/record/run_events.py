@@ -77,6 +77,7 @@ class RecordedChange(NamedTuple):
         return not is_of_loss_alone(self.change.settings)
 
 
+@lru_cache(maxsize=1)
 def changes_of(record: RunRecord) -> list[RecordedChange]:
     """Return the changes of a run, in the order in which they came into force.
 

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from cosim.analysis.replay.machine_replay import MachineReplay, SharedMachines
 from cosim.analysis.replay.message_comparison import MessageComparison
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay
-from cosim.analysis.summary_model import ReplayDifference
+from cosim.analysis.summary_model import ReplayDifference, ReplayPart
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.topology import LOOP_ROLES
 
@@ -66,7 +66,7 @@ def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
     return found
 
 
-def stored_verdict(run_dir: Path) -> dict[str, Any]:
+def stored_verdict(run_dir: Path) -> ReplayPart:
     """Replay the only loop of a run directory; return the result for its summary."""
     return replay(load_run(run_dir).loop()).verdict()
 

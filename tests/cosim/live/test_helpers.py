@@ -54,7 +54,6 @@ def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
     finalize.finalize(RunEnding(run_dir, 0, ExitStatus.OK, "horizon"), report=False)
     stored = json.loads((run_dir / SUMMARY_FILE).read_text())["loops"][0]["replay"]
     assert stored["first_difference"]["row"] == 9
-    verdict = replay(load_record(run_dir)).verdict()
-    assert {name: stored[name] for name in verdict} == verdict
+    assert stored == replay(load_record(run_dir)).verdict().model_dump()
     assert len(found) == 1
     assert (found[0] is None) == (part is _killed)
