@@ -160,11 +160,11 @@ def _judged(
                     show(sum(map(len, found)) / loops)
 
         beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
-        helpers = 0 if pool is None or loops == 1 else cores() - 1
+        others = [] if pool is None or loops == 1 else [partial(_judged_by, pool, ending)]
+        others *= cores() - 1
         gc.freeze()  # what is there stays: it need not be searched again and again
-        with ThreadPoolExecutor(max(helpers, 1)) as threads:
-            waiting = [threads.submit(judge_next, partial(_judged_by, pool, ending))
-                       for _ in range(helpers)]  # fmt: skip
+        with ThreadPoolExecutor(max(len(others), 1)) as threads:
+            waiting = [threads.submit(judge_next, judge) for judge in others]
             try:
                 if run.kind == "live" and loops > 1:
                     replayed = _replay(run.network)
