@@ -286,11 +286,6 @@ class RecordedRun:
         return phases_ns(self.scenario)
 
     @cached_property
-    def scenarios(self) -> Sequence[Scenario]:
-        """The resolved scenario of each loop."""
-        return resolved_loops(self.scenario)
-
-    @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
         return loop_names(self.scenario)
