@@ -30,11 +30,11 @@ from cosim.analysis.value_reduction import QuantileSketch
 from cosim.record.align import (
     AlignedPart,
     AlignedRun,
-    IdentityResidual,
     Reals,
     SizeStatistics,
-    aligned_parts,
+    bounded_parts,
     expected_rms,
+    identity_residual,
     in_common,
 )
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
@@ -376,11 +376,10 @@ class SignalStatistics:
         self._scale, self._read = 0.0, 0
         self._half = record.count(SENSOR_MEASUREMENT) // 2
         facts = SampleFactsReader(record.scenario)
-        residual = IdentityResidual(record.scenario)
-        for part in aligned_parts(record):
+        for part, bounds in bounded_parts(record):
             self._add(part)
             facts.take(part.aligned)
-            left = residual.take(part)
+            left = identity_residual(record.scenario, part.aligned, bounds.missed)
             self._residual = _larger(self._residual, left[~np.isnan(left)])
             self._estimation_error(part)
             self._read += len(part.rows)
