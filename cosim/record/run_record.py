@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cosim.record.processes import (
     LIFE_COLUMNS,
     Life,
+    Report,
     entries_of_loop,
     generations,
     joint_reports,
@@ -78,6 +79,8 @@ if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
 
 _NOTICES_FILE = "notices.jsonl"
+Notice = dict[str, Any]
+"""A line of the run's log: t_ns, level, text, process, and the number of a loop if it has one."""
 _MOST_NAMES = 12
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
 """A table has at most this number of rows per step of the loops, and more for restarts."""
@@ -118,10 +121,10 @@ class RunRecord:
         self,
         scenario: Scenario,
         rows: Mapping[str, Rows] | RecordSource,
-        notices: list[dict[str, Any]],
-        reports: Mapping[str, dict[str, Any]],
+        notices: list[Notice],
+        reports: Mapping[str, Report],
         kind: Kind = "live",
-        earlier: Sequence[dict[str, Any]] = (),
+        earlier: Sequence[Report] = (),
         number: int = 0,
         roles: Sequence[str] = LOOP_ROLES,
     ) -> None:
@@ -229,7 +232,7 @@ class RunRecord:
             for one in self.row_counts(role)
         )
 
-    def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
+    def _reports_of(self, role: str) -> Mapping[int, Report]:
         """The final reports of a process, by generation."""
         newest = [] if role not in self.reports else [self.reports[role]]
         earlier = [report for report in self.earlier if report["process"] == role]
@@ -483,7 +486,7 @@ def write_tables(
     tables: Iterable[tuple[str, Iterable[Rows]]],
     types: Mapping[str, np.dtype[np.void]],
     names: Mapping[str, Sequence[str]],
-    notices: Iterable[Mapping[str, Any]],
+    notices: Iterable[Notice],
 ) -> None:
     """Write tables, with the names of states and inputs, and the run's log."""
     from cosim.record.table_files import write_table
@@ -502,7 +505,7 @@ def write_tables(
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 
 
-def read_notices(folder: Path) -> list[dict[str, Any]]:
+def read_notices(folder: Path) -> list[Notice]:
     """Read the run's log from the folder of its record."""
     path = folder / _NOTICES_FILE
     try:

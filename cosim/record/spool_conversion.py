@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
 from cosim.record.run_record import (
+    Notice,
     RecordedRun,
     load_run,
     read_notices,
@@ -212,7 +213,7 @@ def _kept(run_dir: Path, error: OSError) -> MachineError:
     )
 
 
-def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:
+def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
     notices = read_notices(folder)
     known = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):
