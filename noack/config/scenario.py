@@ -21,7 +21,7 @@ from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
 from noack.core.random_streams import named_stream_keys, stream
-from noack.settings.section import ScenarioSection
+from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.trigger.periodic_trigger import PeriodicSettings
 
 
@@ -107,7 +107,7 @@ def with_loop_tables(
     """
     sections = []
     for place, section in enumerate(scenario.loops or ()):
-        update: dict[str, Any] = {}
+        update: dict[str, object] = {}
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")
@@ -132,7 +132,7 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
         raise ValueError("scenario: it is read where a scenario file is loaded; give tables here")
     if section.scenario is not None:
         loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
-    content: dict[str, Any] = {} if section.mode is None else {"mode": section.mode}
+    content: Table = {} if section.mode is None else {"mode": section.mode}
     for part, kinds in _KINDS.items():
         if (given := getattr(section, part)) is None:
             continue
@@ -148,7 +148,7 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
 
 
 def _with_parts(
-    scenario: Scenario, content: Mapping[str, Any], parts: Iterable[str], place: str = ""
+    scenario: Scenario, content: ReadTable, parts: Iterable[str], place: str = ""
 ) -> Scenario:
     """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
     model = parts_model(frozenset(parts))
@@ -208,7 +208,7 @@ def _seeds(
 @cache
 def parts_model(parts: frozenset[str], *, others: bool = False) -> type[ScenarioSection]:
     """Return a model of some of a scenario's parts; with ``others``, those are optional keys."""
-    fields: dict[str, Any] = {}
+    fields: Table = {}
     for name, field in Scenario.model_fields.items():
         kind: Any = field.annotation
         if name in parts:

@@ -5,7 +5,7 @@ have (:func:`noack.settings.section.kinds_in`).
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -168,7 +168,7 @@ class ModelSection(ScenarioSection):
         return np.array(self.A), np.array(self.B)
 
 
-def require_read(file: str | None, names: Mapping[Any, str] | None) -> None:
+def require_read(file: str | None, names: object | None) -> None:
     """Raise ValueError if a section still names a file: loading a scenario replaces the name."""
     if file is not None:
         raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
@@ -443,7 +443,7 @@ class NetworkSection(DirectionSection):
     @property
     def link(self) -> LinkSettings:
         """The link from sensor to controller."""
-        update: dict[str, Any] = {"first_delivered": self.initial_sync == "first_packet"}
+        update: dict[str, object] = {"first_delivered": self.initial_sync == "first_packet"}
         if not self.enforce_mansd:
             update |= {"mansd": None, "constraints": ()}
         return super().link.model_copy(update=update)

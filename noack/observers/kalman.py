@@ -6,13 +6,13 @@ symmetric and positive semidefinite for any rounding error of L.
 """
 
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
 
 from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_memory import CoreMemory, Structure, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.section import Row, Rows, require_length, require_shape, require_squares
@@ -115,7 +115,9 @@ class KalmanSettings(ObserverSettings):
             for _ in range(assumed.steps):
                 core.noack_observer_predict(observer, n, m, nothing)
 
-    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+    def fill(
+        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+    ) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {
             "kind": core.NOACK_KALMAN, "P": np.diag(np.square(self.initial_std)),

@@ -30,6 +30,10 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 
+Table = dict[str, Any]
+"""A table of a settings file before it is validated: the values that JSON has."""
+ReadTable = Mapping[str, Any]
+"""The same, where it is only read."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
@@ -61,7 +65,7 @@ class ScenarioSection(BaseModel):
     @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /
-    ) -> dict[str, Any]:
+    ) -> Table:
         """Return the JSON Schema with the descriptions of the keys."""
         schema = handler(core_schema)
         properties = handler.resolve_ref_schema(schema).get("properties", {})

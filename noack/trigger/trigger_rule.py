@@ -16,12 +16,12 @@ Exact simulation finds the first t (native/exact/).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_memory import CoreMemory
+from noack.core.core_memory import CoreMemory, Structure
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
@@ -189,7 +189,7 @@ _NEVER_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
-def fill_rule(structure: Any, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
+def fill_rule(structure: Structure, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
     """Fill a ``noack_trigger_rule`` for n states; its matrices live in ``memory``.
 
     Raises:

@@ -16,7 +16,6 @@ from noack.config.parameter_changes import (
 from noack.config.resolution import resolve
 from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.config.scenario import Scenario
-from noack.config.scenario_checks import content_with_settings
 from noack.config.scenario_file import dumps, validate
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
@@ -59,9 +58,8 @@ def test_a_change_leaves_all_other_settings_unchanged(scenario: Scenario) -> Non
     assert (found.network.mansd, found.decaying.beta) == (1, 0.25)
     back = {"network.loss.probability": 0.5, "network.mansd": 2, "trigger.beta": 0.5}
     assert changed(found, back) == scenario
-    setpoint = {"controller.setpoint": [3.0, 0.0]}
-    as_a_whole = validate(content_with_settings(scenario, setpoint), "x")
-    assert changed(scenario, setpoint) == as_a_whole
+    moved = changed(scenario, {"controller.setpoint": [3.0, 0.0]})
+    assert validate(moved.model_dump(mode="json"), "x") == moved
 
 
 def test_a_new_loss_model_does_not_inherit_the_old_models_keys(scenario: Scenario) -> None:
