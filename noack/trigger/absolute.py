@@ -28,11 +28,3 @@ class AbsoluteSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖ > {self.delta:g}"
-
-    @property
-    def largest_threshold(self) -> float:
-        return self.delta
-
-    @property
-    def least_threshold(self) -> float:
-        return self.delta

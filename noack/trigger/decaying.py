@@ -40,21 +40,9 @@ class DecayingSettings(WeightedSettings):
     def description(self) -> str:
         return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
 
-    @property
-    def threshold_decay_per_s(self) -> float:
-        return self.alpha_per_s
-
     def at_origin(self, t_s: float) -> Self:
         beta = max(self.beta * math.exp(-self.alpha_per_s * t_s), _LEAST_BETA)
         return self.model_copy(update={"beta": beta})
-
-    @property
-    def largest_threshold(self) -> float:
-        return max(self.beta, self.floor)
-
-    @property
-    def least_threshold(self) -> float:
-        return self.floor
 
 
 def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:

@@ -36,14 +36,6 @@ class MixedSettings(WeightedSettings):
     def description(self) -> str:
         return f"‖e_s‖² > {self.sigma:g}² ‖x‖² + {self.epsilon:g}²"
 
-    @property
-    def largest_threshold(self) -> float:
-        return self.epsilon
-
-    @property
-    def least_threshold(self) -> float:
-        return self.epsilon
-
 
 def mixed_rule(n: int, sigma: float, epsilon: float, weight: Matrix | None) -> TriggerRule:
     """Return the rule for n states; σ > 0 without a unit, ε ≥ 0 in the units of ‖W x‖."""

@@ -71,24 +71,9 @@ class PolicySettings(ScenarioSection):
         """Why exact simulation cannot apply the policy; None if it can."""
         return None
 
-    @property
-    def threshold_decay_per_s(self) -> float:
-        """α of a threshold that decays from the run's start on; 0 if there is none."""
-        return 0.0
-
     def at_origin(self, t_s: float) -> Self:
         """Return the settings of the same trigger with times counted from ``t_s`` on."""
         return self
-
-    @property
-    def largest_threshold(self) -> float:
-        """The largest constant that ‖e_s‖_W is compared with; 0 if there is none."""
-        return 0.0
-
-    @property
-    def least_threshold(self) -> float | None:
-        """The threshold of ‖e_s‖_W never falls below this; None: there is no such threshold."""
-        return None
 
     def check(self, n: int, why: str) -> None:
         """Require matrices of the right shapes for n states.

@@ -47,10 +47,6 @@ class QuadraticSettings(WeightedSettings):
         heartbeat = f", or after {self.heartbeat} periods" if self.heartbeat else ""
         return f"zᵀQz > {self.epsilon:g}, sampled every {self.period_s:g} s{heartbeat}"
 
-    @property
-    def largest_threshold(self) -> float:
-        return self.epsilon
-
     def check(self, n: int, why: str) -> None:
         super().check(n, why)
         require_shape(self.Q, "trigger.Q", (2 * n, 2 * n), f"{why}, and z = (x, e_s)")

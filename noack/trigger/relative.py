@@ -27,7 +27,3 @@ class RelativeSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖ > {self.sigma:g} ‖x‖"
-
-    @property
-    def least_threshold(self) -> float:
-        return 0.0

@@ -72,11 +72,3 @@ class SelfTriggeredSettings(WeightedSettings):
     def description(self) -> str:
         threshold = decaying_text(self.beta, self.alpha_per_s, self.floor)
         return f"‖e_s‖ could reach {threshold}, as forecast at the last event"
-
-    @property
-    def largest_threshold(self) -> float:
-        return max(self.beta, self.floor)
-
-    @property
-    def least_threshold(self) -> float:
-        return self.floor
