@@ -1,7 +1,8 @@
 """Every policy at measurements, against the rules as they are stated; mistakes in settings.
 
-The exact simulator under every policy: tests/cosim/simulation/batch/test_policies.py; the search
-for the worst pattern: tests/cosim/analysis/adversary/test_policies.py.
+The table of all policies is in tests/trigger_rules.py. Here each is applied at measurements; in
+tests/cosim/simulation/batch/test_exact_events.py in continuous time; in
+tests/cosim/analysis/adversary/test_worst_patterns.py by the search for the worst pattern.
 """
 
 import math
@@ -13,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of, resolve, rule_of
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
@@ -22,27 +22,18 @@ from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import Forecast
 from tests.noack.trigger.core_trigger import CoreTrigger
 from tests.oracles.trigger_rules import Trigger
-from tests.trigger_rules import EXAMPLES, absolute_rule, self_triggered_rule
+from tests.trigger_rules import (
+    TABLES,
+    absolute_rule,
+    drawn,
+    rule_from,
+    self_triggered_rule,
+)
 
 Vector = NDArray[np.float64]
 DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
 RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
 N, MS, S = 2, 10**6, 10**9
-WEIGHT = [[2.0, 0.5], [0.0, 1.0]]
-FORM = [[-0.1, 0.0, 0.02, 0.0], [0.0, -0.1, 0.0, 0.01], [0.02, 0.0, 1.0, 0.1],
-        [0.0, 0.01, 0.1, 2.0]]  # fmt: skip
-TABLES: dict[str, dict[str, Any]] = {
-    **EXAMPLES,
-    "floor": EXAMPLES["decaying"] | {"floor": 0.4, "weight": WEIGHT},
-    "weighted mixed": EXAMPLES["mixed"] | {"sigma": 0.3, "weight": WEIGHT},
-    "weighted area": EXAMPLES["send_on_area"] | {"weight": WEIGHT},
-    "indefinite": EXAMPLES["quadratic"] | {"Q": FORM, "heartbeat": 6},
-    "late": EXAMPLES["deadline"] | {"interval_s": 0.2},
-    "dwell of periodic": EXAMPLES["dwell"]
-    | {"rule": {"policy": "periodic", "period_s": 0.07}, "interval_s": 0.1},
-    "late self-triggered": EXAMPLES["self_triggered"] | {"longest_s": 0.3, "weight": WEIGHT},
-}
-
 vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
 
 
@@ -62,14 +53,12 @@ def samples(seed: int, k: int) -> tuple[list[int], Vector]:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", TABLES)
-def test_the_core_decides_as_the_rule_is_stated(
-    content: dict[str, Any], name: str, seed: int
-) -> None:
-    table = TABLES[name]
-    scenario = resolve(validate(content | {"trigger": table}, "here"))
-    loop, start = loop_of(scenario), np.array([0.5, -0.3])
-    BK = loop.B_model @ loop.K
-    trigger, stated = CoreTrigger(rule_of(scenario), N), Trigger(table, loop.A_model + BK, BK)
+def test_the_core_decides_as_the_rule_is_stated(name: str, seed: int) -> None:
+    rng, start = np.random.default_rng(seed), np.array([0.5, -0.3])
+    table = drawn(TABLES[name], rng, N, np.array([[2.0, 0.5], [0.0, 1.0]]) if seed % 2 else None)
+    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[-1.0, -1.5]])
+    rule = rule_from(table, ModelMatrices(A, B, K))
+    trigger, stated = CoreTrigger(rule, N), Trigger(table, A + B @ K, B @ K)
 
     def begin(t_ns: int, x: Vector) -> None:
         trigger.start(t_ns, x)
