@@ -7,21 +7,19 @@ import numpy as np
 from noack.config.sections import POLICIES
 from noack.core.linear_systems import Matrix
 from noack.settings.section import Table
-from noack.trigger.deadline import with_deadline as with_deadline
-from noack.trigger.dwell import with_dwell_time as with_dwell_time
-from noack.trigger.dynamic import DynamicSettings
-from noack.trigger.dynamic import dynamic_rule as given_dynamic_rule
-from noack.trigger.lyapunov import lyapunov_rule as given_lyapunov_rule
 from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import (
     NEVER_NS,
     Forecast,
+    QuadraticForm,
     TriggerRule,
+    empty_map,
     error_form,
     no_form,
     quadratic_form,
     require_rule,
+    state_map,
 )
 
 EXAMPLES: dict[str, Table] = {
@@ -136,16 +134,6 @@ def mixed_rule(
     return given_mixed_rule(n if weight is None else len(weight), sigma, epsilon, weight)
 
 
-def dynamic_rule(
-    sigma: float, theta_s: float, decay_per_s: float, P: Matrix, Q: Matrix, BK: Matrix,
-    eta_0: float = 0.0, weight: Matrix | None = None,
-) -> TriggerRule:  # fmt: skip
-    settings = DynamicSettings(
-        policy="dynamic", sigma=sigma, theta_s=theta_s, decay_per_s=decay_per_s, eta_0=eta_0
-    )
-    return given_dynamic_rule(settings, P, Q, BK)._replace(weight=weight)
-
-
 def quadratic_rule(
     Q: Matrix, period_ns: int, epsilon: float = 0.0, heartbeat: int = 0,
     weight: Matrix | None = None,
@@ -170,4 +158,6 @@ def self_triggered_rule(
 
 
 def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:
-    return given_lyapunov_rule(factor, rate_per_s, weight)
+    n = len(factor)
+    form = QuadraticForm(state_map(n, factor), empty_map(n))
+    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

@@ -32,10 +32,6 @@ class PythonTriggerSettings(ClassSettings, WeightedSettings):
 
     policy: Literal["python"]
 
-    @classmethod
-    def example(cls, n: int) -> None:
-        return
-
     def trigger_policy(self, model: ModelMatrices) -> CodedPolicy:
         return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self), _BEYOND_EXACT)
 
