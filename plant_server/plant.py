@@ -95,8 +95,10 @@ class MeasurementModel:
 INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
 """The input that each policy applies, in words."""
 _POLICIES = {
-    "hold": core.NOACK_HOLD, "zero": core.NOACK_ZERO, "model": core.NOACK_PREDICT,
-}  # fmt: skip
+    "hold": core.NOACK_HOLD,
+    "zero": core.NOACK_ZERO,
+    "model": core.NOACK_PREDICT,
+}
 
 
 @dataclass(frozen=True)
@@ -222,8 +224,10 @@ class Plant:
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measuring is not None and self.measuring.is_noisy
         for name, width in (
-            ("at_input", widths[0]), ("at_state", widths[1]), ("noise", plant.p * noisy),
-        ):  # fmt: skip
+            ("at_input", widths[0]),
+            ("at_state", widths[1]),
+            ("noise", plant.p * noisy),
+        ):
             signal = getattr(plant, name)
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
@@ -312,9 +316,11 @@ def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
     if is_repeated and plant.disturbance is None and plant.measuring is None:
         return plant
     return replace(
-        plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
+        plant,
+        system=system_of(resolved),
+        disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
-    )  # fmt: skip
+    )
 
 
 def system_of(resolved: Scenario) -> PlantSystem:

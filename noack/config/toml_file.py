@@ -381,9 +381,10 @@ def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     if len(sections) < 2:
         return {}, ""
     key = next(
-        name for name, field in sections[0].model_fields.items()
+        name
+        for name, field in sections[0].model_fields.items()
         if get_origin(field.annotation) is Literal
-    )  # fmt: skip
+    )
     return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
 

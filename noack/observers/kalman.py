@@ -55,9 +55,11 @@ class KalmanSettings(ObserverSettings):
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
         super().check(n, m, p, noise)
         for key, expected, what in (
-            ("process_std", n, "state"), ("input_std", m, "input"), ("noise_std", p, "output"),
+            ("process_std", n, "state"),
+            ("input_std", m, "input"),
+            ("noise_std", p, "output"),
             ("initial_std", n, "state"),
-        ):  # fmt: skip
+        ):
             require_length(getattr(self, key), f"observer.{key}", expected, f"one per {what}")
         require_shape(self.Q, "observer.Q", (n, n), "a covariance of states")
         require_shape(self.R, "observer.R", (p, p), "a covariance of outputs")

@@ -86,9 +86,11 @@ class VehicleSettings(EquationSettings):
     needs: ClassVar = ("vehiclemodels", "vehicle")
     scenario: ClassVar = "lane_vehicle"
     variants: ClassVar = (
-        {"model": "kinematic"}, {"model": "single_track"}, {"model": "drift"},
+        {"model": "kinematic"},
+        {"model": "single_track"},
+        {"model": "drift"},
         {"model": "multi_body"},
-    )  # fmt: skip
+    )
 
     kind: Literal["vehicle"]
     model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"

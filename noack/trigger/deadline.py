@@ -14,8 +14,9 @@ class DeadlineSettings(CombinedSettings):
     """Any rule with a deadline: an event at the latest ``interval_s`` after the last one."""
 
     example_keys: ClassVar = {
-        "interval_s": 1.0, "rule": {"policy": "mixed", "sigma": 0.1, "epsilon": 0.05},
-    }  # fmt: skip
+        "interval_s": 1.0,
+        "rule": {"policy": "mixed", "sigma": 0.1, "epsilon": 0.05},
+    }
 
     policy: Literal["deadline"]
 

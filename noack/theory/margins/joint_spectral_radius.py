@@ -225,8 +225,9 @@ def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
         ends.setdefault(edge.target, []).append(number)
     kinds = {
         number: index * classes // len(members)
-        for members in ends.values() for index, number in enumerate(members)
-    }  # fmt: skip
+        for members in ends.values()
+        for index, number in enumerate(members)
+    }
     return SwitchedSystem(tuple(
         Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
         for number, edge in enumerate(system.edges) for kind in range(classes)

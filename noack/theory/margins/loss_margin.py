@@ -133,8 +133,9 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
         lowest.setdefault(classes[node], node)
     return [
         burst._replace(target=lowest[classes[burst.target]])
-        for node in lowest.values() for burst in leaving[node]
-    ]  # fmt: skip
+        for node in lowest.values()
+        for burst in leaving[node]
+    ]
 
 
 class Stability(NamedTuple):
