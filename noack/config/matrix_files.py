@@ -114,7 +114,7 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
     return found
 
 
-def unfit(C: object, D: object, dt: object, n: int) -> str | None:
+def unfit(C: ArrayLike | None, D: ArrayLike | None, dt: ArrayLike | None, n: int) -> str | None:
     """Return why the loop cannot use a state-space model of n states; None if it can.
 
     C, D and the sampling time dt may be None; dt = 0 is continuous time.

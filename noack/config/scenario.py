@@ -107,7 +107,7 @@ def with_loop_tables(
     """
     sections = []
     for place, section in enumerate(scenario.loops or ()):
-        update: dict[str, object] = {}
+        update: Table = {}
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")

@@ -13,7 +13,17 @@ from contextlib import suppress
 from datetime import date, time
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+)
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -23,7 +33,8 @@ from noack.core.file_access import read_regular
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
-Kind = Any
+Value: TypeAlias = Any  # what JSON has
+Kind: TypeAlias = Any
 """The annotation of a value: a class, a union, a list."""
 
 MOST_BYTES = 2**20  # largest size of a settings file
@@ -309,7 +320,7 @@ def _locate(place: Sequence[str | int], root: type[ScenarioSection]) -> _Place:
     for part in place:
         choices, _ = _choices(kind)
         if part in choices:
-            kind = choices[part]
+            kind = choices[str(part)]
             continue
         path.append(part)
         kind, section = _within(kind, part)
@@ -345,8 +356,9 @@ def _share(value: object, at: _Place) -> str:
     percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
     if percent is not None:
         value = float(percent[1])
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return f"; {value:g} % is {value / 100:g}" if is_number and 1 < value <= 100 else ""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 < value <= 100:
+        return ""
+    return f"; {value:g} % is {value / 100:g}"
 
 
 def _metadata(kind: Kind) -> list[Kind]:
@@ -388,7 +400,7 @@ def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
 
-def _own_check(key: str, value: object, message: str) -> str:
+def _own_check(key: str, value: Value, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):

@@ -348,7 +348,8 @@ def is_compiled(model: str) -> bool:
 
 
 def _dynamics(model: str) -> FunctionType:
-    return library(f"vehicle_dynamics_{model}")
+    dynamics: FunctionType = library(f"vehicle_dynamics_{model}")
+    return dynamics
 
 
 def _print(line: str) -> None:
@@ -398,7 +399,7 @@ def _compiled(model: str) -> Compiled:
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
     own = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
-    functions: set[FunctionType] = {*_needed(dynamics), *own, rates}
+    functions: set[Callable[..., Any]] = {*_needed(dynamics), *own, rates}
     for function in functions - {lateral}:
         register_jitable(**_OPTIONS)(function)
     overload(lateral, jit_options=_OPTIONS)(_held)

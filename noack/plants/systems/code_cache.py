@@ -119,7 +119,7 @@ def compiler(folder: Path | None, **options: str | bool) -> Callable[[Function],
         compiling: Callable[[Function], Function] = numba.njit(**options)
         return compiling
 
-    def compile_and_keep(function: Function) -> Function:
+    def compile_and_keep(function: Function) -> Any:
         numba.config.CACHE_DIR = str(folder)
         dispatcher = numba.njit(function, cache=True, **options)
         dispatcher.compile = _one_at_a_time(dispatcher.compile, folder / ".lock")

@@ -82,19 +82,6 @@ def test_no_invalid_value_is_suggested(path: Path, setting: str) -> None:
     assert "transposed" not in message
 
 
-@pytest.mark.parametrize(
-    ("setting", "hint"),
-    [
-        ("plant.system=MyPlant",
-         'a table, e.g. { kind = "python", file = "my_plant.py", name = "MyPlant" }'),
-        ("trigger=absolute", 'a table, e.g. { policy = "absolute", delta = ... }'),
-        ("network.impairments=4", "a list of tables"),
-    ],
-)  # fmt: skip
-def test_hint_names_the_table(path: Path, setting: str, hint: str) -> None:
-    assert mistake(path, setting).endswith(f"should be {hint}")
-
-
 class Car:
     """A user's plant class; only its name is used."""
 

@@ -84,25 +84,6 @@ def test_a_scenario_with_changes_is_written_and_read_back(content: dict[str, Any
     assert validate(tomllib.loads(dumps(scenario)), "again") == scenario
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ([{"at_s": 2.0, "set": {"network.mansd": 1}}], "changes.0.at_s.*the run ends at 1 s"),
-        ([{"at_s": 0.5, "set": {"network.mansd": 1}}, {"at_s": 0.4, "set": {"trigger.beta": 1}}],
-         "changes.1.at_s.*earlier than the change before it"),
-        ([{"at_s": 0.5, "set": {"network.mansd": -1}}], "changes.0.set.*greater than or equal"),
-        ([{"at_s": 0.5, "set": {"horizon_s": 1}}], "changes.0.set.*cannot be changed"),
-        ([{"at_s": 0.5, "set": {}}], "changes.0.set.*needs at least|changes.0.set"),
-    ],
-)  # fmt: skip
-def test_an_invalid_table_of_changes_is_refused_in_one_line(
-    content: dict[str, Any], changes: list[dict[str, Any]], why: str
-) -> None:
-    content["changes"] = changes
-    with pytest.raises(CallerError, match=rf"^[^\n]*({why})[^\n]*$"):
-        validate(content, "here")
-
-
 def test_short_names_refer_to_runtime_parameters(scenario: Scenario) -> None:
     names = current_parameters(scenario)
     for short in ("loss", "mansd", "beta", "alpha", "floor", "setpoint"):

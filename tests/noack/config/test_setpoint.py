@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario_checks import input_at
 from noack.config.scenario_file import dumps, validate
-from noack.core.errors import CallerError
 
 A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
 
@@ -49,23 +48,6 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
     found = input_at(A, B, x_r)
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
-
-
-@pytest.mark.parametrize(
-    ("setpoint", "protocol", "why"),
-    [
-        ([1.0, 2.0], "none", r"controller.setpoint.*nearest one is \[1, 0\]"),
-        ([1.0], "none", "controller.setpoint"),
-        ([1.0, 0.0], "ack", "not with network.protocol"),
-    ],
-)
-def test_an_invalid_set_point_is_refused_in_one_line(
-    content: dict[str, Any], setpoint: list[float], protocol: str, why: str
-) -> None:
-    content["controller"] = {"setpoint": setpoint}
-    content["network"]["protocol"] = protocol
-    with pytest.raises(CallerError, match=rf"^[^\n]*{why}[^\n]*$"):
-        validate(content, "here")
 
 
 def test_the_set_point_of_a_scenario_is_used_in_its_loop(content: dict[str, Any]) -> None:

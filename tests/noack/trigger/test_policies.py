@@ -6,7 +6,6 @@ tests/cosim/analysis/adversary/test_worst_patterns.py by the search for the wors
 """
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
 from noack.trigger.lyapunov import LyapunovSettings
@@ -31,8 +29,6 @@ from tests.trigger_rules import (
 )
 
 Vector = NDArray[np.float64]
-DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
-RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
 N, MS, S = 2, 10**6, 10**9
 vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
 
@@ -112,36 +108,6 @@ def test_the_compared_error_has_the_bits_of_its_norm(e_s: Vector, x: Vector) -> 
     trigger.start(0, x)
     with np.errstate(over="ignore"):
         assert trigger.test(MS, x, e_s).left == exact_norm(e_s)
-
-
-def nested(rule: dict[str, Any]) -> dict[str, Any]:
-    inner = {"policy": "dwell", "interval_s": 0.1, "rule": rule}
-    return {"policy": "deadline", "interval_s": 1.0, "rule": inner}
-
-
-@pytest.mark.parametrize(
-    ("trigger", "expected"),
-    [
-        ({"policy": "absolute", "delta": 1e-300}, "trigger.delta = 1e-300: should be greater"),
-        ({"policy": "relative", "sigma": 1e300}, "trigger.sigma = 1e+300: should be less"),
-        ({"policy": "mixed", "sigma": 1.0, "epsilon": 1e200}, "trigger.epsilon = 1e+200: should"),
-        ({"policy": "lyapunov", "rate_per_s": 1e300}, "trigger.rate_per_s = 1e+300: should be"),
-        (DYNAMIC | {"decay_per_s": 1e6}, "trigger.decay_per_s = 1000000.0: should be less"),
-        (RULE, "trigger.period_s = 0.003: must be a whole number of the 0.002 s"),
-        (nested(RULE), "trigger.rule.rule.period_s = 0.003: must be a whole number"),
-        (
-            nested({"policy": "absolute", "delta": 1.0, "weight": [[1.0, 1.0], [1.0, 1.0]]}),
-            "trigger.rule.rule.weight = [[1.0, 1.0], [1.0, 1.0]]: W must be invertible",
-        ),
-    ],
-)
-def test_a_mistake_names_its_key(
-    content: dict[str, Any], trigger: dict[str, Any], expected: str
-) -> None:
-    with pytest.raises(CallerError) as found:
-        validate(content | {"trigger": trigger}, "here")
-    assert str(found.value).startswith(f"here: {expected}")
-    assert "\n" not in str(found.value)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
