@@ -371,7 +371,7 @@ def _not_an_input(variable: Variable) -> str | None:
 
 def _not_settable(variable: Variable) -> str | None:
     """Refuse a variable that cannot be set before the initialisation."""
-    from fmpy.simulation import settable_in_instantiated
+    from fmpy.simulation import settable_in_instantiated  # an extra of noack
 
     if settable_in_instantiated(variable):
         return None

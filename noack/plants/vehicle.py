@@ -323,7 +323,7 @@ def compiled_dynamics(model: str) -> Compiled | None:
     """
     if model not in _COMPILED:
         return None
-    import numba
+    import numba  # an extra of noack
     from numba.core.errors import NumbaError
 
     if not is_compiled(model):
@@ -395,7 +395,7 @@ def rates(
 
 
 def _compiled(model: str) -> Compiled:
-    from numba.extending import overload, register_jitable
+    from numba.extending import overload, register_jitable  # an extra of noack
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
     own = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
@@ -412,7 +412,7 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
     The library calls it for one wheel after the other. Its shifts are s (p₁ + p₃ |γ|) with the sign
     s of the camber γ. With −p₁ instead of p₁ it computes them for the other sign.
     """
-    from numba.extending import register_jitable
+    from numba.extending import register_jitable  # an extra of noack
 
     original = library("utils.tire_model", "formula_lateral")
     formula = FunctionType(original.__code__, original.__globals__)

@@ -136,7 +136,7 @@ class LyapunovFunctionSettings(WeightedSettings):
         Raises:
             CallerError: the closed loop is not stable.
         """
-        from scipy.linalg import solve_continuous_lyapunov
+        from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
         A = model.A + model.B @ model.K
         if spectral_abscissa(A) >= 0:

@@ -213,7 +213,7 @@ class EstimationError:
 
     @cached_property
     def _settled_covariance(self) -> Matrix:
-        from scipy.linalg import solve_discrete_lyapunov
+        from scipy.linalg import solve_discrete_lyapunov  # slow to import
 
         F, added = self._covariances[-1]
         _contraction(F)
@@ -384,7 +384,7 @@ def _contraction(step: Matrix) -> tuple[Matrix, float]:
     Raises:
         NotDecayingError: there is none.
     """
-    from scipy.linalg import solve_discrete_lyapunov
+    from scipy.linalg import solve_discrete_lyapunov  # slow to import
 
     reason = "the observer's error does not decay as fast as the bounds"
     if not np.abs(np.linalg.eigvals(step)).max() < 1:

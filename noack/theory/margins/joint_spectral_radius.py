@@ -296,7 +296,7 @@ class _Search:
 
     def improve(self, numbers: NDArray[np.int64]) -> None:
         """Minimise the maximum over some edges: a smooth one that becomes sharper and sharper."""
-        from scipy.optimize import minimize
+        from scipy.optimize import minimize  # slow to import
 
         groups = list(self._grouped(numbers.tolist()))
         for sharpness in _SHARPNESS:
