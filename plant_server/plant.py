@@ -367,13 +367,8 @@ def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
     settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
     if settings.selects_all(n) and not settings.is_noisy:
         return None
-    p = resolved.message_sizes.outputs
-    std, bound = (
-        np.zeros(p) if given is None else np.array(given)
-        for given in (settings.noise_std, settings.noise_bound)
-    )
     C = None if settings.selects_all(n) else np.array(settings.C)
-    return MeasurementModel(C, std, bound, resolved.seeds.noise)
+    return MeasurementModel(C, *settings.noise(n), resolved.seeds.noise)
 
 
 def watchdog_of(resolved: Scenario) -> Watchdog:

@@ -81,7 +81,7 @@ def changed(scenario: Scenario, settings: ReadTable) -> Scenario:
 def current_parameters(scenario: Scenario) -> Table:
     """Return the parameters that can be changed during a run, with their values."""
     trigger = scenario.trigger
-    loss = scenario.network.loss.model_dump(mode="json", exclude_none=True)
+    loss = scenario.network.loss.content()
     values = {
         key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)
     }

@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ValidationError, create_model, model_validator
+from pydantic import ValidationError, create_model, model_validator
 
 from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.config.scenario_checks import check_changes, check_sections
@@ -97,7 +97,7 @@ def phases_ns(scenario: Scenario) -> tuple[int, ...]:
 
 
 def with_loop_tables(
-    scenario: Scenario, change: Callable[[str, Scenario], Mapping[str, BaseModel]]
+    scenario: Scenario, change: Callable[[str, Scenario], Mapping[str, ScenarioSection]]
 ) -> Scenario:
     """Return a scenario with other tables in the entries of [[loops]].
 
@@ -111,7 +111,7 @@ def with_loop_tables(
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")
-            content = table.model_dump(mode="json", exclude_none=True)
+            content = table.content()
             if (own := getattr(section, part)) is not None and (not inner or inner in own):
                 update[part] = own | {inner: content} if inner else content
             elif part in (file := update.get("scenario", section.scenario) or {}):
@@ -137,7 +137,7 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
         if (given := getattr(section, part)) is None:
             continue
         own = getattr(loop, part)
-        template = {} if own is None else own.model_dump(mode="json", exclude_none=True)
+        template = {} if own is None else own.content()
         content[part] = given if any(kind in given for kind in kinds) else template | given
     if content:
         loop = _with_parts(loop, content, content)

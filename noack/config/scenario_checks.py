@@ -258,12 +258,9 @@ def with_settings(scenario: S, settings: ReadTable) -> S:
     require_runtime_parameters(settings, scenario.trigger)
     sections = {key.split(".")[0] for key in settings}
     changes_loss = any(key.startswith(LOSS) for key in settings)
-    content: Table = {
-        name: getattr(scenario, name).model_dump(mode="json", exclude_none=True)
-        for name in sections - {"network"}
-    }
+    content: Table = {name: getattr(scenario, name).content() for name in sections - {"network"}}
     if "network" in sections:
-        loss = scenario.network.loss.model_dump(mode="json", exclude_none=True)
+        loss = scenario.network.loss.content()
         content["network"] = {"loss": loss} if changes_loss else {}
     put_settings(content, settings)
     try:

@@ -152,7 +152,7 @@ def _path(name: str, folder: Path, named: str) -> Path:
 
 def dumps(scenario: Scenario) -> str:
     """Return the scenario as TOML that :func:`load` reads back to an equal scenario."""
-    return toml_text(scenario.model_dump(mode="json", exclude_none=True))
+    return toml_text(scenario.content())
 
 
 def toml_text(content: ReadTable) -> str:

@@ -231,12 +231,20 @@ class MeasurementSection(ScenarioSection):
         """Whether there is any noise."""
         return any(self.noise_std or ()) or any(self.noise_bound or ())
 
+    def matrix(self, n: int) -> Matrix:
+        """C of a plant of n states, (p, n)."""
+        return np.eye(n) if self.C is None else np.array(self.C)
+
+    def noise(self, n: int) -> tuple[Vector, Vector]:
+        """Standard deviations of the normal part of v, bounds of the uniform part, (p,) each."""
+        p, given = self.outputs(n), (self.noise_std, self.noise_bound)
+        std, bound = (np.zeros(p) if row is None else np.array(row) for row in given)
+        return std, bound
+
     def variance(self, n: int) -> Vector:
         """Variance of v, shape (p,)."""
-        variance = np.zeros(self.outputs(n))
-        if self.noise_std is not None:
-            variance = variance + np.square(self.noise_std)
-        return variance if self.noise_bound is None else variance + np.square(self.noise_bound) / 3
+        std, bound = self.noise(n)
+        return std**2 + bound**2 / 3
 
     def check(self, n: int, why: str) -> None:
         """Raise ValueError, with the key, unless the shapes fit a model of n states."""

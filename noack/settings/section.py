@@ -50,6 +50,10 @@ class ScenarioSection(BaseModel):
     # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
+    def content(self) -> Table:
+        """Return the table as JSON has it, without keys that have no value."""
+        return self.model_dump(mode="json", exclude_none=True)
+
     @classmethod
     def key_descriptions(cls) -> dict[str, str]:
         """Return the docstrings of the keys.

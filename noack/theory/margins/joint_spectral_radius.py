@@ -125,7 +125,9 @@ def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> J
         if not searched:  # if a longer cycle grows faster, the polytopes cannot be completed
             searched, before = True, cycle.growth
             upper, vertices = min((upper, vertices), (quadratic_norms(system).upper, 0))
-            cycle = max(cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=_growth)
+            cycle = max(
+                cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=lambda one: one.growth
+            )
             if cycle.growth > before * (1 + accuracy / 2):
                 continue
         accuracy *= _COARSER
@@ -167,10 +169,6 @@ def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _Cycle
         return cycle
     # The original matrices have smaller radii.
     return cycle._replace(growth=max(cycle.growth, growth_bounds(system, cycle.path)[0]))
-
-
-def _growth(cycle: Cycle) -> float:
-    return cycle.growth
 
 
 def _largest(system: SwitchedSystem) -> float:
