@@ -26,16 +26,17 @@ from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
 from noack.settings.section import (
+    Bounds,
+    Deviations,
+    HalfWidthRows,
+    HalfWidths,
     RateHz,
     Row,
     Rows,
     ScenarioSection,
     kinds_in,
     require_length,
-    require_non_negative,
     require_shape,
-    require_squares,
-    require_whole_period,
     shape,
     union_of,
 )
@@ -205,16 +206,10 @@ class MeasurementSection(ScenarioSection):
 
     C: Rows | None = None
     """C by rows, p x n; by default the identity: every state is measured."""
-    noise_std: Row | None = None
+    noise_std: Deviations | None = None
     """Standard deviation of the normally distributed part of v, p entries; by default 0."""
-    noise_bound: Row | None = None
+    noise_bound: Bounds | None = None
     """Bound of the uniformly distributed part of v, p entries; by default 0."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        require_squares(self.noise_std or (), "noise_std", "standard deviations")
-        require_squares(self.noise_bound or (), "noise_bound", "bounds")
-        return self
 
     def outputs(self, n: int) -> int:
         """Number of measured outputs p of a plant of n states."""
@@ -276,9 +271,9 @@ class PlantSection(ScenarioSection):
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
     one end of its half-width; given: the matrices A and B below."""
-    uncertainty_A: Rows | None = None
+    uncertainty_A: HalfWidthRows | None = None
     """Half-widths of the uncertainty box around Â, n x n."""
-    uncertainty_B: Rows | None = None
+    uncertainty_B: HalfWidthRows | None = None
     """Half-widths of the uncertainty box around B̂, n x m."""
     A: Rows | None = None
     """The true A, n x n, for draw = "given"."""
@@ -290,7 +285,7 @@ class PlantSection(ScenarioSection):
     """Names of the arrays in the file, if they differ from A and B."""
     initial_state: Row
     """x(0), n entries."""
-    initial_state_halfwidth: Row | None = None
+    initial_state_halfwidth: HalfWidths | None = None
     """x(0) is drawn uniformly within these distances of initial_state; n entries."""
     rate_hz: RateHz = 500.0
     """Steps per second of simulated time."""
@@ -303,7 +298,6 @@ class PlantSection(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_whole_period(self.rate_hz, "rate_hz")
         require_read(self.file, self.names)
         for key in ("A", "B"):
             matrix = getattr(self, key)
@@ -320,10 +314,6 @@ class PlantSection(ScenarioSection):
             raise ValueError(
                 f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
             )
-        for key in ("uncertainty_A", "uncertainty_B"):
-            for row in getattr(self, key) or ():
-                require_non_negative(row, key)
-        require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
         return self
 
     def noise_variances(self, n: int, m: int) -> NoiseVariances:

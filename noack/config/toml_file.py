@@ -404,7 +404,7 @@ def _own_check(key: str, value: Value, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
-        shown = f" = {show_value(value)}" if isinstance(value, str) else ""
+        shown = "" if isinstance(value, Mapping) else f" = {show_value(value)}"
         return f"{key}{shown}: {message}"
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
