@@ -1,5 +1,5 @@
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from scipy.linalg import expm
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
@@ -34,31 +33,6 @@ def updates(outputs: Sequence[Output]) -> list[Message]:
 def rows(outputs: Sequence[Output], n: int) -> Any:
     found = [output.row for output in outputs if isinstance(output, Record)]
     return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
-
-
-def feed(sensor: LoopMachines, x: Callable[[float], float], until_s: float) -> list[Output]:
-    """Measure the scalar x(t) on the grid."""
-    outputs: list[Output] = []
-    for k in range(round(until_s * 1e9) // GRID_NS + 1):
-        outputs += sensor.handle(measurement(k, k * GRID_NS, [x(k * GRID_NS * 1e-9)]), k * GRID_NS)
-    return outputs
-
-
-def next_on_grid_ns(t_s: float) -> int:
-    """The first grid time after ``t_s``."""
-    return (math.floor(t_s * 1e9 / GRID_NS) + 1) * GRID_NS
-
-
-def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
-    """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
-    x0, beta = 2.0, 0.3
-    sensor = machine(Sensor(ZOH, decaying_rule(beta, 1.0, n=1), np.array([x0])))
-    sent = updates(feed(sensor, lambda t: x0 * math.exp(-t), 3.0))
-    expected = [next_on_grid_ns(math.log(1 + beta / x0))]
-    while expected[-1] <= 3_000_000_000:
-        expected.append(next_on_grid_ns(expected[-1] * 1e-9 + math.log(1 + beta / x0)))
-    assert [message.t_ns for message in sent] == expected[:-1]
-    assert len(sent) == 21  # 0.14 s apart
 
 
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:

@@ -91,17 +91,5 @@ def test_the_shaft_sticks_exactly_up_to_the_coulomb_torque() -> None:
         assert (motion(motor, [factor * limit_v] * 50)[-1, 0] > 0.0) == moves
 
 
-def test_energy_is_conserved() -> None:
-    """∫Vi dt = ∫(Ri² + bω²) dt + T_c|θ| + ½Li² + ½Jω², for a shaft that turns one way."""
-    motor = settings(inductance_h=1e-3, coulomb_friction_n_m=1e-3)
-    voltage, step_ns = 2.0, 10_000
-    angle, speed, current = motion(DcMotor(motor, np.zeros(3)), [voltage] * 4000, step_ns).T
-    dx = step_ns * 1e-9
-    supplied = np.trapezoid(voltage * current, dx=dx)
-    losses = np.trapezoid(4.0 * current**2 + motor.friction_n_m_s * speed**2, dx=dx)
-    stored = 0.5 * (1e-3 * current[-1] ** 2 + motor.inertia_kg_m2 * speed[-1] ** 2)
-    assert supplied == pytest.approx(losses + 1e-3 * angle[-1] + stored, rel=1e-4)
-
-
 def test_a_non_finite_state_stays_non_finite() -> None:
     assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
