@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 import noack
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 
 DOUBLE = """
@@ -19,67 +18,6 @@ plant = { initial_state = [1, 0] }
 trigger = { beta = 0.5, alpha_per_s = 0.25 }
 network = { mansd = 2, loss = { model = "bernoulli", probability = 0.5 } }
 """
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    (tmp_path / "double.toml").write_text(DOUBLE)
-    return tmp_path / "double.toml"
-
-
-def mistake(path: Path, *settings: str) -> str:
-    """The line of the error message."""
-    with pytest.raises(CallerError, match=r"^[^\n]*$") as caught:
-        load(path, settings)
-    return str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("setting", "hint", "before"),
-    [
-        ("model.B=[[0, 1]]", "looks transposed: try ", []),
-        ("model.gain=[[-1], [-1.5]]", "looks transposed: try ", []),
-        ("plant.B=[[0, 1]]", "looks transposed: try ",
-         ["plant.draw=given", "plant.A=[[0, 1], [0, 0]]"]),
-        ('plant.initial_state="1, 0"', "a list of numbers, e.g. ", []),
-        ("model.A=1", "a matrix is a list of rows, e.g. ", []),
-        ('model.A=["0 1", [0, 0]]', "a matrix is a list of rows, e.g. ", []),
-        ("model.state_names=position", "a list of names, e.g. ", []),
-        ('network.loss={model="scripted",lost=3}', "a list of numbers, e.g. ", []),
-        ("network.loss.probability=80", "80 % is ", []),
-        ("network.loss.probability=80%", "80 % is ", []),
-        ('network.loss.probability="12.5 %"', "12.5 % is ", []),
-        ("network.loss.correlation=30%", "30 % is ", []),
-    ],
-)  # fmt: skip
-def test_hint_is_what_would_be_right(
-    path: Path, setting: str, hint: str, before: list[str]
-) -> None:
-    message = mistake(path, *before, setting)
-    begin, found, right = message.partition(hint)
-    assert found, message
-    key = begin.removeprefix("--set ").partition(" = ")[0].removesuffix(".0")
-    tomllib.loads(f"value = {right}")
-    value = f'{{model="scripted",lost={right}}}' if key == "network.loss.lost" else right
-    setting = f"{key.removesuffix('.lost')}={value}"
-    load(path, [*before, "model.allow_unstable=true", setting])  # the hint concerns the form only
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        "network.loss.probability=800",  # not a percentage
-        "network.loss.probability=-80",
-        "network.loss.probability=true",
-        "network.loss.probability=much",
-        "horizon_s=80%",  # not a share
-        "model.B=[[0, 1, 2]]",  # wrong in either order
-    ],
-)
-def test_no_invalid_value_is_suggested(path: Path, setting: str) -> None:
-    message = mistake(path, setting)
-    assert "% is" not in message
-    assert "transposed" not in message
 
 
 class Car:
