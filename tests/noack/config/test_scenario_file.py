@@ -14,6 +14,7 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
+import noack
 from noack.config.resolution import resolve, resolved_loops
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load, put, validate, value_of
@@ -276,6 +277,30 @@ def test_a_setting_that_cannot_be_applied_is_reported(
     setting: str, says: str, tmp_path: Path
 ) -> None:
     assert mistakes_with(LANE, tmp_path, [setting]) == [says]
+
+
+class Car:
+    """A user's plant class; only its name is used."""
+
+
+@pytest.mark.parametrize("key", ["plant.system", "plant.system.name", "plant.system.file"])
+def test_class_is_converted_to_its_file_and_name(
+    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content: dict[str, Any] = {"plant.system": {"kind": "python", "name": "Car"}}
+    with pytest.raises(CallerError) as caught:
+        noack.load("double_integrator", content | {key: Car})
+    _, found, written = str(caught.value).partition(
+        "Car: a class is given by its file and its name: "
+    )
+    assert found
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_plant.py").write_text("class Car: pass")
+    scenario = tomllib.loads(DOUBLE)
+    loaded = noack.load(scenario, {"plant.system": json.loads(written)})
+    assert (loaded.plant.system.kind, loaded.plant.system.name) == ("python", "Car")
+    with pytest.raises(CallerError, match=r"a value of type Car is no value of a setting$"):
+        noack.load("double_integrator", {"plant.system": Car()})
 
 
 def test_the_message_quotes_only_the_name_of_the_source(content: Content) -> None:
