@@ -10,15 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix, transition
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import Sensor
-from tests.machine_parts import machine, sensor_of, state_of
+from tests.machine_parts import machine, state_of
 from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -137,34 +135,6 @@ def test_the_sensor_acts_on_measurements_only() -> None:
     assert not sensor.on_timer(10**9)
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_sensor_of_a_scenario_uses_the_model_not_the_plant(
-    content: dict[str, Any], mode: str
-) -> None:
-    content |= {"mode": mode}
-    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
-    content["network"]["initial_sync"] = "known_state"
-    content["trigger"] = {"beta": 1.0, "alpha_per_s": 0.5, "weight": [[2.0, 0.0], [0.0, 1.0]]}
-    sensor = sensor_of(resolve(validate(content, "here")))
-    (row,) = rows(sensor.handle(measurement(0, 10**9, [0.0, 0.0]), 10**9), 2)
-    # ẍ = u with u = −x − 1.5 ẋ from (1, 0), by hand for the closed loop, or constant under a hold.
-    w = math.sqrt(1 - 0.75**2)
-    modelled = [
-        math.exp(-0.75) * (math.cos(w) + 0.75 / w * math.sin(w)),
-        -math.exp(-0.75) / w * math.sin(w),
-    ]
-    expected = np.array(modelled if mode == "model" else [1.0, 0.0])
-    np.testing.assert_allclose(row["x_s"], expected, rtol=1e-12)
-    assert row["e_s_norm"] == pytest.approx(math.hypot(2 * expected[0], expected[1]), rel=1e-12)
-    assert row["threshold"] == pytest.approx(math.exp(-0.5), rel=1e-14)
-
-
-def test_a_scenario_without_a_known_start_transmits_at_once(content: dict[str, Any]) -> None:
-    sensor = sensor_of(resolve(validate(content, "here")))
-    assert not sensor.machines[0].knows_state
-    assert len(updates(sensor.handle(measurement(0, 0, [1.0, 0.0]), 0))) == 1
-
-
 MS = 1_000_000
 H = np.array([[0.0, 1.0], [-2.0, -3.0]])
 ALWAYS = absolute_rule(1e-9)
@@ -185,28 +155,6 @@ def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) ->
     return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
 
 
-def test_the_acknowledgement_resets_the_error_and_the_event_does_not() -> None:
-    one = waiting(x0=[1.0, 0.0])
-    (update,), row = split(one.handle(measurement(1, GRID_NS, [2.0, 0.5]), GRID_NS))
-    before = transition(H, GRID_NS) @ [1.0, 0.0]
-    np.testing.assert_allclose(row["x_s"], before, rtol=1e-14)
-    assert (row["event"], update.flow, update.sequence, update.t_ns) == (0, Flow.UPDATE, 0, GRID_NS)
-    sent, row = split(one.handle(measurement(2, 2 * GRID_NS, [2.0, 0.5]), 2 * GRID_NS))
-    assert sent == []  # the rule is met, but the sensor is waiting
-    assert row["compared"] > row["threshold"]
-    np.testing.assert_allclose(row["x_s"], transition(H, 2 * GRID_NS) @ [1.0, 0.0], rtol=1e-13)
-    sent, row = split(one.handle(acknowledgement(update), 2 * GRID_NS + 5 * MS))
-    assert sent == []
-    assert (row["sequence"], row["t_ns"], row["model_t_ns"]) == (0, GRID_NS, 2 * GRID_NS)
-    np.testing.assert_allclose(row["x_s"], transition(H, GRID_NS) @ [2.0, 0.5], rtol=1e-14)
-    np.testing.assert_allclose(
-        row["x_s_before"], transition(H, 2 * GRID_NS) @ [1.0, 0.0], rtol=1e-13
-    )
-    (update,), row = split(one.handle(measurement(3, 3 * GRID_NS, [3.0, 0.0]), 3 * GRID_NS))
-    np.testing.assert_allclose(row["x_s"], transition(H, 2 * GRID_NS) @ [2.0, 0.5], rtol=1e-13)
-    assert update.sequence == 1
-
-
 @pytest.mark.parametrize("periods", [1, 2, 5])
 def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_timeout(
     periods: int,
@@ -218,23 +166,6 @@ def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_tim
     assert [message.t_ns // GRID_NS for message in sent] == list(range(1, 21, periods))
     assert [message.vector[0] for message in sent] == [message.t_ns // GRID_NS for message in sent]
     assert [message.sequence for message in sent] == list(range(len(sent)))
-
-
-def test_it_does_not_retransmit_if_the_rule_is_no_longer_met() -> None:
-    policy, timeout_ns = decaying_rule(1.0, 1e-9), 2 * GRID_NS
-    one = machine(Sensor(np.zeros((2, 2)), policy, np.zeros(2), timeout_ns=timeout_ns))
-    assert split(one.handle(measurement(1, GRID_NS, [2.0, 0.0]), 0))[0]
-    assert split(one.handle(measurement(3, 3 * GRID_NS, [0.5, 0.0]), 0))[0] == []
-    assert split(one.handle(measurement(4, 4 * GRID_NS, [2.0, 0.0]), 0))[0]
-
-
-def test_the_first_measurement_is_an_event_and_x_s_is_zero_as_x_c_is() -> None:
-    one = waiting()
-    (update,), row = split(one.handle(measurement(0, 0, [1.0, 2.0]), 0))
-    assert row["x_s"].tolist() == [0.0, 0.0]
-    assert (row["event"], row["e_s_norm"]) == (0, pytest.approx(5**0.5))
-    one.handle(acknowledgement(update), 0)
-    assert state_of(one, "x_s").tolist() == [1.0, 2.0]
 
 
 def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
