@@ -58,6 +58,7 @@ def deadline(rule: Table, interval_s: float) -> Table:
 
 
 TABLES: dict[str, Table] = {
+    "decaying": DECAYING,
     "absolute": {"policy": "absolute", "delta": 0.01},
     "relative": {"policy": "relative", "sigma": (0.01, 0.03, 0.05)},
     "mixed": MIXED,

@@ -106,7 +106,6 @@ class FmuSettings(FileSettings, PlantSettings):
         require_length(self.operating_input, "plant.system.operating_input", m, why)
 
     def system(self, start: PlantStart) -> PlantSystem:
-
         return FmuSystem(self, start.x0)
 
 

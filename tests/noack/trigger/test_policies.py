@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
 from noack.trigger.lyapunov import LyapunovSettings
@@ -45,6 +46,10 @@ def samples(seed: int, k: int) -> tuple[list[int], Vector]:
     z = np.sin(phase + np.outer(t_ns * 1e-9, rate))
     z[:, N:] *= (t_ns * 1e-9)[:, None] * rng.choice([0.01, 0.1, 1.0])
     return t_ns.tolist(), z
+
+
+def test_every_rule_is_in_the_table() -> None:
+    assert {table["policy"] for table in TABLES.values()} == POLICIES.keys() - {"python"}
 
 
 @pytest.mark.parametrize("seed", range(5))
