@@ -368,7 +368,7 @@ def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> Continuo
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     """Return the run as JSON: its summary, every event, and the states at 501 times."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     before = run.before
@@ -403,7 +403,7 @@ def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
     return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
 
 
-def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     """Return the run's numbers, with the keys of ``summary.json``."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     diverged = _divergence(run, samples, resolved)

@@ -28,7 +28,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +91,7 @@ class PolicyCapacity(NamedTuple):
         names = [name for name, capacity in self.limits.items() if capacity.median == first]
         return ", ".join(names) if np.isfinite(first) else ""
 
-    def document(self, plan: CapacityPlan) -> dict[str, Any]:
+    def document(self, plan: CapacityPlan) -> dict[str, object]:
         """Return the capacity for JSON, also as a multiple of the given mixture if it is finite."""
         median = self.any_limit.median
         known = math.isfinite(median)
@@ -178,7 +178,7 @@ class LivePoint(NamedTuple):
         ends = self.simulated.items()
         return [name for name, (low, high) in ends if not low <= self.values[name] <= high]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return the point for JSON."""
         return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
 

@@ -20,13 +20,10 @@ from cosim.simulation.continuous import (
 from noack.config.resolution import LoopMatrices
 from noack.trigger.trigger_rule import Forecast, TriggerRule
 from tests.trigger_rules import (
-    dynamic_rule,
     lyapunov_rule,
     mixed_rule,
-    periodic_rule,
     quadratic_rule,
     self_triggered_rule,
-    with_deadline,
     with_dwell_time,
 )
 
@@ -59,23 +56,6 @@ def run_of(policy: TriggerRule, *, zoh: bool, lost: int, horizon_s: float = 6.0)
         ContinuousLoop(loop, policy), horizon_s=horizon_s, known_start=True,
         delivered=lambda event: event % (lost + 1) == lost, max_events=5000,
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
-def test_states_evolve_while_the_rule_is_not_tested(decay_per_s: float) -> None:
-    """η may be used up meanwhile; an event that is due within the dwell time follows at its end."""
-    dynamic = dynamic_rule(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
-    for policy, times_s in (
-        (with_dwell_time(dynamic, 500 * MS), None),
-        (with_deadline(with_dwell_time(dynamic, 500 * MS), 200 * MS), 0.2 * np.arange(1, 30)),
-    ):
-        run = run_of(policy, zoh=True, lost=1, horizon_s=5.9)
-        assert len(run.before) >= 5
-        for state, following in zip((run.start, *run.after), run.before, strict=False):
-            z = expm(run.system.generator * (following.t_s - state.t_s)) @ np.concatenate(state[1:])
-            np.testing.assert_allclose(np.concatenate(following[1:]), z, rtol=1e-9, atol=1e-9)
-        if times_s is not None:
-            np.testing.assert_allclose(run.event_s, times_s, rtol=1e-12)
 
 
 def test_an_envelope_is_not_exceeded_between_dwell_time_and_event() -> None:
@@ -113,11 +93,6 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
         shortest_s = min(shortest_s, float(np.diff(run.event_s).min()))
     assert shortest_s >= tau_s
     assert shortest_s < 1.2 * tau_s
-
-
-def test_periodic_transmits_at_a_fixed_period() -> None:
-    run = run_of(periodic_rule(300 * MS), zoh=True, lost=0, horizon_s=6.1)
-    np.testing.assert_allclose(run.event_s, np.arange(1, 21) * 0.3, rtol=1e-12)
 
 
 def test_periodic_event_triggering_agrees_with_the_sampled_rule() -> None:
