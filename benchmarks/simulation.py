@@ -27,6 +27,7 @@ from benchmarks.report import (
     MeasurementError,
     Peer,
     Row,
+    Side,
     benchmark,
     compared,
     cpu_ms,
@@ -93,13 +94,13 @@ def integrated(
 
 
 def beside_scipy(
-    name: str, unit: str, ours: Any, method: str, rtol: float, theirs: Any, error_s: float,
-    goal: Goal | None, agreement_s: float,
+    name: str, unit: str, ours: Side, peer: tuple[str, Side], error_s: float, agreement_s: float,
+    goal: Goal | None,
 ) -> Row:  # fmt: skip
     """Compare a simulator with the integrator, whose event times differ by at most ``error_s``."""
     return compared(
-        name, unit, ours, (f"solve_ivp, {method}, rtol {rtol:g}", theirs), goal,
-        note=f"event times differ from those of {method} by {error_s:.1g} s",
+        name, unit, ours, (f"solve_ivp, {peer[0]}", peer[1]), goal,
+        note=f"event times differ by {error_s:.1g} s from those of {peer[0]}",
         unjudged=None if error_s <= agreement_s else "the two do not agree",
     )  # fmt: skip
 
@@ -130,8 +131,9 @@ def continuous_row(scenario: Scenario) -> Row:
         return integrated(setting, draw, np.array(fates), "DOP853", rtol)
 
     return beside_scipy(
-        f"{horizon_s:g} s in continuous time", "ms", cpu_ms(ours), "DOP853", rtol, cpu_ms(theirs),
-        apart_s(ours(), theirs()), Goal("<=", 0.1), 1e-8,
+        f"{horizon_s:g} s in continuous time", "ms", cpu_ms(ours),
+        (f"DOP853, rtol {rtol:g}", cpu_ms(theirs)), apart_s(ours(), theirs()), 1e-8,
+        Goal("<=", 0.1),
     )  # fmt: skip
 
 
@@ -225,10 +227,8 @@ def batch_rows(mode: str) -> list[Row]:
             return [integrated(setting, draws[i], fates[i], method) for i in few]
 
         error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
-        theirs = per_cpu_s(len(few), integrate)
-        found.append(
-            beside_scipy(name, "runs/s", engine, method, 1e-8, theirs, error_s, goal, _AGREEMENT_S)
-        )
+        peer = f"{method}, rtol 1e-8", per_cpu_s(len(few), integrate)
+        found.append(beside_scipy(name, "runs/s", engine, peer, error_s, _AGREEMENT_S, goal))
     value = median(row.value for row in found if row.value is not None)
     note = f"{rows['transmissions'].mean():.0f} events a run"
     return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *found]

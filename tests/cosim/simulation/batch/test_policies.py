@@ -124,9 +124,11 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     made = []
     for seed in seeds:
         rng = np.random.default_rng([seed, *name.encode()])
-        n, m = SIZES[name in NORM_OR_TIME]
+        n, m = SIZES[name in (*NORM_OR_TIME, "decaying")]
         setting = random_setting(rng, n, m)
-        policy = POLICIES.get(name, decaying)(rng, n, setting.trigger.weight)
+        policy = setting.trigger
+        if name != "decaying":
+            policy = POLICIES[name](rng, n, setting.trigger.weight)
         if name == "lyapunov":  # After a lost update, the next event follows at once.
             setting = replace(setting, link=LinkSettings(), H=0.3 * setting.H - 0.7 * np.eye(n))
         population = random_population(rng, setting, 2)
@@ -137,7 +139,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
 @pytest.mark.parametrize("name", ["decaying", *POLICIES])
 def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -> None:
     events = finished = 0
-    for setting, population in settings(name, range(12 if name == "lyapunov" else 4)):
+    for setting, population in settings(name, range(12 if name in ("lyapunov", "decaying") else 4)):
         for i, row in enumerate(run_batch(setting, population)):
             draw = one(population, i)
             try:
