@@ -155,8 +155,7 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
     yield Row(f"end of {longest_s:g} s", long.wall_s, "s")
     yield speed("speed of the end, as a multiple of real time", long.wall_s - short.wall_s,
                 note="of the additional length, replay beside the rest")  # fmt: skip
-    yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s,
-                Goal(">=", 200))  # fmt: skip
+    yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200))
     yield speed("of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY],
                 Goal(">=", 2000))  # fmt: skip
     for phase, took_s in long.phases_s.items():

@@ -127,11 +127,9 @@ def run_recovery_s(record: RunRecord, end_s: float) -> float:
     """Return the longest :func:`recovery_s` of all processes; late: by more than a period."""
     period_us = record.scenario.timing.plant_period_ns * 1e-3
     return max(
-        recovery_s(
-            record[table]["now_ns"][lateness_us(record, role) > period_us] * 1e-9, end_s
-        )
+        recovery_s(record[table]["now_ns"][lateness_us(record, role) > period_us] * 1e-9, end_s)
         for role, table in STEPS.items()
-    )  # fmt: skip
+    )
 
 
 ROUNDS = 3

@@ -138,9 +138,7 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
 
 
 _FLOW = ("link", "direction", "flow")
-_COLUMNS = (
-    *_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit",
-)  # fmt: skip
+_COLUMNS = (*_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
 _LATEST_NS = 2**61
 
 

@@ -52,9 +52,7 @@ from noack.settings.user_files import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"
 SUFFIX = ".noack.zip"
-_FILES = {
-    SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE
-}  # fmt: skip
+_FILES = {SCENARIO_FILE, ENVIRONMENT_FILE, REPORTS_FILE, ENDING_FILE, SUMMARY_FILE}
 _FOLDERS = {RECORD, "logs", *(place.split(".")[0] for place in PLACES)}
 _MOST_ENTRIES = 1_000_000
 _MOST_MANIFEST_BYTES = 256 * 2**20

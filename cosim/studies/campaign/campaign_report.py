@@ -52,7 +52,7 @@ def write_report(
         write_whole(store.folder / SUMMARY, document + b"\n"),
         store.folder / RUNS,
         *save_figures(figures(summary, store), store.folder / PAGE, figure_files),
-    ]  # fmt: skip
+    ]
 
 
 def campaign_tables(summary: CampaignSummary, *, shares: bool = False) -> Iterator[ResultTable]:
