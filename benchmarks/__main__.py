@@ -143,9 +143,10 @@ def rows_of_figures(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
         (figure.name or row.name, row)
         for figure in FIGURES
         for benchmark, row in rows
-        if benchmark == figure.benchmark and re.fullmatch(figure.rows, row.name)
+        if benchmark == figure.benchmark
+        and re.fullmatch(figure.rows, row.name)
         and (row.goal is not None or row.value is None)
-    ]  # fmt: skip
+    ]
 
 
 def write_docs(page: Path, figures: Iterable[tuple[str, Row]]) -> None:

@@ -120,8 +120,9 @@ def _asyncio(count: int, period_ns: int) -> list[int]:
 
 
 LOOPS: Mapping[str, Callable[[int, int], Sequence[int]]] = {
-    "run_loop": _run_loop, "asyncio": _asyncio,
-}  # fmt: skip
+    "run_loop": _run_loop,
+    "asyncio": _asyncio,
+}
 
 
 def ticks(loop: str, count: str, period_ns: str, priority: str) -> None:

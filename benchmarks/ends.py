@@ -156,8 +156,9 @@ def rows_of(ends: Mapping[float, End]) -> Iterator[Row]:
     yield speed("speed of the end, as a multiple of real time", long.wall_s - short.wall_s,
                 note="of the additional length, replay beside the rest")  # fmt: skip
     yield speed("the same, by CPU time of all processes", long.cpu_s - short.cpu_s, Goal(">=", 200))
-    yield speed("of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY],
-                Goal(">=", 2000))  # fmt: skip
+    yield speed(
+        "of it, the replay", long.phases_s[REPLAY] - short.phases_s[REPLAY], Goal(">=", 2000)
+    )
     for phase, took_s in long.phases_s.items():
         hour_s = 3600 * (took_s - short.phases_s.get(phase, 0.0)) / length_s
         yield Row(f"phase: {phase}, per hour of the run", hour_s, "s")

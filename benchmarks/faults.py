@@ -198,8 +198,9 @@ def killed_rows(role: str) -> Iterator[Row]:
         rounds.add(IMPORT, dict.fromkeys(("acted_s", "updated_s"), imported_s(MODULES[role])))
     row = partial(rounds.row, ours=role)
     yield row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT)
-    yield row(f"{role} killed: until the controller has an update again", "s", "updated_s",
-              peer=IMPORT)  # fmt: skip
+    yield row(
+        f"{role} killed: until the controller has an update again", "s", "updated_s", peer=IMPORT
+    )
     yield row(f"{role} killed: age of its last recorded row", "ms", "unwritten_ms",
               note="rows are handed over every 50 ms")  # fmt: skip
 

@@ -190,8 +190,10 @@ NODES, BEAM = 200_000, 64
 _SIGMA, _PERIOD_S, _DEADLINE_S = 0.005, 0.01, 0.02
 _ROUNDING = 1 + 1e-9
 QUANTITIES = {
-    Objective.ERROR: "e_c", Objective.STATE: "x", Objective.INTER_EVENT: "inter-event time",
-}  # fmt: skip
+    Objective.ERROR: "e_c",
+    Objective.STATE: "x",
+    Objective.INTER_EVENT: "inter-event time",
+}
 
 
 def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
@@ -254,10 +256,12 @@ def row_of(name: str, worst: Worst) -> Row:
     """Return the share of a bound that the worst run uses; more than 1 refutes the bound."""
     searched = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
     return Row(
-        f"{name}: {QUANTITIES[worst.objective]}", worst.tightness, "of the bound",
+        f"{name}: {QUANTITIES[worst.objective]}",
+        worst.tightness,
+        "of the bound",
         goal=Goal("<=", _ROUNDING),
         note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {searched}",
-    )  # fmt: skip
+    )
 
 
 @benchmark(

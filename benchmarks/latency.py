@@ -74,9 +74,11 @@ def ping(
     numbers = (count, round(period_s * 1e9), PRIORITY if asked else 0)
     try:
         done = subprocess.run(
-            [*command, *map(str, numbers)], capture_output=True, timeout=count * period_s + 30,
+            [*command, *map(str, numbers)],
+            capture_output=True,
+            timeout=count * period_s + 30,
             check=True,
-        )  # fmt: skip
+        )
         latencies_us = np.frombuffer(done.stdout, "<i8") / 1e3
         p50_us, p99_us = np.quantile(latencies_us, [0.5, 0.99]).tolist()
     except (subprocess.SubprocessError, IndexError):

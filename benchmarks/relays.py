@@ -368,8 +368,10 @@ def running(kind: Kind, built: Built) -> Iterator[Relay]:
     with on_core(RELAY_CORE):
         process = subprocess.Popen(
             kind.command(ends.sink_port, chosen),
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     try:
         ends.connect(_listening_on(kind, process, chosen))
         yield Relay(kind, process, ends)
@@ -467,9 +469,10 @@ COSTS = ((PLAIN, "socat"), (PLAIN, "C relay"), (PLAIN, DIRECT), (SEGMENTS, "C re
 def drained(options: argparse.Namespace) -> Iterator[Row]:
     """Send bursts to each relay in turn."""
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
-        kinds = [
-            c_relay(tools, *one) for one in C_MODES
-        ] + [our_relay(PLAIN, WORDS), our_relay(SEGMENTS, WORDS, "--segment")]  # fmt: skip
+        kinds = [c_relay(tools, *one) for one in C_MODES] + [
+            our_relay(PLAIN, WORDS),
+            our_relay(SEGMENTS, WORDS, "--segment"),
+        ]
         named = [("socat", socat()), *((kind.name, kind) for kind in kinds)]
         with Sides(named, tools) as sides:
             direct = sides.direct()
@@ -544,8 +547,9 @@ def flow_rows(rounds: Rounds) -> Iterator[Row]:
     for name, peer, goal in (*cases, (REVERSE, _many(PATHS), Goal("<=", 1))):
         if name in rounds.missing:
             rounds.add(_many(name), rounds.missing[name])
-        yield rounds.row(f"{_many(name)}: cost", "µs CPU each", "cpu_us", _many(name), peer, goal,
-                         paired=True)  # fmt: skip
+        yield rounds.row(
+            f"{_many(name)}: cost", "µs CPU each", "cpu_us", _many(name), peer, goal, paired=True
+        )
 
 
 PING_ROUNDS, PINGS = 60, 500

@@ -294,8 +294,9 @@ def cpu_s(command: Sequence[str]) -> float:
 def startup_rows(rounds: Rounds) -> Iterator[Row]:
     """Yield the rows of the start of a run."""
     note = "upper bound: includes a progress line's way through the recorder"
-    yield rounds.row("noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6),
-                     note=note)  # fmt: skip
+    yield rounds.row(
+        "noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note
+    )
     yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
     yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
 

@@ -172,8 +172,10 @@ def simulation(options: argparse.Namespace) -> Iterator[Row]:
     yield compared(name, "ms", machines, live, Goal("<=", 1e-3))
     yield compared(
         f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU",
-        "/s", per_cpu_s(_LOOPS, lambda: simulate_loops(many)), goal=Goal(">=", 3000),
-    )  # fmt: skip
+        "/s",
+        per_cpu_s(_LOOPS, lambda: simulate_loops(many)),
+        goal=Goal(">=", 3000),
+    )
     yield compared(
         f"sampled runs of {horizon_s:g} s on one core", "/s",
         per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)), earlier, Goal(">=", 100),

@@ -122,9 +122,10 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
     medians = [_low_median(judged[windows == window]) for window in np.unique(windows)]
     shares = (
         float(samples[np.abs(samples[:, 0] - share * length_s).argmin(), 1])
-        if len(samples) else math.nan
+        if len(samples)
+        else math.nan
         for share in (0.1, 0.5, 1.0)
-    )  # fmt: skip
+    )
     if judged_s < LEAST_S or len(medians) < LEAST_WINDOWS:
         verdict: Word = "too short" if judged_s < LEAST_S else "unknown"
         return Trend(*shares, math.nan, math.nan, allowed_kib, math.nan, verdict)
@@ -470,13 +471,15 @@ def memory_figure(result: Result) -> FigureDescription:
         margin = 0.05 * (high - low)
         title = f"{result.name}: private memory since the warm-up (grey); 1 MiB is allowed"
         colour = palette.PROCESSES.get(role, palette.SERIES[5 if role == RECORDER else 4])
-        warm = Spans(begin=np.zeros(1), end=np.array([warm_s]), colour=(128, 128, 128),
-                     opacity=0.14)  # fmt: skip
+        warm = Spans(
+            begin=np.zeros(1), end=np.array([warm_s]), colour=(128, 128, 128), opacity=0.14
+        )
         panel = Panel(
-            title="" if i else title, items=[warm, Line(x=at_s, y=kib, colour=colour)],
+            title="" if i else title,
+            items=[warm, Line(x=at_s, y=kib, colour=colour)],
             x=time_axis(at_s, numbers=i == len(result.watched) - 1, label="wall time [s]"),
             y=Axis(label=f"{role} [KiB]", ends=(low - margin, high + margin)),
-        )  # fmt: skip
+        )
         rows.append(Row(panels=[panel], height_in=0.95))
     return FigureDescription(name="memory", rows=rows)
 

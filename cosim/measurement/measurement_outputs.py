@@ -428,8 +428,9 @@ def _histogram(found: Measurement) -> Panel:
         ("outages", found.bursts.only(outages), _OUTAGES),
     ):
         counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
-        items.append(Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour,
-                          opacity=0.85))  # fmt: skip
+        items.append(
+            Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85)
+        )
     return Panel(
         title="Loss bursts",
         items=items,

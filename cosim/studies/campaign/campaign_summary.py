@@ -89,9 +89,10 @@ def judge_claims(
             )
             if all(point.labels[axis] in known for axis, known in allowed.items()):
                 rest = (
-                    f"{axis} {label}" for axis, label in point.labels.items()
+                    f"{axis} {label}"
+                    for axis, label in point.labels.items()
                     if axis != claim.axis and axis not in named
-                )  # fmt: skip
+                )
                 groups.setdefault(", ".join(rest), []).append(point)
         yield _judged(claim, groups, lambda point: cached(point.number))
 
@@ -108,8 +109,9 @@ def _judged(claim: Claim, groups: dict[str, list[Point]], values: Values) -> Jud
             texts += [
                 f"{METRICS[term.metric].heading}{f' at {term.label}' if term.label else ''} "
                 + number(float(middle)).replace("inf", "∞")
-                for term, middle in zip((smaller, larger), middles, strict=True) if term.metric
-            ]  # fmt: skip
+                for term, middle in zip((smaller, larger), middles, strict=True)
+                if term.metric
+            ]
         shares[name] = float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*holds))))
         medians = medians or ", ".join(dict.fromkeys(texts))
     least_at = min(shares, key=shares.__getitem__)
@@ -127,9 +129,11 @@ def _side(term: Term, claim: Claim, group: Sequence[Point], values: Values) -> V
 
 _ROUNDING = 1e-9
 _ENDED = {
-    OK: "finished", DIVERGED: "diverged", TOO_MANY_EVENTS: "too_many_events",
+    OK: "finished",
+    DIVERGED: "diverged",
+    TOO_MANY_EVENTS: "too_many_events",
     UNDECIDED: "undecided",
-}  # fmt: skip
+}
 
 
 class GridPointResult(NamedTuple):
@@ -247,6 +251,7 @@ def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
             if point is not reference:
                 differences = {
                     name: difference(values, own[name])
-                    for name, values in runs_at(point, store)[0].items() if name in own
-                }  # fmt: skip
+                    for name, values in runs_at(point, store)[0].items()
+                    if name in own
+                }
                 yield ComparedResult(point, reference, differences)

@@ -55,14 +55,16 @@ class Store:
         text, number = pa.dictionary(pa.int16(), pa.string()), pa.float64()
         axes = points[0].values.items()
         self.row_type = row_type(points)
-        self._schema = pa.schema([
-            *((name, text if isinstance(value, str) else number) for name, value in axes),
-            ("draw", pa.int64()),
-            *(
-                (name, pa.from_numpy_dtype(self.row_type[name]))
-                for name in self.row_type.names or ()
-            ),
-        ])  # fmt: skip
+        self._schema = pa.schema(
+            [
+                *((name, text if isinstance(value, str) else number) for name, value in axes),
+                ("draw", pa.int64()),
+                *(
+                    (name, pa.from_numpy_dtype(self.row_type[name]))
+                    for name in self.row_type.names or ()
+                ),
+            ]
+        )
 
     def chunks(self, point: int) -> Iterator[Chunk]:
         """Return all chunks of a point."""

@@ -57,8 +57,10 @@ from noack.core.linear_systems import Matrix, Vector
 LATE, COST_FACTOR = 0.01, 2.0
 Limit = Literal["guarantee", "deadline", "cost"]
 LIMITS: Mapping[Limit, Metric] = {
-    "guarantee": "loops_guarantee_used", "deadline": "updates_late", "cost": "cost",
-}  # fmt: skip
+    "guarantee": "loops_guarantee_used",
+    "deadline": "updates_late",
+    "cost": "cost",
+}
 """The limits and their metrics."""
 
 
@@ -96,12 +98,14 @@ class PolicyCapacity(NamedTuple):
         median = self.any_limit.median
         known = math.isfinite(median)
         return {
-            "policy": self.policy, "disturbance": self.disturbance,
-            **self.any_limit._asdict(), "limited_by": self.limited_by,
+            "policy": self.policy,
+            "disturbance": self.disturbance,
+            **self.any_limit._asdict(),
+            "limited_by": self.limited_by,
             "limits": {name: capacity._asdict() for name, capacity in self.limits.items()},
             "factor": plan.factor(median) if known else None,
             "loops_by_kind": plan.composition(median) if known else None,
-        }  # fmt: skip
+        }
 
 
 def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
@@ -137,11 +141,13 @@ def capacity_of(
         reached["cost"] = cost >= (COST_FACTOR * finite.mean() if len(finite) else 0.0)
         reached["cost"][0] = np.isinf(cost[0])  # it is the reference, however costly
     else:
-        reached["cost"] = np.logical_or.reduce([
-            values(column)
-            >= COST_FACTOR * np.stack([runs[unshared(count)][column] for count in plan.counts])
-            for column in plan.cost_columns
-        ])  # fmt: skip
+        reached["cost"] = np.logical_or.reduce(
+            [
+                values(column)
+                >= COST_FACTOR * np.stack([runs[unshared(count)][column] for count in plan.counts])
+                for column in plan.cost_columns
+            ]
+        )
     draws = {limit: carried(plan.counts, flags) for limit, flags in reached.items()}
     limits = {limit: Capacity.estimate(found) for limit, found in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)

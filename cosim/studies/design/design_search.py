@@ -216,9 +216,10 @@ class Search:
         while True:
             limits = self.limits.bounds.items()
             known = [
-                trial for trial in self.trials
+                trial
+                for trial in self.trials
                 if all(trial.bounds.get(name, 0.0) <= limit for name, limit in limits)
-            ]  # fmt: skip
+            ]
             sent = np.array([t.measured.transmissions for t in known])
             settling_s = np.array([t.measured.settling_s for t in known])
             front = [known[i] for i in undominated(sent, settling_s)]

@@ -76,8 +76,10 @@ def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Pat
     found, inner = numbers(done), make_folder(folder)
     draw, scenario = found["representative"], _base(done)
     described = {one.name: one for one in figures(done.summary, done.store)}
-    described |= {policy.lower(): draw_figure(scenario, draw, mode)
-                  for policy, mode in zip(POLICIES, MODES, strict=True)}  # fmt: skip
+    described |= {
+        policy.lower(): draw_figure(scenario, draw, mode)
+        for policy, mode in zip(POLICIES, MODES, strict=True)
+    }
     written = [
         write_whole(folder / "paper.md", render(found)),
         write_whole(inner / "paper.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n"),
