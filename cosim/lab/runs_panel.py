@@ -44,7 +44,7 @@ def opened(directory: Path, width_in: float) -> Opened:
     import noack
     from cosim.output.figure_files import inline
     from cosim.output.figure_style import figure_width
-    from cosim.output.run_figures import page_figures
+    from cosim.output.network_figures import page_figures
     from cosim.output.run_tables import run_facts
     from cosim.output.run_verdict import verdict
     from cosim.record.run_record import load_run
