@@ -29,7 +29,15 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
-from tests.trigger_rules import TABLES, absolute_rule, mixed_rule, periodic_rule, random_rule
+from tests.trigger_rules import (
+    TABLES,
+    absolute_rule,
+    decaying_rule,
+    mixed_rule,
+    periodic_rule,
+    quadratic_rule,
+    random_rule,
+)
 
 MS = 10**6
 SIZES = ((4, 2), (2, 1))
