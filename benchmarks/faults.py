@@ -31,6 +31,7 @@ from cosim.analysis.loop_statistics import lateness_us
 from cosim.analysis.run_summary import summarise
 from cosim.cli import find_scenario
 from cosim.live.child_processes import MODULES
+from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
 from cosim.live.run_watcher import Watcher
 from cosim.record.run_record import RunRecord, load_record
@@ -102,6 +103,7 @@ def faulted_run(
             thread.join()
         if ending.status != ExitStatus.OK or ending.startup_s is None or not outcomes:
             raise MeasurementError(f"{name}: the run ended: {ending.reason}")
+        finalize(ending, report=False, view=False)
         record = load_record(ending.run_dir)
         summary = summarise(record, ending.status, ending.reason).to_json()
     back_s = backs_s[0] if backs_s else None

@@ -4,7 +4,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,7 @@ from noack.core.linear_systems import Matrix
 from noack.impairments.loss_prediction import expected_loss
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.weight import choose_weight
-
-Outcomes = NDArray[np.bool_]
-
-
-class Limits(NamedTuple):
-    """A guarantee in numbers."""
-
-    windows: tuple[tuple[int, int], ...]
-    """(m, K): at most m losses among K; a cap M − 1 is (M − 1, M)."""
-    recovery: int = 0
-
+from tests.oracles.receiver import Limits, Outcomes, longest_burst, outcomes_of, violations
 
 DECISIONS = 100_000_000
 _BATCH = 1_000_000
@@ -83,33 +73,6 @@ class Decider:
         return measured
 
 
-def outcomes_of(decisions: NDArray[Any]) -> Outcomes:
-    """Return (k,) whether each datagram of a flow is lost, from its decisions in order."""
-    numbers = np.arange(len(decisions))
-    times, leaving = [], []
-    for departure, bit in (("release_ns", "bit"), ("copy_ns", "copy_bit")):
-        intact = (decisions[departure] >= 0) & (decisions[bit] < 0)
-        times.append(decisions[departure][intact])
-        leaving.append(numbers[intact])
-    # Datagrams with equal release times leave in the order of arrival.
-    in_order = np.concatenate(leaving)[np.lexsort((np.concatenate(leaving), np.concatenate(times)))]
-    newest = np.maximum.accumulate(np.concatenate([[-1], in_order]))
-    lost = np.ones(len(decisions), bool)
-    lost[in_order[in_order > newest[:-1]]] = False
-    return lost
-
-
-def violations(lost: Outcomes, limits: Limits) -> int:
-    """Count the windows with too many losses, and the gaps between bursts that are too short."""
-    count = np.concatenate([[0], np.cumsum(lost)])
-    found = 0
-    for losses, window in limits.windows:
-        begin = np.maximum(np.arange(1, len(count)) - window, 0)
-        found += int(np.count_nonzero(count[1:] - count[begin] > losses))
-    gaps = np.diff(np.flatnonzero(lost)) - 1
-    return found + int(np.count_nonzero((gaps > 0) & (gaps < limits.recovery)))
-
-
 def check_row(words: str, limits: Limits, count: int) -> Row:
     """Return the violations in a number of decisions."""
     say(f"{count:,} decisions, {words}")
@@ -142,11 +105,10 @@ def network_rows() -> Iterator[Row]:
     }
     for name, decisions in networks.items():
         lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
-        ends = np.flatnonzero(np.concatenate([[True], ~lost, [True]]))
         goal = Goal("<=", CAP) if name == held else None
         yield Row(f"{name}: dropped", 100 * float(dropped.mean()), "%")
         yield Row(f"{name}: dropped or out of order", 100 * float(lost.mean()), "%")
-        yield Row(f"{name}: longest loss burst", int(np.diff(ends).max()) - 1, "", goal=goal)
+        yield Row(f"{name}: longest loss burst", longest_burst(lost), "", goal=goal)
     back_ns = networks[held]["hold_back_ns"]
     back_ns = back_ns[back_ns > 0]
     yield Row(f"{held}: held back", 100 * len(back_ns) / _BATCH, "%")

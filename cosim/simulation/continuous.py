@@ -380,25 +380,17 @@ def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> Continuo
 def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     """Return the run as JSON: its summary, every event, and the states at 501 times."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    before = run.before
+    states = ("x", "e_s", "e_c")
     return {
         "summary": summary(run, resolved),
         "events": [
-            {
-                "t_s": state.t_s,
-                "delivered": bool(delivered),
-                "x": state.x.tolist(),
-                "e_s": state.e_s.tolist(),
-                "e_c": state.e_c.tolist(),
-            }
-            for state, delivered in zip(before, run.delivered, strict=True)
+            {"t_s": state.t_s, "delivered": bool(delivered)}
+            | {name: getattr(state, name).tolist() for name in states}
+            for state, delivered in zip(run.before, run.delivered, strict=True)
         ],
         "state_names": list(run.system.loop.state_names),
         "samples": {
-            "t_s": samples.t_s.tolist(),
-            "x": samples.x.tolist(),
-            "x_s": samples.x_s.tolist(),
-            "x_c": samples.x_c.tolist(),
+            **{name: getattr(samples, name).tolist() for name in ("t_s", "x", "x_s", "x_c")},
             "e_s_norm": run.e_s_norm(samples).tolist(),
             "e_c_norm": run.e_c_norm(samples).tolist(),
             "threshold": _thresholds(run, samples),

@@ -9,13 +9,11 @@ from benchmarks.guarantees import (
     EXPECTED,
     REORDERING,
     Decider,
-    Limits,
     check_row,
     expected_row,
     network_rows,
-    outcomes_of,
-    violations,
 )
+from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
 @pytest.mark.parametrize("words", COMBINATIONS)
