@@ -34,10 +34,16 @@ with lazy_modules():
     from cosim.live import launcher, simulated_run
     from cosim.live import progress as progress_display
     from cosim.output import export as exports
-    from cosim.output import figure_drawing, figure_files, figure_format, run_figures
+    from cosim.output import (
+        figure_drawing,
+        figure_files,
+        figure_format,
+        network_figures,
+        run_figures,
+    )
     from cosim.output import run_tables as result_tables
     from cosim.record import data_frames, run_record, table_files
-    from cosim.studies import run_archive, run_comparison, run_repetition
+    from cosim.studies import run_archive, run_comparison
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -278,7 +284,7 @@ class Run:
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        return run_figures.page_figures(
+        return network_figures.page_figures(
             self._run, lambda: self.summary, self._loop, bounded=bounded
         )
 
@@ -383,7 +389,7 @@ def open_run(directory: Folder = "runs/latest") -> Run:
 
 def reproduce(
     path: Folder, *, run_code: bool = False, long: bool = False
-) -> "run_repetition.Repetition":
+) -> "run_archive.Repetition":
     """Repeat an archived run, and compare it bit for bit.
 
     Args:
@@ -400,7 +406,7 @@ def reproduce(
         NoackError: the file is not such an archive, is damaged, or contains code without
             ``run_code`` or a long run without ``long``.
     """
-    return run_repetition.repeat_archive(Path(path), run_code=run_code, long=long)
+    return run_archive.repeat_archive(Path(path), run_code=run_code, long=long)
 
 
 def compare(*runs: Run | Folder) -> "run_comparison.RunComparison":

@@ -31,7 +31,7 @@ from noack.traces.trace_formats import find_trace
 
 with lazy_modules():
     from cosim.live import progress as progress_display
-    from cosim.measurement import measurement_page
+    from cosim.measurement import measurement_outputs
     from cosim.output import certificate_report, figure_drawing, result_tables, run_tables
     from cosim.studies.campaign import (
         campaign_figures,
@@ -39,7 +39,6 @@ with lazy_modules():
         campaign_report,
         campaign_summary,
         campaign_workers,
-        finished_campaign,
     )
 
 if TYPE_CHECKING:
@@ -109,7 +108,7 @@ class Measurement(NetworkMeasurement):
         Raises:
             NoackError: the name has another ending, or the file cannot be written.
         """
-        measurement_page.write_page(self, None, Path(path))
+        measurement_outputs.write_page(self, None, Path(path))
 
     def write_network(
         self, path: str | PathLike[str], form: Literal["trace", "model"] = "trace"
@@ -155,7 +154,7 @@ class CampaignResult:
     """A finished campaign; :func:`noack.campaign` returns it."""
 
     def __init__(
-        self, finished: "finished_campaign.FinishedCampaign", temporary: Path | None = None
+        self, finished: "campaign_report.FinishedCampaign", temporary: Path | None = None
     ) -> None:
         self._finished = finished
         if temporary is not None:
@@ -311,7 +310,7 @@ def campaign(
     temporary = None if folder is not None else Path(tempfile.mkdtemp(prefix="noack-"))
     start = partial(campaign_workers.local, workers or cores())
     try:
-        finished = finished_campaign.finish_campaign(
+        finished = campaign_report.finish_campaign(
             plan, path, Path(folder or temporary or ""), start, draws=draws,
             show=lambda text: nullcontext(),
             bar=_runs_bar() if progress else None,

@@ -29,7 +29,7 @@ with lazy_modules():
     )
     from cosim.output import run_verdict
     from cosim.record import run_directory
-    from cosim.studies.campaign import campaign_file, campaign_workers, finished_campaign
+    from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.config import link_load, resolution, scenario
     from noack.protocol import topology
     from noack.runtime import address, metrics_server, run_registry
@@ -201,7 +201,7 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[
 def execute_campaign(
     plan: "campaign_file.Campaign", path: Path, start: Callable[[Any], Any], *,
     folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
-) -> "finished_campaign.FinishedCampaign":  # fmt: skip
+) -> "campaign_report.FinishedCampaign":  # fmt: skip
     """Run or continue a campaign; write its page.
 
     Args:
@@ -217,7 +217,7 @@ def execute_campaign(
     def say(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
-    return finished_campaign.finish_campaign(
+    return campaign_report.finish_campaign(
         plan, path, folder, lambda: start(say), draws=draws, figure_files=figure_files,
         show=console.status, bar=progress.runs_bar(console),
     )  # fmt: skip

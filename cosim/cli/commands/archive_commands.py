@@ -17,7 +17,7 @@ with lazy_modules():
     from cosim.live import finalize
     from cosim.output import result_tables, run_verdict
     from cosim.record import collection
-    from cosim.studies import run_archive, run_comparison, run_repetition
+    from cosim.studies import run_archive, run_comparison
 
 
 @cli.command(cli.RUNS, 92)
@@ -67,8 +67,8 @@ def reproduce(
         noack reproduce result.noack.zip --into again --json   keep both runs; print JSON
     """
     with cli.status("repeating"):
-        found = run_repetition.repeat_archive(file, run_code=run_code, long=long, into=into)
-    cli.show(json, found.to_json, run_repetition.print_repetition, found)
+        found = run_archive.repeat_archive(file, run_code=run_code, long=long, into=into)
+    cli.show(json, found.to_json, run_archive.print_repetition, found)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 

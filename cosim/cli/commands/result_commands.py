@@ -19,7 +19,7 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis import run_summary
     from cosim.live import finalize
-    from cosim.output import figure_files, run_tables, run_verdict, signal_figures
+    from cosim.output import figure_files, run_figures, run_tables, run_verdict
     from cosim.output.viewer import live_viewer
     from cosim.record import run_directory, run_record
 
@@ -147,7 +147,7 @@ def fidelity(
     with cli.status("comparing"):
         found = fidelity_analysis.compute_fidelity(run_record.load_record(run.path, run.loop))
         if out is not None:
-            figure_files.save_figure(signal_figures.fidelity_figure(found), out, width)
+            figure_files.save_figure(run_figures.fidelity_figure(found), out, width)
     cli.show(json, found.as_json, run_verdict.print_fidelity, found)
     return ExitStatus.OK if found.explained else ExitStatus.FAILED
 
