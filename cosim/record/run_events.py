@@ -77,6 +77,7 @@ class RecordedChange(NamedTuple):
         return not is_of_loss_alone(self.change.settings)
 
 
+@lru_cache(maxsize=1)
 def changes_of(record: RunRecord) -> list[RecordedChange]:
     """Return the changes of a run, in the order in which they came into force.
 
@@ -190,8 +191,8 @@ class PacketOutcome(NamedTuple):
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
     released = _released(record, flow)
-    parts = [_outcomes(rows, flow, *released) for rows in record.source.batches(NETEM_PACKET)]
-    parts.append(_outcomes(np.zeros(0, record.tables[NETEM_PACKET]), flow, *released))
+    batches = [*record.source.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
+    parts = [_outcomes(rows, flow, *released) for rows in batches]
     return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -34,7 +34,7 @@ from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
 Value: TypeAlias = Any  # what JSON has
-Kind: TypeAlias = Any
+Kind: TypeAlias = object
 """The annotation of a value: a class, a union, a list."""
 
 MOST_BYTES = 2**20  # largest size of a settings file
@@ -207,7 +207,7 @@ _MOST_LINES = 50
 _SIMILAR = 0.8
 """Least similarity of a suggested key, or of its last part, as difflib measures it."""
 _MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
-_LISTS = {
+_LISTS: dict[object, str] = {
     float: "should be a list of numbers, e.g. [1.0, 0.0]",
     int: "should be a list of numbers, e.g. [1, 2]",
     str: 'should be a list of names, e.g. ["a", "b"]',

@@ -1,4 +1,4 @@
-"""Batches under every policy against the exact simulator, on the same draws."""
+"""Batches under every policy against single runs, whose events an integrator confirms."""
 
 import math
 from dataclasses import replace
@@ -7,10 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.simulation.batch import Population, Setting, run_batch, run_events
-from cosim.simulation.continuous import TooManyEventsError
+from cosim.shipped_files import find_shipped
+from cosim.simulation.batch import Population, Setting, run_batch, run_events, setting_of
+from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
@@ -24,7 +29,15 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
-from tests.trigger_rules import TABLES, absolute_rule, mixed_rule, periodic_rule, random_rule
+from tests.trigger_rules import (
+    TABLES,
+    absolute_rule,
+    decaying_rule,
+    mixed_rule,
+    periodic_rule,
+    quadratic_rule,
+    random_rule,
+)
 
 MS = 10**6
 SIZES = ((4, 2), (2, 1))
@@ -50,7 +63,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
 @pytest.mark.parametrize("name", TABLES)
 def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -> None:
     events = finished = 0
-    for setting, population in settings(name, range(12 if name == "lyapunov" else 4)):
+    for setting, population in settings(name, range(12 if name in ("lyapunov", "decaying") else 4)):
         for i, row in enumerate(run_batch(setting, population)):
             draw = one(population, i)
             try:
@@ -67,7 +80,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
     assert finished >= (2 if name == "lyapunov" else 6)
 
 
-@pytest.mark.parametrize("name", ["mixed", "dynamic", "quadratic", "dwell of lyapunov"])
+@pytest.mark.parametrize("name", ["decaying", "mixed", "dynamic", "quadratic", "dwell of lyapunov"])
 def test_a_row_depends_only_on_its_own_draw(name: str) -> None:
     rng = np.random.default_rng(5)
     for setting, _ in settings(name, range(2)):
@@ -121,10 +134,10 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
 
 @pytest.mark.parametrize(
     "name",
-    ["relative", "periodic", "dwell of decaying", "dynamic", "quadratic", "dwell of quadratic"],
+    ["decaying", "relative", "periodic", "dynamic", "quadratic", "dwell of quadratic"],
 )
 def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> None:
-    quiet = name in ("relative", "dynamic", "quadratic")
+    quiet = name in ("decaying", "relative", "dynamic", "quadratic")
     for setting, population in settings(name, range(3)):
         wild = population._replace(A=population.A + 20 * np.eye(len(setting.H)))
         forever = replace(setting, horizon_s=60.0, most_events=100_000)
@@ -136,6 +149,15 @@ def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> N
         assert row["status"] == DIVERGED
         assert row["diverged_at_s"] == pytest.approx(run.diverged_at_s, rel=1e-9)
         assert row["transmissions"] == len(run.event_s)
+
+
+@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
+def test_the_supremum_between_events_is_certified(omega: float) -> None:
+    """e_c = e_s turns with x, and nothing is sent: sup ‖e_c‖ is 2‖x(0)‖, at π/ω."""
+    setting = known_loop(np.zeros((4, 4)), absolute_rule(2.001, n=4), 1.5 * math.pi / omega)
+    (row,) = run_batch(setting, draw_of(rotation(omega)))
+    assert row["transmissions"] == 0
+    assert 1 - 1e-10 <= row["sup_e_c_scaled"] / 2.0 <= 1 + 1e-12
 
 
 def test_an_oscillation_close_to_a_level_is_decided() -> None:
@@ -165,3 +187,40 @@ def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
     fast = -rate_per_s * np.eye(4)
     (row,) = run_batch(known_loop(fast, periodic_rule(1000 * MS, n=4), 4.0), draw_of(fast))
     assert row["status"] == UNDECIDED
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_a_batch_setting_of_a_scenario_gives_the_scenarios_run(mode: str) -> None:
+    seed, delay = 2**40 + 3, 'network.impairments=[{kind="delay", delay_s=0.1}]'
+    settings = [f"mode={mode}", "horizon_s=8", f"seeds.loss={seed}", delay]
+    resolved = resolve(load(find_shipped("lane_following", "scenarios"), settings))
+    loop = loop_of(resolved)
+    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([seed], np.uint64))
+    found = run_events(setting_of(resolved), draw)
+    run = run_continuous(resolved)
+    assert len(run.event_s) >= (1 if mode == "model" else 5)
+    np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+    assert found.delivered.tolist() == run.delivered.tolist()
+
+
+def test_invalid_settings_are_refused() -> None:
+    rng = np.random.default_rng(1)
+    setting = random_setting(rng, 2, 1)
+    population = random_population(rng, setting, 3)
+    with pytest.raises(ValueError, match="x0: expected the shape"):
+        run_batch(setting, population._replace(x0=population.x0[:, :1]))
+    with pytest.raises(ValueError, match="loss_seeds: expected uint64"):
+        run_batch(setting, population._replace(loss_seeds=np.zeros(3, np.int64)))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="one run"):
+        run_events(setting, population)
+    late = setting.link.model_copy(update={"impairments": (Delay(delay_s=1.0),)})
+    with pytest.raises(CallerError, match="losses and corruption only"):
+        run_batch(Setting(**{**vars(setting), "link": late}), population)
+    with pytest.raises(CallerError, match=r"trigger\.floor"):
+        run_batch(
+            Setting(**{**vars(setting), "trigger": decaying_rule(1.0, 1.0), "horizon_s": 1e3}),
+            population,
+        )
+    wide = quadratic_rule(np.eye(6), 10**6)
+    with pytest.raises(ValueError, match="trigger: expected 4 columns, found 6"):
+        run_batch(Setting(**{**vars(setting), "trigger": wide}), population)

@@ -1,4 +1,4 @@
-"""Rounds, rows, tables and JSON of the benchmarks, and the machine's other load."""
+"""Benchmarks as functions that return rows; rounds, rows, tables, and the machine's other load."""
 
 import argparse
 import operator
@@ -6,7 +6,7 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,12 +14,10 @@ import numpy as np
 import psutil
 from rich.table import Table
 
-BUSY_SHARE = 0.1
-"""Figures are reported as doubtful if other programs used at least this share of all cores."""
-STEAL_SHARE = 0.01
-"""Figures are reported as doubtful if the hypervisor took at least this share of all cores."""
-
+BUSY_SHARE, STEAL_SHARE = 0.1, 0.01
+"""Figures are doubtful if other programs, or the hypervisor, used this share of all cores."""
 _COMPARISONS = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operator.eq}
+median = statistics.median
 
 
 class MeasurementError(Exception):
@@ -39,38 +37,28 @@ class Goal(NamedTuple):
     comparison: str
     limit: float
 
-    def holds(self, found: float) -> bool:
-        """Whether ``found`` reaches the goal."""
-        return bool(_COMPARISONS[self.comparison](found, self.limit))
-
     def __str__(self) -> str:
         return f"{self.comparison} {self.limit:g}"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One figure.
-
-    Args:
-        name: what was measured.
-        value: the figure; None if it could not be measured.
-        unit: its unit.
-        peer: the alternative, in the same unit.
-        goal: condition on the ratio to the peer; without a peer, on the value.
-        note: a remark for the reader.
-        unjudged: why the goal cannot be judged although there is a figure.
-        paired_ratio: if both sides were measured in alternating rounds, the median over rounds of
-            the ratio within a round; it replaces the ratio of the two figures.
-    """
+    """One figure."""
 
     name: str
     value: float | None
+    """None if it could not be measured."""
     unit: str
     peer: Peer | None = None
+    """The alternative, in the same unit."""
     goal: Goal | None = None
+    """A condition on the ratio to the peer; without a peer, on the value."""
     note: str | None = None
     unjudged: str | None = None
+    """Why the goal cannot be judged although there is a figure."""
     paired_ratio: float | None = None
+    """If both sides were measured in turn, the median of the rounds' ratios; replaces the ratio of
+    the two figures."""
 
     @property
     def ratio(self) -> float | None:
@@ -87,17 +75,60 @@ class Row:
         found = self.value if self.peer is None else self.ratio
         if self.goal is None or found is None or self.unjudged is not None:
             return None
-        return self.goal.holds(found)
+        return bool(_COMPARISONS[self.goal.comparison](found, self.goal.limit))
 
-    def as_json(self) -> dict[str, Any]:
+    @property
+    def notes(self) -> str:
+        """Why it is not judged, and the note."""
+        return "; ".join(filter(None, (self.unjudged, self.note)))
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The row of a table: figure, value, alternative, its value, ratio, goal, verdict."""
+        goal = "" if self.goal is None else str(self.goal)
+        return (
+            self.name, with_unit(self.value, self.unit), self.peer.name if self.peer else "",
+            with_unit(self.peer.value, self.unit) if self.peer else "",
+            "" if self.ratio is None else number_text(self.ratio), goal,
+            {True: "yes", False: "no", None: "?" if goal else ""}[self.holds],
+        )  # fmt: skip
+
+    def as_json(self) -> dict[str, object]:
         """Return the row as ``--json`` writes it."""
         row = {
             "name": self.name, "value": self.value, "unit": self.unit,
             "peer": self.peer and self.peer._asdict(), "ratio": self.ratio,
             "goal": self.goal and str(self.goal), "holds": self.holds,
         }  # fmt: skip
-        notes = [text for text in (self.unjudged, self.note) if text]
-        return row | ({"note": "; ".join(notes)} if notes else {})
+        return row | ({"note": self.notes} if self.notes else {})
+
+
+Measure = Callable[[argparse.Namespace], Iterable[Row]]
+
+
+class Benchmark(NamedTuple):
+    """A benchmark of the command line: its table's title, its function, its own options."""
+
+    name: str
+    title: str
+    measure: Measure
+    options: Mapping[str, Mapping[str, Any]] = {}
+    """The arguments of ``add_argument`` by the option's name."""
+
+
+BENCHMARKS: dict[str, Benchmark] = {}
+
+
+def benchmark(
+    name: str, title: str, options: Mapping[str, Mapping[str, Any]] | None = None
+) -> Callable[[Measure], Measure]:
+    """Declare a function that measures a benchmark."""
+
+    def declare(measure: Measure) -> Measure:
+        BENCHMARKS[name] = Benchmark(name, title, measure, options or {})
+        return measure
+
+    return declare
 
 
 class Load:
@@ -109,11 +140,15 @@ class Load:
     def rows(self) -> list[Row]:
         """Return the shares of all cores used by other programs and by the hypervisor."""
         total_s, busy_s, steal_s, own_s = np.subtract(self._read(), self._before).tolist()
-        total_s = max(total_s, 1e-9)
-        return [
-            _share("machine: other programs", max(busy_s - own_s, 0.0) / total_s, BUSY_SHARE),
-            _share("machine: steal", steal_s / total_s, STEAL_SHARE),
-        ]
+        rows = []
+        for name, used_s, doubtful in (
+            ("other programs", max(busy_s - own_s, 0.0), BUSY_SHARE),
+            ("steal", steal_s, STEAL_SHARE),
+        ):
+            share = used_s / max(total_s, 1e-9)
+            doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
+            rows.append(Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt))
+        return rows
 
     @staticmethod
     def _read() -> tuple[float, ...]:
@@ -123,33 +158,15 @@ class Load:
             times.pop(part, None)
         total_s, steal_s = sum(times.values()), times.get("steal", 0.0)
         busy_s = total_s - steal_s - times["idle"] - times.get("iowait", 0.0)
-        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        return total_s, busy_s, steal_s, sum(one.ru_utime + one.ru_stime for one in used)
+        return total_s, busy_s, steal_s, own_cpu_s() + own_cpu_s(children=True)
 
 
-def _share(name: str, share: float, doubtful: float) -> Row:
-    doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
-    return Row(name, 100 * share, "% of all cores", note=doubt)
+def own_cpu_s(*, children: bool = False) -> float:
+    """Return the CPU time of this process, or of its children that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN if children else resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """A benchmark of the command line.
-
-    Args:
-        name: name of its file.
-        title: title of its table.
-        measure: runs it and returns its rows.
-        add_arguments: declares its own options.
-    """
-
-    name: str
-    title: str
-    measure: Callable[[argparse.Namespace], list[Row]]
-    add_arguments: Callable[[argparse.ArgumentParser], None] = lambda parser: None
-
-
-median = statistics.median
 Figures = Mapping[str, float]
 """The figures of one side in one round, by quantity."""
 
@@ -177,18 +194,10 @@ class Rounds:
         self, name: str, unit: str, quantity: str, ours: str, peer: str | None = None,
         goal: Goal | None = None, *, note: str | None = None, paired: bool = False,
     ) -> Row:  # fmt: skip
-        """Return the row of a quantity: the medians of both sides.
+        """Return the row of a quantity: the medians of our side and of the alternative's.
 
-        Args:
-            name: what was measured.
-            unit: its unit.
-            quantity: key of the figures.
-            ours: our side.
-            peer: the alternative's side.
-            goal: see :class:`Row`.
-            note: for the reader.
-            paired: use the median of the rounds' ratios, since a disturbance affects both sides of
-                a round; False: the ratio of the medians.
+        With ``paired``, the ratio is the median of the rounds' ratios, since a disturbance affects
+        both sides of a round; else it is the ratio of the medians.
         """
         sides = [side for side in (ours, peer) if side is not None]
         reasons = [f"{side}: {self.missing[side]}" for side in sides if side in self.missing]
@@ -214,15 +223,7 @@ def compared(
 ) -> Row:  # fmt: skip
     """Measure our side and the alternative in turn; the ratio is the median of the rounds' ratios.
 
-    Args:
-        name: what is measured.
-        unit: its unit.
-        ours: our side.
-        peer: name and side of the alternative; or its figure, if it is known.
-        goal: see :class:`Row`.
-        note: for the reader.
-        unjudged: see :class:`Row`.
-        rounds: number of rounds.
+    The alternative may also be a known figure.
     """
     say(name)
     if not isinstance(peer, tuple) or isinstance(peer, Peer):
@@ -260,21 +261,18 @@ def table_of(title: str, rows: Sequence[Row]) -> Table:
     for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
         right = heading in ("value", "its value", "ratio", "goal")
         table.add_column(heading, justify="right" if right else "left")
+    colours = {"yes": "[green]yes[/]", "no": "[bold red]no[/]"}
     for row in rows:
-        goal = "" if row.goal is None else str(row.goal)
-        holds = {True: "[green]yes[/]", False: "[bold red]no[/]", None: "?" if goal else ""}
-        table.add_row(
-            row.name, f"{number_text(row.value)} {row.unit}",
-            "" if row.peer is None else row.peer.name,
-            "" if row.peer is None else f"{number_text(row.peer.value)} {row.unit}",
-            "" if row.ratio is None else number_text(row.ratio),
-            goal, holds[row.holds],
-        )  # fmt: skip
+        *cells, verdict = row.cells
+        table.add_row(*cells, colours.get(verdict, verdict))
     return table
 
 
-def number_text(value: float | None) -> str:
-    """Return a figure with four digits; a dash for None."""
-    if value is None:
-        return "-"
+def number_text(value: float) -> str:
+    """Return a figure with four digits."""
     return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
+
+
+def with_unit(value: float | None, unit: str) -> str:
+    """Return a figure with its unit; a dash for None."""
+    return "-" if value is None else f"{number_text(value)} {unit}".strip()
