@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.studies.campaign.campaign_file import Campaign, Claim, Term, label_of
@@ -218,7 +219,7 @@ def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
     return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)), claims)
 
 
-def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
+def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], NDArray[np.generic]]:
     """Return all metrics of the runs at a grid point, and the status of each run."""
     columns = store.columns(point.number, store.row_type.names or ())
     return measured(columns, point.certified_error), columns["status"]

@@ -377,7 +377,7 @@ class DesignResult:
     def _row(self, trial: Trial) -> dict[str, object]:
         number, alpha_per_s, beta = trial.candidate
         family = self.space.families[number]
-        chosen = {"gain": family.gain, "weight": family.weight}
+        chosen: dict[str, object] = {"gain": family.gain, "weight": family.weight}
         return chosen | {"alpha_per_s": alpha_per_s, "beta": beta} | trial.measured._asdict()
 
 
