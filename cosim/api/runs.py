@@ -289,7 +289,7 @@ class Run:
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        from cosim.output.run_figures import page_figures
+        from cosim.output.network_figures import page_figures
 
         return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 

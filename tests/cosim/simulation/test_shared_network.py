@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
+from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
@@ -125,8 +126,10 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
     found = replay(shared.network)
     assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
+    machines = SharedMachines(shared.loops)
     for record in shared.loops:
-        found = replay(record)
+        found = replay(record, machines)
+        assert found == replay(record)
         assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
         assert all(hop.compared > 20 for hop in found.messages)
     packets = shared.network[NETEM_PACKET].copy()
@@ -136,7 +139,9 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     head = bytearray(packets["head"][3].tobytes())
     head[6] = 1  # the number of another loop
     packets["head"][3] = bytes(head)
-    found = replay(changed(shared.loops[2], {NETEM_PACKET: packets}))
+    other = changed(shared.loops[2], {NETEM_PACKET: packets})
+    found = replay(other)
+    assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
 

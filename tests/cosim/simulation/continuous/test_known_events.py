@@ -1,6 +1,6 @@
 """Policies in continuous time: known events, and published bounds.
 
-Each event of every policy is checked by an integrator in ../batch/test_policies.py.
+Each event of every policy is checked by an integrator in ../batch/test_exact_events.py.
 """
 
 import math
@@ -24,7 +24,6 @@ from tests.trigger_rules import (
     mixed_rule,
     quadratic_rule,
     self_triggered_rule,
-    with_dwell_time,
 )
 
 Vector = NDArray[np.float64]
@@ -56,22 +55,6 @@ def run_of(policy: TriggerRule, *, zoh: bool, lost: int, horizon_s: float = 6.0)
         ContinuousLoop(loop, policy), horizon_s=horizon_s, known_start=True,
         delivered=lambda event: event % (lost + 1) == lost, max_events=5000,
     )  # fmt: skip
-
-
-def test_an_envelope_is_not_exceeded_between_dwell_time_and_event() -> None:
-    """V(x) = xᵀPx ≤ V(x_k) e^{−ρ(t−t_k)}, sampled densely, under losses."""
-    policy = with_dwell_time(lyapunov_rule(np.linalg.cholesky(P).T, 0.2), 20 * MS)
-    run = run_of(policy, zoh=True, lost=1, horizon_s=4.0)
-    compared = 0
-    for state, end_s in zip([run.start, *run.after], [*run.event_s, run.horizon_s], strict=True):
-        if end_s < state.t_s + 0.02 + 1e-9:  # the event followed at the end of the dwell time
-            continue
-        t_s = np.linspace(state.t_s + 0.02, end_s, 50)[1:-1]
-        envelope = state.x @ P @ state.x * np.exp(-0.2 * (t_s - state.t_s))
-        x = run.system.sample(state, t_s).x
-        assert (np.einsum("ij,jk,ik->i", x, P, x) <= envelope * (1 + 2e-9) + 1e-24).all()
-        compared += len(t_s)
-    assert compared > 300
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.2])

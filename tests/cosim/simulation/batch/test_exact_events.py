@@ -1,7 +1,6 @@
 """Batches under every policy against single runs, whose events an integrator confirms."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,7 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
-from noack.trigger.trigger_rule import Forecast, TriggerRule
+from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import (
     check_events,
     check_independence,
@@ -31,91 +30,18 @@ from tests.cosim.simulation.batch.exact import (
     reference,
 )
 from tests.trigger_rules import (
+    TABLES,
     absolute_rule,
-    area_rule,
     decaying_rule,
-    dynamic_rule,
-    lyapunov_rule,
     mixed_rule,
     periodic_rule,
     quadratic_rule,
-    self_triggered_rule,
-    with_deadline,
-    with_dwell_time,
+    random_rule,
 )
 
-Make = Callable[[np.random.Generator, int, Matrix | None], TriggerRule]
 MS = 10**6
-
-
-def mixed(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    return mixed_rule(0.05, rng.uniform(0.003, 0.05), W, n)
-
-
-def decaying(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    return decaying_rule(0.2, 0.5, rng.choice([0.0, 0.1, 1.0]), W, n)
-
-
-def lyapunov(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    return lyapunov_rule(np.eye(n) + 0.1 * rng.uniform(-1, 1, (n, n)), 1.2, W)
-
-
-def dynamic(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    L = np.eye(n) + 0.3 * rng.uniform(-1, 1, (n, n))
-    theta_s, decay_per_s = rng.choice([0.01, 0.5]), rng.choice([0.0, 1.0, 30.0])
-    BK = 3 * rng.uniform(-1, 1, (n, n))
-    return dynamic_rule(
-        0.1, theta_s, decay_per_s, L.T @ L, np.eye(n), BK, rng.choice([0.0, 0.05]), W
-    )
-
-
-def quadratic(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    apart = 0.05 * rng.uniform(-1, 1, (2 * n, 2 * n))
-    Q = np.diag([-0.02] * n + [1.0] * n) + apart + apart.T
-    period_ns, heartbeat = int(rng.choice([100 * MS, 7 * MS, 1])), int(rng.choice([0, 6]))
-    if period_ns == 1:
-        period_ns, heartbeat = 33 * MS, 0
-    return quadratic_rule(Q, period_ns, rng.choice([0.0, 0.01]), heartbeat, W)
-
-
-def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> TriggerRule:
-    growth_per_s = rng.choice([0.0, 2.0])
-    return self_triggered_rule(
-        Forecast(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1), 10 * MS, 1000 * MS, W, n
-    )
-
-
-POLICIES: dict[str, Make] = {
-    "absolute": lambda rng, n, W: absolute_rule(0.01, W, n),
-    "relative": lambda rng, n, W: mixed_rule(rng.uniform(0.01, 0.05), 0.0, W, n),
-    "mixed": mixed,
-    "send_on_area": lambda rng, n, W: area_rule(0.01, W, n),
-    "dwell of send_on_area": lambda rng, n, W: with_dwell_time(area_rule(0.01, W, n), 120 * MS),
-    "lyapunov": lyapunov,
-    "dynamic": dynamic,
-    "quadratic": quadratic,
-    "periodic": lambda rng, n, W: periodic_rule(100 * MS, W, n),
-    "self_triggered": self_triggered,
-    "deadline of decaying": lambda *given: with_deadline(decaying(*given), 300 * MS),
-    "deadline of mixed": lambda *given: with_deadline(mixed(*given), 300 * MS),
-    "dwell of decaying": lambda *given: with_dwell_time(decaying(*given), 100 * MS),
-    "dwell of lyapunov": lambda *given: with_dwell_time(lyapunov(*given), 100 * MS),
-    "dwell of dynamic": lambda *given: with_dwell_time(dynamic(*given), 100 * MS),
-    "dwell of quadratic": lambda *given: with_dwell_time(quadratic(*given), 15 * MS + 3),
-    "dwell of deadline of self_triggered": lambda *given: with_dwell_time(
-        with_deadline(self_triggered(*given), 200 * MS), 50 * MS
-    ),
-    "deadline within a dwell": lambda *given: with_deadline(
-        with_dwell_time(dynamic(*given), 300 * MS), 100 * MS
-    ),
-}
-NORM_OR_TIME = (
-    "absolute", "periodic", "self_triggered", "deadline of decaying", "dwell of decaying",
-    "dwell of deadline of self_triggered",
-)  # fmt: skip
-"""Policies that run in the same compiled code as the paper's policy."""
-SIZES = {True: (4, 2), False: (2, 1)}
-"""Numbers of states and inputs for these and for the other policies: each is compiled anew."""
+SIZES = ((4, 2), (2, 1))
+"""Numbers of states and inputs."""
 MOST_EVENTS = 500
 
 
@@ -124,11 +50,9 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     made = []
     for seed in seeds:
         rng = np.random.default_rng([seed, *name.encode()])
-        n, m = SIZES[name in (*NORM_OR_TIME, "decaying")]
+        n, m = SIZES[seed % 2]
         setting = random_setting(rng, n, m)
-        policy = setting.trigger
-        if name != "decaying":
-            policy = POLICIES[name](rng, n, setting.trigger.weight)
+        policy = random_rule(name, rng, n, setting.trigger.weight)
         if name == "lyapunov":  # After a lost update, the next event follows at once.
             setting = replace(setting, link=LinkSettings(), H=0.3 * setting.H - 0.7 * np.eye(n))
         population = random_population(rng, setting, 2)
@@ -136,7 +60,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     return made
 
 
-@pytest.mark.parametrize("name", ["decaying", *POLICIES])
+@pytest.mark.parametrize("name", TABLES)
 def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -> None:
     events = finished = 0
     for setting, population in settings(name, range(12 if name in ("lyapunov", "decaying") else 4)):

@@ -1,4 +1,4 @@
-"""The DC motor against its published transfer function; stiction against another solver."""
+"""Plants by their physical laws, published numbers and other solvers; bit-exact repetition."""
 
 import math
 from typing import Any
@@ -8,7 +8,10 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
+from noack.plants.cart_pole import CartPoleSettings
 from noack.plants.dc_motor import DcMotor, DcMotorSettings
+from noack.plants.plant_settings import OdeSystem, PlantEquations
+from noack.plants.systems.plant_linearisation import linearise
 from tests.noack.plants.motion import H_NS, motion
 
 INDUCTANCES = (2.75e-6, 1e-3, 0.5)
@@ -91,17 +94,82 @@ def test_the_shaft_sticks_exactly_up_to_the_coulomb_torque() -> None:
         assert (motion(motor, [factor * limit_v] * 50)[-1, 0] > 0.0) == moves
 
 
-def test_energy_is_conserved() -> None:
-    """∫Vi dt = ∫(Ri² + bω²) dt + T_c|θ| + ½Li² + ½Jω², for a shaft that turns one way."""
-    motor = settings(inductance_h=1e-3, coulomb_friction_n_m=1e-3)
-    voltage, step_ns = 2.0, 10_000
-    angle, speed, current = motion(DcMotor(motor, np.zeros(3)), [voltage] * 4000, step_ns).T
-    dx = step_ns * 1e-9
-    supplied = np.trapezoid(voltage * current, dx=dx)
-    losses = np.trapezoid(4.0 * current**2 + motor.friction_n_m_s * speed**2, dx=dx)
-    stored = 0.5 * (1e-3 * current[-1] ** 2 + motor.inertia_kg_m2 * speed[-1] ** 2)
-    assert supplied == pytest.approx(losses + 1e-3 * angle[-1] + stored, rel=1e-4)
-
-
 def test_a_non_finite_state_stays_non_finite() -> None:
     assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
+
+
+def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
+    _, v, angle, rate = x.tolist()
+    m, length = settings.pole_kg, settings.length_m
+    along, up = v + length * rate * math.cos(angle), -length * rate * math.sin(angle)
+    kinetic = settings.cart_kg * v**2 + m * (along**2 + up**2) + settings.inertia_kg_m2 * rate**2
+    return 0.5 * kinetic + m * settings.gravity_m_per_s2 * length * math.cos(angle)
+
+
+def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
+    settings = CartPoleSettings(kind="cart_pole", friction_n_s_per_m=0.0)
+    states = motion(OdeSystem(settings.equations(), np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 500)
+    assert np.ptp(states[:, 2]) > 1.0  # it has fallen
+    energies = [energy(settings, x) for x in states]
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-7)
+    total, moment = settings.cart_kg + settings.pole_kg, settings.pole_kg * settings.length_m
+    momentum = total * states[:, 1] + moment * states[:, 3] * np.cos(states[:, 2])
+    np.testing.assert_allclose(momentum, momentum[0], atol=1e-8)
+
+
+def test_energy_changes_by_the_work_of_force_and_friction() -> None:
+    settings = CartPoleSettings(kind="cart_pole")
+    force, h_ns = 0.7, 500_000
+    states = motion(
+        OdeSystem(settings.equations(), np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns
+    )
+    power = force * states[:, 1] - settings.friction_n_s_per_m * states[:, 1] ** 2
+    work = np.trapezoid(power, dx=h_ns * 1e-9)
+    gained = energy(settings, states[-1]) - energy(settings, states[0])
+    assert gained == pytest.approx(work, rel=1e-5)
+
+
+def test_its_linearisation_has_the_poles_of_the_literature() -> None:
+    """Open-loop poles by the Control Tutorials (MATLAB): 0, -0.1428, -5.6041, 5.5651."""
+    A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
+    poles = np.sort(np.linalg.eigvals(A).real)
+    np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
+    np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
+
+
+def test_the_integration_agrees_with_another_solver() -> None:
+    def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
+
+    system = OdeSystem(PlantEquations(pendulum), np.array([2.0, 0.0]))
+    states = motion(system, [0.5] * 500, 20_000_000)
+    exact = solve_ivp(
+        lambda t, z: pendulum(t, z, np.array([0.5])), (0, 10), [2.0, 0.0],
+        method="DOP853", rtol=1e-13, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(states[-1], exact.y[:, -1], atol=1e-6)
+
+
+def test_the_state_is_nan_after_it_has_escaped() -> None:
+    """ż = z² from 1 is infinite at 1 s."""
+
+    def escaping(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        return (float(z[0]) ** 2,)
+
+    system = OdeSystem(PlantEquations(escaping), np.array([1.0]))
+    states = motion(system, [0.0] * 20, 100_000_000)
+    assert np.isfinite(states[9]).all()
+    assert np.isnan(states[12:]).all()
+
+
+def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:
+    def broken(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        if t > 0.003:
+            raise [OverflowError, KeyError][int(v[0])]("far")
+        return (1.0,)
+
+    states = motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [0.0, 0.0])
+    assert states[1] == pytest.approx([0.002])
+    assert np.isnan(states[2]).all()
+    with pytest.raises(KeyError, match="far"):
+        motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [1.0, 1.0])
