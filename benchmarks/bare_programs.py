@@ -28,7 +28,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.doctor.probe import idle_lateness_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.wire_format import Flow, datagram_bytes
 from noack.runtime.real_time_loop import realtime
@@ -98,6 +97,8 @@ def _send(out: socket.socket, count: int, period_s: float) -> None:
 
 
 def _run_loop(count: int, period_ns: int) -> Sequence[int]:
+    from cosim.doctor.probe import idle_lateness_ns  # takes half a second: a flood begins at once
+
     return idle_lateness_ns(period_ns, count * period_ns / NS_PER_S)
 
 
