@@ -50,7 +50,7 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> Non
 
 def test_actuations_are_lost_within_their_guarantee(finished: Finished, record: RunRecord) -> None:
     found, outcomes = (
-        finished.summary["loops"][0]["actuations"],
+        finished.loop["actuations"],
         packet_outcomes(record, Flow.ACTUATION),
     )
     assert found["sent"] == len(record[CONTROLLER_STEP])
@@ -95,8 +95,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
-    assert restarted.summary["loops"][0]["replay"]["bit_exact"]
-    assert {one["process"] for one in restarted.summary["loops"][0]["restarts"]} == set(RESTARTED)
+    assert restarted.loop["replay"]["bit_exact"]
+    assert {one["process"] for one in restarted.loop["restarts"]} == set(RESTARTED)
     record = load_record(restarted.run_dir)
     steps, actuations = record[CONTROLLER_STEP], record[PLANT_ACTUATION]
     # The plant applies inputs of the restarted controller, through the restarted emulator.
@@ -111,11 +111,9 @@ def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) ->
 
 
 def test_claims_of_a_restarted_run_are_judged(restarted: Finished) -> None:
-    found = restarted.summary["loops"][0]["actuations"]
+    found = restarted.loop["actuations"]
     assert found["lost"] > 0.2 * found["sent"]
-    claims = restarted.summary["loops"][0]["claims"]
+    claims = restarted.loop["claims"]
     assert claims
     assert {claim["verdict"] for claim in claims} <= {"held", "void", "not applicable"}
-    assert restarted.summary["loops"][0][
-        "assumption_violations"
-    ]  # e.g. the input of a dead controller was old
+    assert restarted.loop["assumption_violations"]  # e.g. the input of a dead controller was old

@@ -92,11 +92,11 @@ def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(
     finished = watched.finished
     assert finished.status == 130, finished.stderr
     assert finished.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
-    assert finished.summary["loops"][0]["missing_samples"] == 0
-    assert finished.summary["loops"][0]["unintended_losses"] == 0
-    assert finished.summary["loops"][0]["replay"]["bit_exact"]
-    assert finished.summary["loops"][0]["replay"]["complete"]
-    assert finished.summary["loops"][0]["identity_residual_max"] < 1e-11
+    assert finished.loop["missing_samples"] == 0
+    assert finished.loop["unintended_losses"] == 0
+    assert finished.loop["replay"]["bit_exact"]
+    assert finished.loop["replay"]["complete"]
+    assert finished.loop["identity_residual_max"] < 1e-11
     assert set(watched.ended.values()) == {(1, "stopped by the user (SIGINT)")}
     steps = load_record(finished.run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(len(steps)))

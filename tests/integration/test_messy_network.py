@@ -79,8 +79,8 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(
 
 
 def test_acknowledgements_are_counted_by_outcome(finished: Finished, record: RunRecord) -> None:
-    found = finished.summary["loops"][0]["acknowledgements"]
-    assert found["sent"] == finished.summary["loops"][0]["deliveries"] > 10
+    found = finished.loop["acknowledgements"]
+    assert found["sent"] == finished.loop["deliveries"] > 10
     assert found["lost"] > 3
     assert found["received"] > 3
     assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
@@ -134,7 +134,7 @@ def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     packets, taken = record[NETEM_PACKET], record[CONTROLLER_DELIVERY]
     updates = packets[packets["flow"] == UPDATES]
     forwarded = int((updates["release_ns"] >= 0).sum() + (updates["copy_ns"] >= 0).sum())
-    rejected = finished.summary["loops"][0]["rejected_datagrams"]["controller"]
+    rejected = finished.loop["rejected_datagrams"]["controller"]
     assert rejected["stale"] > 0
     assert forwarded == len(taken) + sum(rejected.values())
     sent = [read_header(head.tobytes()).sequence for head in updates["head"]]
@@ -142,7 +142,7 @@ def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     ends = np.concatenate([[-1], taken["sequence"], [len(sent)]])
     assert np.diff(ends).max() - 1 <= MANSD
     assert taken["dropouts"].max() == np.diff(ends[:-1]).max() - 1
-    assert finished.summary["loops"][0]["longest_loss_burst"] <= MANSD
-    causes = finished.summary["loops"][0]["drops_by_cause"]
+    assert finished.loop["longest_loss_burst"] <= MANSD
+    causes = finished.loop["drops_by_cause"]
     assert {"dropped", "corrupted"} <= set(causes)
-    assert sum(causes.values()) == finished.summary["loops"][0]["drops"]
+    assert sum(causes.values()) == finished.loop["drops"]

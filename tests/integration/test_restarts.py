@@ -91,7 +91,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
 def test_the_run_continues_and_lists_its_restarts(restarted: live.Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
-    restarts = {one["process"]: one for one in restarted.summary["loops"][0]["restarts"]}
+    restarts = {one["process"]: one for one in restarted.loop["restarts"]}
     assert restarts.keys() == set(RESTARTED)
     for role, one in restarts.items():
         assert one["generation"] == 1
@@ -109,8 +109,8 @@ def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
 
 
 def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: live.Finished) -> None:
-    assert restarted.summary["loops"][0]["missing_samples"] == 0
-    verdict = restarted.summary["loops"][0]["replay"]
+    assert restarted.loop["missing_samples"] == 0
+    verdict = restarted.loop["replay"]
     assert verdict["bit_exact"], verdict
     record = load_record(restarted.run_dir)
     assert verdict["inputs"] == sum(len(record[table]) for table in record.tables)
@@ -147,7 +147,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
 
 def test_the_loop_converges_again_and_its_identity_holds(restarted: live.Finished) -> None:
     record = load_record(restarted.run_dir)
-    assert restarted.summary["loops"][0]["identity_residual_relative"] < 1e-11
+    assert restarted.loop["identity_residual_relative"] < 1e-11
     joined = align_tables(record)
     away = np.isnan(joined.x_c).any(axis=1)
     known_ns = rows_of_life(record, "controller_delivery", 1)["model_t_ns"][0]

@@ -81,13 +81,13 @@ def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     (loop,) = finished.summary["loops"]
     assert finished.summary.keys() | loop.keys() >= SUMMARY_KEYS
     assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}
-    assert finished.summary["loops"][0]["missing_samples"] == 0
-    assert finished.summary["loops"][0]["unintended_losses"] == 0
-    violations = finished.summary["loops"][0]["assumption_violations"]
+    assert finished.loop["missing_samples"] == 0
+    assert finished.loop["unintended_losses"] == 0
+    violations = finished.loop["assumption_violations"]
     assert "dropouts" not in {one["cause"] for one in violations}  # deadlines may be missed
-    assert finished.summary["loops"][0]["rejected_datagrams"] == {}
+    assert finished.loop["rejected_datagrams"] == {}
     for role in ("plant", "sensor", "controller", "netem"):
-        assert finished.summary["loops"][0]["lateness_us"][role].keys() == {
+        assert finished.loop["lateness_us"][role].keys() == {
             "p50", "p99", "p999", "max", "steps", "late_steps",
         }  # fmt: skip
 
@@ -226,14 +226,14 @@ def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) ->
     assert found.gaps == []
     assert found.inputs == sum(len(live[table]) for table in tables(1, 1))
     assert all(leg.compared == leg.received > 0 for leg in found.messages)
-    assert finished.summary["loops"][0]["replay"] == found.verdict() | {"error": None}
+    assert finished.loop["replay"] == found.verdict() | {"error": None}
     assert finished.summary["kind"] == live.kind == "live"
 
 
 def test_fidelity_explains_the_difference_to_the_ideal_loop(
     finished: Finished,
 ) -> None:
-    fidelity = finished.summary["loops"][0]["fidelity"]
+    fidelity = finished.loop["fidelity"]
     assert fidelity["reason"] is None
     # All effects together explain the run up to rounding: 1e-14 of x, relative to a few per cent.
     assert fidelity["explained_relative"] < 1e-6
@@ -267,13 +267,13 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
 
 def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> None:
     """After missed deadlines, certificates are void and state time and cause."""
-    claims = [c for c in finished.summary["loops"][0]["claims"] if c["source"] in OWN_CLAIMS]
+    claims = [c for c in finished.loop["claims"] if c["source"] in OWN_CLAIMS]
     assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
     for claim in claims:
         assert claim["verdict"] in ("held", "void"), claim
         assert (claim["since_s"] is None) == (claim["verdict"] == "held")
         assert claim["verdict"] == "held" or claim["why"]
-    conditions = finished.summary["loops"][0]["conditions"]
+    conditions = finished.loop["conditions"]
     mansd = finished.summary["mansd"]
     assert 0 < conditions["dropouts"] <= mansd
     assert conditions["delay_s"] >= conditions["sampling_s"] / 2 > 0
