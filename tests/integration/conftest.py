@@ -62,11 +62,6 @@ def starting() -> Iterator[Start]:
             process.communicate()
 
 
-def another_clock(ahead_s: int) -> list[str]:
-    """Return the command that runs another one with a monotonic clock that is ahead."""
-    return ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"]
-
-
 def ended(process: "subprocess.Popen[str]") -> tuple[str, str]:
     """Wait for the end of a process; return what it printed."""
     return process.communicate(timeout=PATIENCE_S)

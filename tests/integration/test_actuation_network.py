@@ -38,10 +38,7 @@ def record(finished: Finished) -> RunRecord:
 
 
 def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> None:
-    summary = finished.summary
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["replay"]["complete"]
-    assert summary["loops"][0]["unintended_losses"] == summary["loops"][0]["missing_samples"] == 0
+    live.assert_complete(finished.loop)
     reports = json.loads((finished.run_dir / "reports.json").read_text())
     roles = {reports[role]["channel"]["local"]: role for role in reports}
     sources = reports["plant"]["channel"]["received_from"]

@@ -27,13 +27,15 @@ ROOMY = "clocks.largest_error_us=1000000"
 """A busy machine gives wide bounds."""
 
 
+def _another_clock(ahead_s: int) -> list[str]:
+    return ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _may_set_clocks() -> None:
     if sys.platform != "linux" or os.geteuid() != 0:
         pytest.skip("only root can make time namespaces")
-    if subprocess.run(
-        [*live.another_clock(1), "true"], capture_output=True, check=False
-    ).returncode:
+    if subprocess.run([*_another_clock(1), "true"], capture_output=True, check=False).returncode:
         pytest.skip("no time namespaces here")
 
 
@@ -92,7 +94,7 @@ class Run:
         if not ahead_s:
             return self._start(role, "--json")
         invited = ("--invitation", self.invitation, "--json")
-        return self._start(role, *invited, before=live.another_clock(ahead_s))
+        return self._start(role, *invited, before=_another_clock(ahead_s))
 
     def forwarder(self) -> Forwarder:
         """Change the invitation, so that requests for the time pass a forwarder."""

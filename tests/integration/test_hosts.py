@@ -49,7 +49,7 @@ def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
         def on(host: int, *arguments: str, ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
             runtime = tmp_path / f"host {host}"
             runtime.mkdir(exist_ok=True)
-            before = hosts.inside(host, *(live.another_clock(ahead_s) if ahead_s else ()))
+            before = hosts.inside(host, monotonic_s=ahead_s)
             return begin(*arguments, before=before, runtime=runtime, cwd=tmp_path, **more)
 
         yield on
