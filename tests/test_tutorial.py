@@ -6,7 +6,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from tests.integration.conftest import wait_for
 
 ROOT = Path(__file__).parents[1]
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -112,10 +112,8 @@ def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> N
         noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         try:
-            while process.poll() is None:
-                if not (folder / "runs/latest/spool").exists():
-                    time.sleep(0.1)
-                    continue
+            wait_for(lambda: (folder / "runs/latest/spool").exists() or process.poll() is not None)
+            while process.poll() is None:  # the run may not have begun
                 done = subprocess.run(
                     [*noack(change), "--run", "runs/latest"],
                     cwd=folder, capture_output=True, text=True, check=False,

@@ -148,7 +148,7 @@ def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> N
 
 
 def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Disturbed) -> None:
-    summary, record = disturbed.finished.summary, disturbed.record
+    record = disturbed.record
     for role in ("plant", "sensor", "controller"):  # netem may have had no packet
         assert disturbed.finished.loop["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
     certified = [
