@@ -13,7 +13,7 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT
 from noack.protocol.wire_format import Flow
 from tests.integration import conftest as live
 from tests.integration.conftest import AT_RATE, Finished, run_scenario
-from tests.integration.test_restarts import KEEPS, goes_on, let_run, spooled
+from tests.integration.test_restarts import kill, let_run
 
 ACTUATION = (
     'network.actuation={mansd=3, loss={model="bernoulli", probability=0.4}, '
@@ -80,11 +80,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         )
         running.wait_started()
         for role in RESTARTED:
-            live.wait_for(lambda role=role: len(spooled(running, KEEPS[role])) > 0)
-            before = live.child_of(running.process, role)
-            assert before is not None
-            before.kill()
-            live.wait_for(lambda role=role: goes_on(running, role))
+            kill(running, role)
         let_run(running, 2)
         running.process.send_signal(signal.SIGINT)
         return running.finish()

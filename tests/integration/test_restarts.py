@@ -50,6 +50,16 @@ def goes_on(running: live.Running, role: str) -> bool:
     return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
+def kill(running: live.Running, role: str) -> None:
+    """Kill a process that has rows on disk; wait until its replacement has, too."""
+    table = KEEPS[role]
+    live.wait_for(lambda: len(spooled(running, table)) > 0)
+    before = live.child_of(running.process, role)
+    assert before is not None
+    before.kill()
+    live.wait_for(lambda: goes_on(running, role))
+
+
 def let_run(running: live.Running, simulated_s: float) -> None:
     def now_ns() -> int:
         return int(spooled(running, "plant_step")["t_ns"].max())
@@ -69,13 +79,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
             *live.settings(realtime__enabled=False, network__mansd=1, trigger__floor=0.02),
         )
         running.wait_started()
-        # Each process has rows on disk before it is killed: its own, or of the recorder's tables.
-        live.wait_for(lambda: all(len(spooled(running, table)) > 0 for table in KEEPS.values()))
         for role in RESTARTED:
-            before = live.child_of(running.process, role)
-            assert before is not None
-            before.kill()
-            live.wait_for(lambda role=role: goes_on(running, role))
+            kill(running, role)
             if role == "recorder":
                 # Unacknowledged rows are sent again. Wait until all of them are on disk before
                 # the next process is killed.
