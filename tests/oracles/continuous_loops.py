@@ -1,7 +1,8 @@
 """Many runs of a loop in continuous time; independent of the project's code.
 
 Between events z = (x, x_s, x_c) follows ż = Fz, from node to node of the grid by the matrix
-exponential, and in a step with an event by its Taylor series; the event is found by bisection.
+exponential, and in a step with an event by its Taylor series; the event is found by dividing the
+step again and again.
 Values just before an event count, too.
 """
 
@@ -13,7 +14,7 @@ from scipy.linalg import expm
 from tests.oracles.lossy_loops import STEPS, Flags, Reals, Steps, System, norms
 
 _ORDER = 16
-_HALVINGS = 50
+_PARTS, _DIVISIONS = 16, 12
 
 
 class ContinuousTrace(NamedTuple):
@@ -46,35 +47,38 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
         system.K @ np.hstack([-eye, none, eye]),
         W @ E @ np.hstack([eye, none, none]),
     ]
+    e_s = signals[0].T
+    rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(one) for one in signals[:-1])])
     leap, step_s = expm(F * system.step_s).T, system.step_s
     z, events = np.tile(system.x0, (len(delivered), 3)), np.zeros(len(delivered), dtype=np.int64)
-    largest, last_s = np.zeros((len(signals), len(z))), np.full(len(z), -np.inf)
-    shortest_s = np.inf
-    running = np.arange(len(z))
+    largest, last_s = np.zeros((len(z), len(signals))), np.full(len(z), -np.inf)
+    shortest_s, running = np.inf, np.arange(len(z))
 
-    def grown(z: Reals, t_s: Reals | float, signal: Reals) -> Reals:
-        return np.asarray(norms(z @ signal.T) * np.exp(system.alpha * t_s))
+    def is_above(error: Reals, t_s: Reals | float) -> Flags:
+        return np.asarray(norms(error) * np.exp(system.alpha * t_s) >= system.beta)
 
-    def note(which: Steps, z: Reals, t_s: Reals | float) -> None:
-        for kind, signal in enumerate(signals):
-            largest[kind, which] = np.maximum(largest[kind, which], grown(z, t_s, signal))
+    def note(which: Steps, t_s: Reals | float) -> None:
+        """Take the state of these runs into account."""
+        sizes = np.sqrt(np.add.reduceat((z[which] @ rows) ** 2, begins, axis=1))
+        grown = (sizes.T * np.exp(system.alpha * t_s)).T
+        largest[which] = np.maximum(largest[which], grown)
 
     for step in range(STEPS):
         following, end_s = z @ leap, (step + 1) * step_s
         begin_s = np.full(len(z), step * step_s)
-        crossing = running[grown(following[running], end_s, signals[0]) >= system.beta]
+        crossing = running[is_above(following[running] @ e_s, end_s)]
         while len(crossing):
             series, low_s = _series(F, z[crossing]), np.zeros(len(crossing))
-            high_s = end_s - begin_s[crossing]
-            for _ in range(_HALVINGS):
-                middle_s = (low_s + high_s) / 2
-                t_s = begin_s[crossing] + middle_s
-                above = grown(_at(series, middle_s), t_s, signals[0]) >= system.beta
-                low_s, high_s = np.where(above, low_s, middle_s), np.where(above, middle_s, high_s)
+            errors = series @ e_s
+            width_s = end_s - begin_s[crossing]
+            for _ in range(_DIVISIONS):
+                width_s = width_s / _PARTS
+                ends_s = low_s + width_s * np.arange(1, _PARTS + 1)[:, None]
+                above = is_above(_at(errors, ends_s), begin_s[crossing] + ends_s)
+                low_s = low_s + width_s * np.argmax(above, axis=0)
             now_s = begin_s[crossing] + low_s
-            begin_s[crossing], before = now_s, _at(series, low_s)
-            note(crossing, before, now_s)
-            z[crossing] = before
+            z[crossing], begin_s[crossing] = _at(series, low_s[None])[0], now_s
+            note(crossing, now_s)
             more = events[crossing] < delivered.shape[1]
             running = np.setdiff1d(running, crossing[~more])
             crossing, now_s = crossing[more], now_s[more]
@@ -84,12 +88,11 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
             received = crossing[delivered[crossing, events[crossing]]]
             z[received, 2 * n :] = z[received, :n]
             events[crossing] += 1
-            following[crossing] = _at(_series(F, z[crossing]), end_s - now_s)
-            above = grown(following[crossing], end_s, signals[0]) >= system.beta
-            crossing = crossing[above]
-        note(running, following[running], end_s)
+            following[crossing] = _at(_series(F, z[crossing]), (end_s - now_s)[None])[0]
+            crossing = crossing[is_above(following[crossing] @ e_s, end_s)]
         z = following
-    return ContinuousTrace(*largest[..., None], float(shortest_s))
+        note(running, end_s)
+    return ContinuousTrace(*largest.T[..., None], float(shortest_s))
 
 
 def _series(F: Reals, z: Reals) -> Reals:
@@ -101,7 +104,8 @@ def _series(F: Reals, z: Reals) -> Reals:
 
 
 def _at(series: Reals, s: Reals) -> Reals:
-    found = series[-1]
+    """The values at times (k, runs), as (k, runs, 3n)."""
+    found = np.broadcast_to(series[-1], (*s.shape, series.shape[2]))
     for coefficients in series[-2::-1]:
-        found = found * s[:, None] + coefficients
+        found = found * s[..., None] + coefficients
     return found

@@ -237,15 +237,16 @@ def simulate(
     synchronised, shortest = np.full(runs, system.known_start), 10**9
     commands: list[tuple[Reals, Flags]] = []
     inputs = np.zeros((STEPS, runs, m))
-    norms_seen, states = np.zeros((STEPS, 5, runs)), np.zeros((STEPS, 2, runs, n))
-    is_event, received = np.zeros((STEPS, runs), bool), np.zeros((STEPS, runs), dtype=np.int64)
+    sensor_error, states = np.zeros((STEPS, runs)), np.zeros((3, STEPS, runs, n))
+    is_event, has_input, has_state = (np.zeros((STEPS, runs), bool) for _ in range(3))
+    received = np.zeros((STEPS, runs), dtype=np.int64)
     for step in range(STEPS):
-        sensor_error, known = norms((x_s - x) @ W), x
+        sensor_error[step], known = norms((x_s - x) @ W), x
         if step % system.sample_steps == 0:
             since = max(step - system.sample_steps, 0)
             known = estimate(step, x, list(inputs[since:step]))
             tested = norms((x_s - known) @ W)
-            sensor_error = np.maximum(sensor_error, tested)
+            sensor_error[step] = np.maximum(sensor_error[step], tested)
             event = tested > threshold[step]
             if rule is not None:
                 event = rule(step, step - last_event, x, x_s - x)
@@ -269,28 +270,29 @@ def simulate(
         synchronised = synchronised | fresh
         is_new = system.hold_steps == 0 or step % system.hold_steps == 0
         commands.append((x_c @ K, synchronised) if is_new else commands[-1])
-        has_input = np.zeros(runs, bool)
         if step >= system.lag:
-            u, has_input = commands[step - system.lag]
-            inputs[step] = u * has_input[:, None]
-        controller_error = np.maximum(norms((x_c - x) @ W), norms((x_c - known) @ W))
-        norms_seen[step] = (
-            sensor_error, controller_error * synchronised, norms(x), norms(x @ W),
-            norms(inputs[step] - x @ K) * has_input,
-        )  # fmt: skip
-        states[step], received[step] = (x, known), newest
+            u, has_input[step] = commands[step - system.lag]
+            inputs[step] = u * has_input[step][:, None]
+        states[:, step], has_state[step], received[step] = (x, known, x_c), synchronised, newest
         push = None if pushes is None else pushes[:, step]
-        following = [one.advance(x, x_c, inputs[step], has_input, push) for one in steps]
+        following = [one.advance(x, x_c, inputs[step], has_input[step], push) for one in steps]
         x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
         x_s, x_c = x_s @ steps[0].model, x_c @ steps[0].model
+    xs, knowns, x_cs = states
+    controller_error = np.maximum(norms((x_cs - xs) @ W), norms((x_cs - knowns) @ W)) * has_state
+    seen = (
+        sensor_error, controller_error, norms(xs), norms(xs @ W),
+        norms(inputs - xs @ K) * has_input,
+    )  # fmt: skip
     return Trace(
-        *norms_seen.transpose(1, 2, 0), shortest * system.step_s, *states.transpose(1, 2, 0, 3),
-        is_event.T, received.T,
+        *(one.T for one in seen), shortest * system.step_s,
+        xs.transpose(1, 0, 2), knowns.transpose(1, 0, 2), is_event.T, received.T,
     )  # fmt: skip
 
 
 def norms(rows: Reals) -> Reals:
-    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    """The norms of vectors along the last axis."""
+    return np.asarray(np.sqrt(np.einsum("...j,...j->...", rows, rows)))
 
 
 class _Propagators:
