@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from tests.pages import PAGES, ROOT, blocks, fill
+from tests.pages import PAGES, ROOT, blocks, fill, target_exists
 
 EXAMPLES = ROOT / "docs/examples"
 FIGURES = {
@@ -58,11 +58,7 @@ def test_every_command_works(
 ) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
     if program == "make":
-        # Running a make target could run this test again: check only that the target exists.
-        done = subprocess.run(
-            ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+        assert target_exists(command)
         return
     assert program == "noack"
     if command in blocks("README.md", "sh")[-1]:
