@@ -41,15 +41,15 @@ LINES = {
     "cosim/interactive": 1600,
     "cosim/lab": 2100,
     "cosim/live": 3550,
-    "cosim/measurement": 2900,
+    "cosim/measurement": 2870,
     "cosim/output": 8400,
     "cosim/record": 3250,
     "cosim/simulation": 1650,
-    "cosim/studies": 6000,
+    "cosim/studies": 5970,
     "plant_server": 450,
     "sensor_node": 400,
     "controller_node": 400,
-    "benchmarks": 5300,
+    "benchmarks": 4600,
     "native": 9550,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
@@ -59,38 +59,37 @@ says why.
 """
 
 MARKS = {
-    "benchmarks": (39, 66, 0),
-    "controller_node": (8, 3, 0),
+    "benchmarks": (40, 57, 0),
+    "controller_node": (0, 3, 0),
     "cosim": (0, 0, 1),
-    "cosim/analysis": (41, 31, 2),
+    "cosim/analysis": (39, 31, 2),
     "cosim/api": (25, 6, 50),
     "cosim/cli": (32, 45, 176),
     "cosim/doctor": (4, 3, 0),
-    "cosim/interactive": (23, 20, 0),
-    "cosim/lab": (30, 20, 14),
-    "cosim/live": (18, 11, 10),
-    "cosim/measurement": (17, 17, 0),
-    "cosim/output": (68, 65, 5),
-    "cosim/record": (34, 5, 3),
-    "cosim/simulation": (18, 16, 0),
-    "cosim/studies": (67, 51, 6),
+    "cosim/interactive": (23, 18, 0),
+    "cosim/lab": (29, 18, 7),
+    "cosim/live": (16, 11, 10),
+    "cosim/measurement": (6, 12, 0),
+    "cosim/output": (63, 45, 5),
+    "cosim/record": (16, 5, 3),
+    "cosim/simulation": (17, 14, 0),
+    "cosim/studies": (43, 30, 6),
     "netem": (64, 50, 4),
     "noack": (0, 1, 1),
-    "noack/config": (97, 11, 0),
-    "noack/core": (34, 2, 2),
-    "noack/disturbances": (2, 0, 0),
+    "noack/config": (21, 7, 0),
+    "noack/core": (35, 2, 2),
     "noack/impairments": (24, 9, 3),
     "noack/machines": (16, 1, 0),
-    "noack/observers": (7, 4, 0),
-    "noack/plants": (75, 7, 5),
+    "noack/observers": (0, 3, 0),
+    "noack/plants": (26, 6, 0),
     "noack/protocol": (9, 4, 1),
     "noack/runtime": (28, 11, 3),
-    "noack/settings": (10, 0, 0),
-    "noack/theory": (15, 22, 8),
+    "noack/settings": (7, 0, 0),
+    "noack/theory": (15, 20, 2),
     "noack/traces": (8, 6, 0),
-    "noack/trigger": (8, 6, 1),
-    "plant_server": (9, 8, 0),
-    "sensor_node": (11, 7, 0),
+    "noack/trigger": (4, 5, 0),
+    "plant_server": (2, 5, 0),
+    "sensor_node": (0, 7, 0),
 }
 """Largest numbers of lines with ``Any``, of lines with ``# fmt:``, and of imports in functions
 without a reason in a comment on their line or the one before, of each folder.
@@ -99,12 +98,10 @@ Lower a folder's numbers when it has less.
 """
 CIRCLES = {"cosim.api", "cosim.record"}
 """Folders whose modules still import each other in a circle."""
-LONG_FUNCTIONS = {
-    "campaign", "capacity", "design", "launch", "measure", "simulate_continuous", "states_figure",
-}  # fmt: skip
+LONG_FUNCTIONS = {"campaign", "capacity", "design", "launch", "measure"}
 """Functions that may have more than 60 lines."""
 MOST_FILES = 15
-FILES = {"benchmarks": 40, "cosim/output": 17, "noack/runtime": 19, "noack/trigger": 17}
+FILES = {"cosim/output": 17, "noack/runtime": 19, "noack/trigger": 17}
 """Largest numbers of modules of folders that have more; a policy of noack/trigger is a file."""
 
 

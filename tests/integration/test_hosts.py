@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks._report import MeasurementError
-from benchmarks._two_hosts import TwoHosts, two_hosts
+from benchmarks.programs import TwoHosts, two_hosts
+from benchmarks.report import MeasurementError
 from cosim.cli import app
 from cosim.record.run_record import load_record, load_run
 from noack.config.scenario import phases_ns
