@@ -107,6 +107,9 @@ setup: $(VENV)/.installed ## Create the environment in .venv (the other targets 
 
 setup-dev: $(VENV)/.installed-dev
 
+ifneq (,$(filter test,$(MAKECMDGOALS)))
+MAKEFLAGS += --jobs=2 # what is checked does not wait for what is tested
+endif
 test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 
 pytest: setup-dev

@@ -6,6 +6,7 @@ new examples per test.
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,6 +16,13 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
+
+# The workers and the programs that tests start import the same modules hundreds of times.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+FIRST = ("tests/integration/", "tests/native/", "tests/cosim/lab/")
+"""Of these folders some files take minutes, and a worker runs whole files."""
 
 settings.register_profile(
     "noack",
@@ -34,8 +42,8 @@ settings.load_profile("noack")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    # Live runs wait most: with several workers they begin first.
-    items.sort(key=lambda item: not item.nodeid.startswith("tests/integration/"))
+    # With several workers, what waits or takes minutes begins first.
+    items.sort(key=lambda item: not item.nodeid.startswith(FIRST))
     if settings().derandomize:
         # Hypothesis would also try constants of the loaded modules, which depend on the tests that
         # this worker has run before.

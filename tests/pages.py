@@ -1,6 +1,7 @@
 """The documentation's pages, and a folder in which their commands and snippets can run."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +15,20 @@ PAGES = (
 )  # fmt: skip
 
 
+def fences(page: str) -> list[tuple[str, str]]:
+    """Language and content of the fenced blocks of a page, in order."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
 def blocks(page: str, language: str) -> list[str]:
-    text = (ROOT / page).read_text()
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [content for of, content in fences(page) if of == language]
+
+
+def target_exists(command: str) -> bool:
+    """Whether make knows the target of a command; running it could run the tests again."""
+    dry = ["make", "--dry-run", *shlex.split(command)[1:]]
+    return subprocess.run(dry, cwd=ROOT, capture_output=True, check=False).returncode == 0
 
 
 def fill(folder: Path) -> Path:

@@ -16,8 +16,8 @@ from cosim.cli import app
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import Parser
 from noack.runtime.run_process import add_options
+from tests.pages import ROOT
 
-ROOT = Path(__file__).parents[1]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, Any] = COMPOSE["services"]
 

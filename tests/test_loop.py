@@ -197,18 +197,6 @@ def test_no_process_of_the_ordinary_loop_accepts_acknowledgements() -> None:
         assert ear.rejected[Rejection.LENGTH] == 1
 
 
-@given(cases())
-def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> None:
-    record = case.run()
-    deliveries = record[CONTROLLER_DELIVERY]
-    sequences = [NO_SEQUENCE, *(int(row["sequence"]) for row in deliveries)]
-    assert all(late < early for late, early in itertools.pairwise(sequences))
-    assert [int(row["dropouts"]) for row in deliveries] == [
-        after - before - 1 for before, after in itertools.pairwise(sequences)
-    ]
-    assert {*record.reports["controller"]["channel"]["rejected"]} <= {Rejection.STALE.value}
-
-
 def papers_example(mode: str) -> RunRecord:
     path = Path(__file__).parents[1] / "scenarios" / "lane_following.toml"
     return simulate(resolve(load(path, [f"mode={mode}"])))

@@ -10,8 +10,7 @@ from PIL import Image, ImageStat
 from typer.main import get_command
 
 from cosim.cli import app
-
-ROOT = Path(__file__).parents[1]
+from tests.pages import ROOT
 
 
 @pytest.fixture(scope="module")

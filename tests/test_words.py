@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from cosim.output.glossary import as_markdown
+from tests.pages import ROOT
 
-ROOT = Path(__file__).parents[1]
 PHRASES = (
     "lost that nobody ordered", "lost outside the emulator", "in the long run, at most",
     "unexplained, RMS", "what this run says of them", "look at it", "the trigger watches",

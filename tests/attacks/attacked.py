@@ -4,15 +4,15 @@ import json
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import psutil
 
@@ -31,8 +31,8 @@ from noack.runtime.address import LOOPBACK
 from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
 from tests.attacks.sender import Plan, Sent, carry_out
+from tests.integration.conftest import PATIENCE_S, starting, wait_for
 
-PATIENCE_S = 300.0
 AWAY = "controller"
 """The process on the second host."""
 _ATTEMPTS = 3
@@ -78,19 +78,21 @@ def may_forge_addresses() -> bool:
 
 
 class Run:
-    """An active run, started one process at a time; the context's end kills what remains."""
+    """An active run, started one process at a time; ``stack`` ends what remains."""
 
-    def __init__(self, folder: Path, hosts: TwoHosts | None, *arguments: str) -> None:
+    def __init__(
+        self, stack: ExitStack, folder: Path, hosts: TwoHosts | None, *arguments: str
+    ) -> None:
         self._folder, self._hosts = folder, hosts
+        self._begin = stack.enter_context(starting())
         invitation = str(folder / "invitation.json")
-        listen = (
-            () if hosts is None
+        network = (
+            ("--set", "ports={}") if hosts is None
             else ("--listen", _addresses(hosts)[0], "--invitation", invitation)
         )  # fmt: skip
-        free_ports = ("--set", "ports={}") if hosts is None else ()
         self._recording = self._start(
             0, "record", "lane_following", "--runs", str(folder / "runs"), "--no-report",
-            *free_ports, *listen, *arguments,
+            *network, *arguments,
         )  # fmt: skip
         self.processes = {
             role: self._start(1, role, "--invitation", invitation)
@@ -99,21 +101,9 @@ class Run:
             for role in LOOP_ROLES
         }
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in (self._recording, *self.processes.values()):
-            process.kill()
-            process.communicate()
-
     def _start(self, host: int, *command: str) -> "subprocess.Popen[str]":
-        words = [sys.executable, "-m", "cosim.cli", *command, "--json"]
-        return subprocess.Popen(
-            words if self._hosts is None else self._hosts.inside(host, *words), text=True,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(self._folder)},
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+        before = () if self._hosts is None else self._hosts.inside(host)
+        return self._begin(*command, "--json", before=before, runtime=self._folder)
 
     def targets(self) -> list[Target]:
         """Wait until the loop runs; return its processes with their ports."""
@@ -152,12 +142,9 @@ class Run:
         self._wait(path.exists)
         return loads(path.read_text())
 
-    def _wait(self, condition: Any) -> None:
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert self._recording.poll() is None, self._recording.communicate()
-            assert time.monotonic() < deadline_s, "waited in vain"
-            time.sleep(0.02)
+    def _wait(self, condition: Callable[[], bool]) -> None:
+        wait_for(lambda: condition() or self._recording.poll() is not None)
+        assert self._recording.poll() is None, self._recording.communicate()
 
 
 def attack(
@@ -188,7 +175,8 @@ def attack(
             (folder / str(attempt)).mkdir()
             horizon_s = 3**attempt * speed * (1.5 * sending_s + 7.0)
             options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
-            with Run(folder / str(attempt), hosts, *options) as run:
+            with ExitStack() as stack:
+                run = Run(stack, folder / str(attempt), hosts, *options)
                 targets = run.targets()
                 until_s = time.monotonic() + 1.5 * sending_s + 3.0
                 namespace = None if hosts is None else hosts.names[1]
@@ -203,14 +191,15 @@ def attack(
 
 def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[str]"]) -> bool:
     """Wait until the processes have read what was sent; whether none has ended before."""
-    while True:
-        try:
-            waiting_bytes = [unread_bytes(processes[one.role].pid)[one.port] for one in targets]
-        except (FileNotFoundError, KeyError):
-            return False
-        if not any(waiting_bytes):
-            return True
-        time.sleep(0.02)
+
+    def all_read() -> bool:
+        return not any(unread_bytes(processes[one.role].pid)[one.port] for one in targets)
+
+    try:
+        wait_for(all_read)
+    except (FileNotFoundError, KeyError):
+        return False
+    return True
 
 
 def unread_bytes(pid: int) -> dict[int, int]:

@@ -134,7 +134,8 @@ def test_a_command_follows_no_planted_name(
     assert invoke() == 0
     names = [one.relative_to(shared) for one in shared.rglob("*") if one.is_file()]
     assert names
-    for plant in PLANTS:
+    # A FIFO or a folder ends a command at the first name; two commands show that.
+    for plant in PLANTS if command.startswith("certify") else (symbolic_link, hard_link):
         shutil.rmtree(shared)
         shared.mkdir()
         planted(plant, shared, names, private)

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,56 @@ BARE = (*EPHEMERAL, "--no-report")
 PATIENCE_S = 300.0
 
 
-def noack_command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "cosim.cli", *arguments]
+def noack_command(*arguments: str, impatient: bool = False) -> list[str]:
+    module = "tests.integration.impatient" if impatient else "cosim.cli"
+    return [sys.executable, "-m", module, *arguments]
+
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@contextmanager
+def starting() -> Iterator[Start]:
+    """Start commands of noack; what still runs at the end is killed, with its children."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(
+        *arguments: object,
+        runtime: Path | None = None,
+        before: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+        impatient: bool = False,
+        cwd: Path | None = None,
+    ) -> subprocess.Popen[str]:
+        command = noack_command(*map(str, arguments), impatient=impatient)
+        own = {} if runtime is None else {"XDG_RUNTIME_DIR": str(runtime)}
+        started.append(subprocess.Popen(
+            [*before, *command], text=True, cwd=cwd, env=os.environ | own | (environment or {}),
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        ))  # fmt: skip
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            if process.poll() is None:
+                for child in psutil.Process(process.pid).children(recursive=True):
+                    child.kill()
+                process.kill()
+            process.communicate()
+
+
+def ended(process: "subprocess.Popen[str]") -> tuple[str, str]:
+    """Wait for the end of a process; return what it printed."""
+    return process.communicate(timeout=PATIENCE_S)
+
+
+def assert_complete(loop: Mapping[str, Any]) -> None:
+    """Check a loop's summary: all samples, no unintended loss, and a replay with the same bits."""
+    assert loop["missing_samples"] == loop["unintended_losses"] == 0
+    assert loop["replay"]["bit_exact"], loop["replay"]
+    assert loop["replay"]["complete"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +80,12 @@ class Finished:
     summary: dict[str, Any]
     stderr: str
     run_dir: Path
+
+    @property
+    def loop(self) -> dict[str, Any]:
+        """The summary of the run's first loop."""
+        loop: dict[str, Any] = self.summary["loops"][0]
+        return loop
 
 
 def settings(**values: object) -> list[str]:
@@ -153,53 +207,20 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
 @contextmanager
 def begun(folder: Path) -> Iterator[Callable[..., Running]]:
     """Do the same as ``start``, for fixtures of a module."""
-    started: list[Running] = []
+    with starting() as start:
 
-    def begin(*arguments: str, command: tuple[str, ...] = ("run", "lane_following")) -> Running:
-        process = subprocess.Popen(
-            noack_command(*command, "--json", "--runs", str(folder / "runs"), *BARE, *arguments),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-        )
-        running = Running(folder / "runs", process)
-        started.append(running)
-        return running
+        def begin(
+            *arguments: str, command: tuple[str, ...] = ("run", "lane_following"), **more: Any
+        ) -> Running:
+            runs = folder / "runs"
+            common = ("--json", "--runs", runs, *BARE)
+            return Running(runs, start(*command, *common, *arguments, runtime=folder, **more))
 
-    try:
         yield begin
-    finally:
-        for running in started:
-            if running.process.poll() is None:
-                for child in psutil.Process(running.process.pid).children(recursive=True):
-                    child.kill()
-                running.process.kill()
-            running.process.communicate()
 
 
 @pytest.fixture
 def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
     """Start one process by hand; kill remaining processes at the end."""
-    started: list[subprocess.Popen[str]] = []
-
-    def begin(role: str) -> subprocess.Popen[str]:
-        started.append(_start_by_hand(role, tmp_path))
-        return started[-1]
-
-    yield begin
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-
-
-def _start_by_hand(role: str, tmp_path: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        noack_command(role, "--json"),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
-    )
+    with starting() as start:
+        yield lambda role: start(role, "--json", runtime=tmp_path)

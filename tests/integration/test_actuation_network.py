@@ -13,7 +13,7 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT
 from noack.protocol.wire_format import Flow
 from tests.integration import conftest as live
 from tests.integration.conftest import AT_RATE, Finished, run_scenario
-from tests.integration.test_restarts import KEEPS, goes_on, let_run, spooled
+from tests.integration.test_restarts import kill, let_run
 
 ACTUATION = (
     'network.actuation={mansd=3, loss={model="bernoulli", probability=0.4}, '
@@ -38,10 +38,7 @@ def record(finished: Finished) -> RunRecord:
 
 
 def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> None:
-    summary = finished.summary
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["replay"]["complete"]
-    assert summary["loops"][0]["unintended_losses"] == summary["loops"][0]["missing_samples"] == 0
+    live.assert_complete(finished.loop)
     reports = json.loads((finished.run_dir / "reports.json").read_text())
     roles = {reports[role]["channel"]["local"]: role for role in reports}
     sources = reports["plant"]["channel"]["received_from"]
@@ -50,7 +47,7 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(finished: Finished) -> Non
 
 def test_actuations_are_lost_within_their_guarantee(finished: Finished, record: RunRecord) -> None:
     found, outcomes = (
-        finished.summary["loops"][0]["actuations"],
+        finished.loop["actuations"],
         packet_outcomes(record, Flow.ACTUATION),
     )
     assert found["sent"] == len(record[CONTROLLER_STEP])
@@ -83,11 +80,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         )
         running.wait_started()
         for role in RESTARTED:
-            live.wait_for(lambda role=role: len(spooled(running, KEEPS[role])) > 0)
-            before = live.child_of(running.process, role)
-            assert before is not None
-            before.kill()
-            live.wait_for(lambda role=role: goes_on(running, role))
+            kill(running, role)
         let_run(running, 2)
         running.process.send_signal(signal.SIGINT)
         return running.finish()
@@ -95,8 +88,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
-    assert restarted.summary["loops"][0]["replay"]["bit_exact"]
-    assert {one["process"] for one in restarted.summary["loops"][0]["restarts"]} == set(RESTARTED)
+    assert restarted.loop["replay"]["bit_exact"]
+    assert {one["process"] for one in restarted.loop["restarts"]} == set(RESTARTED)
     record = load_record(restarted.run_dir)
     steps, actuations = record[CONTROLLER_STEP], record[PLANT_ACTUATION]
     # The plant applies inputs of the restarted controller, through the restarted emulator.
@@ -111,11 +104,9 @@ def test_restarted_processes_go_on_with_lossy_actuations(restarted: Finished) ->
 
 
 def test_claims_of_a_restarted_run_are_judged(restarted: Finished) -> None:
-    found = restarted.summary["loops"][0]["actuations"]
+    found = restarted.loop["actuations"]
     assert found["lost"] > 0.2 * found["sent"]
-    claims = restarted.summary["loops"][0]["claims"]
+    claims = restarted.loop["claims"]
     assert claims
     assert {claim["verdict"] for claim in claims} <= {"held", "void", "not applicable"}
-    assert restarted.summary["loops"][0][
-        "assumption_violations"
-    ]  # e.g. the input of a dead controller was old
+    assert restarted.loop["assumption_violations"]  # e.g. the input of a dead controller was old

@@ -140,21 +140,19 @@ def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> N
         rows = record[table]
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
     assert len(record["plant_step"]) == HORIZON_S * live.RATE_HZ + 1
-    assert summary["loops"][0]["missing_samples"] == 0
-    assert summary["loops"][0]["unintended_losses"] == 0
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["replay"]["complete"]
-    assert summary["loops"][0]["identity_residual_relative"] < 1e-11
-    assert summary["loops"][0]["longest_loss_burst"] <= summary["mansd"]
+    loop = disturbed.finished.loop
+    live.assert_complete(loop)
+    assert loop["identity_residual_relative"] < 1e-11
+    assert loop["longest_loss_burst"] <= summary["mansd"]
     assert disturbed.left_behind == []
 
 
 def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Disturbed) -> None:
-    summary, record = disturbed.finished.summary, disturbed.record
+    record = disturbed.record
     for role in ("plant", "sensor", "controller"):  # netem may have had no packet
-        assert summary["loops"][0]["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
+        assert disturbed.finished.loop["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
     certified = [
-        claim for claim in summary["loops"][0]["claims"] if "certificate" in claim["source"]
+        claim for claim in disturbed.finished.loop["claims"] if "certificate" in claim["source"]
     ]
     assert certified
     for claim in certified:
@@ -164,7 +162,7 @@ def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Distur
     assert any(" s old, " in text or "was felt after " in text for text in void), void
     for text in void:
         assert disturbed.finished.stderr.count(text) == 1
-    own = [claim for claim in summary["loops"][0]["claims"] if claim["source"] == "(I1)"]
+    own = [claim for claim in disturbed.finished.loop["claims"] if claim["source"] == "(I1)"]
     assert {claim["verdict"] for claim in own} == {"held"}
 
 
@@ -173,7 +171,7 @@ def test_no_time_depends_on_the_wall_clock(disturbed: Disturbed) -> None:
         now_ns = disturbed.record[table]["now_ns"]
         assert (np.diff(now_ns) >= 0).all()
         assert now_ns.max(initial=0) < HOUR_S / 2 * 1e9
-    for lateness in disturbed.finished.summary["loops"][0]["lateness_us"].values():
+    for lateness in disturbed.finished.loop["lateness_us"].values():
         assert (lateness["max"] or 0) < 1e6 * HOUR_S / 2
 
 

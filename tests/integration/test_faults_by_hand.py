@@ -13,14 +13,11 @@ from cosim.live.finalize import reopen
 from cosim.record.run_record import load_record
 from noack.protocol.topology import LOOP_ROLES
 from tests.integration import conftest as live
+from tests.integration.conftest import ended
 
 Start = Callable[..., live.Running]
 ByHand = Callable[[str], subprocess.Popen[str]]
 RECORD = ("record", "lane_following")
-
-
-def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
-    return process.communicate(timeout=live.PATIENCE_S)
 
 
 def test_a_wait_for_a_missing_process_can_be_interrupted(

@@ -6,24 +6,27 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from benchmarks.programs import TwoHosts, two_hosts
 from benchmarks.report import MeasurementError
+from cosim.cli import app
 from cosim.record.run_record import load_record, load_run
 from noack.config.scenario import phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
 from tests.integration import conftest as live
+from tests.integration.conftest import Start, ended
 
-Start = Callable[..., subprocess.Popen[str]]
 INVITED = ("--invitation", "invitation.json")
 
 
@@ -41,46 +44,25 @@ def hosts() -> Iterator[TwoHosts]:
 @pytest.fixture
 def start(hosts: TwoHosts, tmp_path: Path) -> Iterator[Start]:
     """Start a command of noack on a host, with a runtime directory of the host's own."""
-    with ExitStack() as stack:
+    with live.starting() as begin:
 
-        def begin(
-            host: int, *arguments: str, path: Path | None = None, ahead_s: int = 0
-        ) -> subprocess.Popen[str]:
+        def on(host: int, *arguments: str, ahead_s: int = 0, **more: Any) -> subprocess.Popen[str]:
             runtime = tmp_path / f"host {host}"
             runtime.mkdir(exist_ok=True)
-            clock = ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"]
-            command = [*(clock if ahead_s else ()), *live.noack_command(*arguments)]
-            command = hosts.inside(host, *command)
-            environment = os.environ | {"XDG_RUNTIME_DIR": str(runtime)}
-            if path is not None:
-                environment["PATH"] = f"{path}:{environment['PATH']}"
-            return stack.enter_context(_started(command, tmp_path, environment))
+            before = hosts.inside(host, monotonic_s=ahead_s)
+            return begin(*arguments, before=before, runtime=runtime, cwd=tmp_path, **more)
 
-        yield begin
+        yield on
 
 
-@contextmanager
-def _started(
-    command: list[str], folder: Path, environment: Mapping[str, str]
-) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        command, cwd=folder, env=environment, text=True, stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-
-
-def record(start: Start, folder: Path, host: str, *more: str) -> subprocess.Popen[str]:
+def record(
+    start: Start, folder: Path, host: str, *more: str, impatient: bool = False
+) -> subprocess.Popen[str]:
     """Open a run on the first host; return when it can be joined."""
     scenario = live.settings(horizon_s=4.0)
     process = start(
         0, "record", "lane_following", "--listen", host, "--json", *live.BARE, *live.AT_RATE,
-        *scenario, *more,
+        *scenario, *more, impatient=impatient,
     )  # fmt: skip
     invitation = folder / "invitation.json"
     live.wait_for(lambda: invitation.exists() or process.poll() is not None)
@@ -88,26 +70,32 @@ def record(start: Start, folder: Path, host: str, *more: str) -> subprocess.Pope
     return process
 
 
-def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
-    return process.communicate(timeout=live.PATIENCE_S)
+def joined(start: Start, *away: str, **more: int) -> list[subprocess.Popen[str]]:
+    """Start all processes of the loop, these on the second host, with the invitation."""
+    return [
+        start(1, role, "--json", *INVITED, **more) if role in away else start(0, role, "--json")
+        for role in LOOP_ROLES
+    ]
 
 
-@pytest.mark.parametrize("ip", [4, 6])
-def test_two_hosts_carry_a_run(start: Start, hosts: TwoHosts, tmp_path: Path, ip: int) -> None:
-    own, other = (addresses[ip == 6] for addresses in hosts.addresses)
-    recording = record(start, tmp_path, own)
-    at_home = [start(0, role, "--json") for role in ("plant", "sensor")]
-    away = [start(1, role, "--json", *INVITED) for role in ("netem", "controller")]
-    for process in (*at_home, *away):
+def end_well(*processes: subprocess.Popen[str]) -> list[Any]:
+    """Wait for the processes' ends, with status 0; return what they printed as JSON."""
+    printed = []
+    for process in processes:
         stdout, stderr = ended(process)
         assert process.returncode == 0, stderr
-        expected = own if process in at_home else other
-        assert json.loads(stdout)["channel"]["local"].rpartition(":")[0].strip("[]") == expected
-    stdout, stderr = ended(recording)
-    assert recording.returncode == 0, stderr
-    summary = json.loads(stdout)
-    assert summary["loops"][0]["missing_samples"] == summary["loops"][0]["unintended_losses"] == 0
-    assert summary["loops"][0]["replay"]["bit_exact"]
+        assert "are kept in" not in stderr
+        printed.append(json.loads(stdout))
+    return printed
+
+
+def test_all_roles_join_from_another_host(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
+    (_, own), (_, other) = hosts.addresses  # of IPv6
+    recording = record(start, tmp_path, own)
+    for report in end_well(*joined(start, *LOOP_ROLES)):
+        assert report["channel"]["local"].rpartition(":")[0].strip("[]") == other
+    (summary,) = end_well(recording)
+    live.assert_complete(summary["loops"][0])
     tables = load_record((tmp_path / "runs" / "latest").resolve())
     assert len(tables["plant_step"]) == 4 * live.RATE_HZ + 1
     assert not (tmp_path / "invitation.json").exists()
@@ -157,18 +145,11 @@ def test_several_loops_run_on_hosts_with_different_clocks(start: Start, tmp_path
     recording = start(0, "record", "three.toml", "--listen", "10.83.3.1", "--json", *live.BARE)
     live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
     assert recording.poll() is None, recording.communicate()
-    at_home = [start(0, role) for role in ("plant", "sensor")]
-    away = [start(1, role, *INVITED, ahead_s=AHEAD_S) for role in ("netem", "controller")]
-    for process in (*at_home, *away):
-        _, stderr = ended(process)
-        assert process.returncode == 0, stderr
-    stdout, stderr = ended(recording)
-    assert recording.returncode == 0, stderr
-    summary = json.loads(stdout)
+    processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
+    *_, summary = end_well(*processes, recording)
     assert summary["network"]["replay"]["bit_exact"]
     for loop in summary["loops"]:
-        assert loop["missing_samples"] == loop["unintended_losses"] == 0
-        assert loop["replay"]["bit_exact"]
+        live.assert_complete(loop)
         assert 0 < loop["conditions"]["clock_error_s"] < 1
     run = load_run((tmp_path / "runs" / "latest").resolve())
     phase_ns = phases_ns(run.scenario)[1]
@@ -223,40 +204,34 @@ def test_a_refused_run_leaves_the_invitation_of_another(start: Start, tmp_path: 
     ("address", "reason"),
     [
         ("0.0.0.0", "--listen: 0.0.0.0 is not an address at which other hosts can reach this one"),
-        ("10.83.3.77", "cannot listen on 10.83.3.77:0: Cannot assign requested address"),
-        ("10.83.3.255", "cannot listen on 10.83.3.255:0: cannot reach 10.83.3.255:"),
+        ("192.0.2.77", "cannot listen on 192.0.2.77:0: Cannot assign requested address"),
         ("nonsense:port", "--listen: expected HOST:PORT"),
     ],
 )
-def test_an_unfit_address_gives_one_line(start: Start, address: str, reason: str) -> None:
-    process = start(0, "record", "lane_following", "--listen", address, *live.BARE)
+def test_an_unfit_address_gives_one_line(address: str, reason: str) -> None:
+    done = CliRunner().invoke(app, ["record", "lane_following", "--listen", address, *live.BARE])
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"noack: {reason}")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_an_address_of_all_hosts_gives_one_line(start: Start) -> None:
+    process = start(0, "record", "lane_following", "--listen", "10.83.3.255", *live.BARE)
     _, stderr = ended(process)
     assert process.returncode == 2
-    assert stderr.startswith(f"noack: {reason}")
+    assert stderr.startswith("noack: cannot listen on 10.83.3.255:0: cannot reach 10.83.3.255:")
     assert len(stderr.splitlines()) == 1
-
-
-def test_all_roles_of_the_loop_can_be_invited(start: Start, tmp_path: Path) -> None:
-    recording = record(start, tmp_path, "10.83.3.1")
-    for process in [start(1, role, *INVITED) for role in LOOP_ROLES]:
-        _, stderr = ended(process)
-        assert process.returncode == 0, stderr
-    assert ended(recording)
-    assert recording.returncode == 0
 
 
 def test_rows_of_a_host_that_was_cut_off_are_collected(
     start: Start, hosts: TwoHosts, tmp_path: Path
 ) -> None:
     """The link goes down in the run; its processes work on and keep their rows and reports."""
-    recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=8.0))
+    recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=8.0), impatient=True)
     at_home = [start(0, role) for role in ("plant", "sensor")]
     kept = ("--runs", str(tmp_path / "kept"))
-    away = [start(1, role, *INVITED, *kept) for role in ("netem", "controller")]
-    run_dir = tmp_path / "runs" / "latest"
-    spooled = run_dir / "spool" / "controller_step.recorder"
-    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 5000)
-    run_dir = run_dir.resolve()
+    away = [start(1, role, *INVITED, *kept, impatient=True) for role in ("netem", "controller")]
+    run_dir = wait_recorded(tmp_path)
     with _cut_off(hosts):
         errors = {process: ended(process)[1] for process in (*away, *at_home)}
         ended(recording)
@@ -266,44 +241,62 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(
     folder = tmp_path / "kept" / run_dir.name
     for process in away:
         assert f"are kept in {folder} " in errors[process]
-    collecting = start(0, "collect", str(run_dir), str(folder), "--json")
-    stdout, stderr = ended(collecting)
-    assert collecting.returncode == 0, stderr
-    summary = json.loads(stdout)
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["replay"]["complete"]
+    refuse_what_was_not_kept(run_dir, tmp_path)
+    (summary,) = end_well(start(0, "collect", str(run_dir), str(folder), "--json"))
+    replay = summary["loops"][0]["replay"]
+    assert replay["bit_exact"]
+    assert replay["complete"]
     assert len(load_record(run_dir)["controller_step"]) == 8 * live.RATE_HZ
-    again = start(0, "collect", str(run_dir), str(folder), "--json")
-    assert json.loads(ended(again)[0])["loops"][0]["replay"] == summary["loops"][0]["replay"]
+    (again,) = end_well(start(0, "collect", str(run_dir), str(folder), "--json"))
+    assert again["loops"][0]["replay"] == replay
+
+
+def refuse_what_was_not_kept(run_dir: Path, folder: Path) -> None:
+    """Collecting what a host has not kept of the run fails in one line."""
+    foreign = folder / "foreign"
+    (foreign / "spool").mkdir(parents=True)
+    (foreign / "spool" / "plant_step.one").write_bytes(b"rows")
+    (foreign / "run_name.txt").write_text("0123456789abcdef")
+    for source, reason in [
+        (str(folder), f"{folder}: nothing was kept there (no files in spool/)"),
+        (str(foreign), f"{foreign}: it was kept of another run than "),
+        ("nohost.invalid:kept", "nohost.invalid:kept: "),
+    ]:
+        done = CliRunner().invoke(app, ["collect", str(run_dir), source])
+        assert done.exit_code in (1, 2)
+        assert done.stderr.startswith(f"noack: {reason}")
+        assert len(done.stderr.splitlines()) == 1
+
+
+def wait_recorded(folder: Path) -> Path:
+    """Wait until rows of the controller have been recorded; return the run directory."""
+    run_dir = folder / "runs" / "latest"
+    spooled = run_dir / "spool" / "controller_step.recorder"
+    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 5000)
+    return run_dir.resolve()
 
 
 def test_a_host_that_comes_back_loses_no_row(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
     """The link is down until the recorder has given the other host's processes up for lost."""
-    recording = record(start, tmp_path, "10.83.3.1", *live.settings(horizon_s=50.0))
-    processes = [start(0, role) for role in ("plant", "sensor")]
-    processes += [start(1, role, *INVITED) for role in ("netem", "controller")]
-    spooled = tmp_path / "runs" / "latest" / "spool" / "controller_step.recorder"
-    live.wait_for(lambda: spooled.exists() and spooled.stat().st_size > 5000)
+    horizon = live.settings(horizon_s=30.0)
+    recording = record(start, tmp_path, "10.83.3.1", *horizon, impatient=True)
+    processes = joined(start, "netem", "controller")
+    wait_recorded(tmp_path)
     assert recording.stderr is not None
     with _cut_off(hosts):
         lines = (line for line in recording.stderr if "stopped responding" in line)
         lost = dict(line.split(maxsplit=1) for line in islice(lines, 2))
     assert set(lost) == {"netem", "controller"}
-    for process in processes:
-        _, stderr = ended(process)
-        assert process.returncode == 0, stderr
-        assert "are kept in" not in stderr
-    stdout, stderr = ended(recording)
-    assert recording.returncode == 0, stderr
-    summary = json.loads(stdout)
-    assert summary["loops"][0]["replay"]["complete"]
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["unintended_losses"] > 0
-    verdicts = {one["verdict"] for one in summary["loops"][0]["claims"]}
+    *_, summary = end_well(*processes, recording)
+    (loop,) = summary["loops"]
+    assert loop["replay"]["complete"]
+    assert loop["replay"]["bit_exact"]
+    assert loop["unintended_losses"] > 0
+    verdicts = {one["verdict"] for one in loop["claims"]}
     assert "void" in verdicts
     assert "violated" not in verdicts
     steps = load_record((tmp_path / "runs" / "latest").resolve())["controller_step"]
-    assert len(steps) == 50 * live.RATE_HZ
+    assert len(steps) == 30 * live.RATE_HZ
 
 
 @contextmanager
@@ -313,27 +306,6 @@ def _cut_off(hosts: TwoHosts) -> Iterator[None]:
     subprocess.run([*command, "down"], check=True)
     yield
     subprocess.run([*command, "up"], check=True)
-
-
-def test_what_is_no_kept_folder_is_refused(start: Start, tmp_path: Path) -> None:
-    recording = record(start, tmp_path, "10.83.3.1")
-    for process in [start(0, role) for role in LOOP_ROLES]:
-        ended(process)
-    ended(recording)
-    foreign = tmp_path / "foreign"
-    (foreign / "spool").mkdir(parents=True)
-    (foreign / "spool" / "plant_step.one").write_bytes(b"rows")
-    (foreign / "run_name.txt").write_text("0123456789abcdef")
-    for source, reason in [
-        (str(tmp_path), f"{tmp_path}: nothing was kept there (no files in spool/)"),
-        (str(foreign), f"{foreign}: it was kept of another run than "),
-        ("nohost.invalid:kept", "nohost.invalid:kept: "),
-    ]:
-        collecting = start(0, "collect", str(tmp_path / "runs" / "latest"), source)
-        _, stderr = ended(collecting)
-        assert collecting.returncode in (1, 2)
-        assert stderr.startswith(f"noack: {reason}")
-        assert len(stderr.splitlines()) == 1
 
 
 @pytest.fixture
@@ -357,6 +329,10 @@ def ssh(hosts: TwoHosts, tmp_path: Path) -> Path:
     return folder
 
 
+def on_path(folder: Path) -> dict[str, str]:
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
 def hosts_file(folder: Path, address: str, ssh: str = "robot", command: str = "") -> str:
     """Write a file that places network and controller on another host."""
     command = command or shlex.join(live.noack_command())
@@ -372,13 +348,12 @@ def test_a_run_starts_its_processes_on_another_host(
     (own, _), (other, _) = hosts.addresses
     run = start(
         0, "run", "lane_following", "--hosts", hosts_file(tmp_path, own), "--json", *live.BARE,
-        *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True), path=ssh,
+        *live.AT_RATE, *live.settings(horizon_s=3.0, network__encrypted=True),
+        environment=on_path(ssh),
     )  # fmt: skip
     stdout, stderr = ended(run)
     assert run.returncode == 0, stderr
-    summary = json.loads(stdout)
-    assert summary["loops"][0]["missing_samples"] == 0
-    assert summary["loops"][0]["replay"]["bit_exact"]
+    live.assert_complete(json.loads(stdout)["loops"][0])
     run_dir = (tmp_path / "runs" / "latest").resolve()
     reports = json.loads((run_dir / "reports.json").read_text())
     places = {role: reports[role]["channel"]["local"].rpartition(":")[0] for role in LOOP_ROLES}
@@ -398,7 +373,7 @@ def test_a_process_that_does_not_start_on_its_host_ends_the_run(
     start: Start, hosts: TwoHosts, tmp_path: Path, ssh: Path, ssh_host: str, command: str, line: str
 ) -> None:
     file = hosts_file(tmp_path, hosts.addresses[0][0], ssh_host, command)
-    run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, path=ssh)
+    run = start(0, "run", "lane_following", "--hosts", file, *live.BARE, environment=on_path(ssh))
     _, stderr = ended(run)
     assert run.returncode == 1
     assert line in stderr.splitlines()[-1]

@@ -5,11 +5,8 @@ import os
 import re
 import signal
 import socket
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +15,16 @@ import pytest
 
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.traces.trace_formats import read_trace
+from tests.integration.conftest import Start, starting, wait_for
 
 LONG_S = 120
-Start = Callable[..., "subprocess.Popen[str]"]
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     """Start `noack WORDS`; what still runs at the end is killed."""
-    running: list[subprocess.Popen[str]] = []
-
-    def begin(*words: object) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "cosim.cli", *map(str, words)], cwd=tmp_path, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
-        running.append(process)
-        return process
-
-    yield begin
-    for process in running:
-        process.kill()
-        process.communicate()
+    with starting() as begin:
+        yield partial(begin, cwd=tmp_path)
 
 
 def line_with(stream: Any, word: str) -> str:
@@ -58,9 +43,7 @@ def listener(start: Start, host: str = "127.0.0.1", *words: object) -> tuple[Any
 def emulator(start: Start, to: str, *words: str) -> str:
     host = to.rpartition(":")[0]
     listen = f"{host}:{free_port(host)}"
-    process = start(
-        "netem", "--listen", listen, "--to", to, *words
-    )  # fmt: skip
+    process = start("netem", "--listen", listen, "--to", to, *words)
     line_with(process.stdout, "ready")
     return listen
 
@@ -78,9 +61,8 @@ def document(process: Any) -> dict[str, Any]:
     return dict(json.loads(out))
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
-def test_periodic_losses_are_measured_exactly(start: Start, tmp_path: Path, host: str) -> None:
-    process, to = listener(start, host, "--save", "received.csv")
+def test_periodic_losses_are_measured_exactly(start: Start, tmp_path: Path) -> None:
+    process, to = listener(start, "[::1]", "--save", "received.csv")
     via = emulator(start, to, "loss", "periodic", "1/5")
     sender = start("measure", via, "--rate", "500hz", "--for", "1s", "--save", "sent.csv")
     assert sender.wait(LONG_S) == 0
@@ -97,22 +79,10 @@ def test_periodic_losses_are_measured_exactly(start: Start, tmp_path: Path, host
 
 def test_a_round_trip_tells_the_two_ways_apart(start: Start, tmp_path: Path) -> None:
     process, to = listener(start)
-    via = emulator(
-        start, to, "loss", "periodic", "1/5", "--reverse", "loss", "periodic", "1/10"
-    )  # fmt: skip
-    sender = start(
-        "measure",
-        via,
-        "--rate",
-        "200hz",
-        "--for",
-        "1s",
-        "--round-trip",
-        "--save",
-        "s.csv",
-        "--json",
-    )
-    document(sender)
+    words = ["loss", "periodic", "1/5", "--reverse", "loss", "periodic", "1/10"]
+    via = emulator(start, to, *words)
+    options = ("--rate", "200hz", "--for", "1s", "--round-trip", "--save", "s.csv", "--json")
+    document(start("measure", via, *options))
     lost = [line.rpartition(",")[2] for line in (tmp_path / "s.csv").read_text().splitlines()[1:]]
     assert lost.count("forward") == 40
     assert lost.count("reverse") == 16  # every tenth of 160 answers
@@ -174,10 +144,4 @@ def test_ctrl_c_ends_a_listener(start: Start) -> None:
 
 
 def wait_for_rows(path: Path, rows: int) -> None:
-    end_s = time.monotonic() + LONG_S
-    while time.monotonic() < end_s:
-        with suppress(FileNotFoundError):
-            if path.read_text().count("\n") > rows:
-                return
-        time.sleep(0.1)
-    raise AssertionError(f"{path.name} has too few rows")
+    wait_for(lambda: path.exists() and path.read_text().count("\n") > rows)

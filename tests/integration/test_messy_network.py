@@ -18,7 +18,13 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, read_header
-from tests.integration.conftest import AT_RATE, Finished, run_scenario, settings
+from tests.integration.conftest import (
+    AT_RATE,
+    Finished,
+    assert_complete,
+    run_scenario,
+    settings,
+)
 from tests.oracles.link import Datagram, network_of
 
 MANSD = 2
@@ -66,10 +72,8 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(
 ) -> None:
     summary = finished.summary
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
-    assert summary["loops"][0]["replay"]["bit_exact"]
-    assert summary["loops"][0]["replay"]["complete"]
-    assert summary["loops"][0]["unintended_losses"] == summary["loops"][0]["missing_samples"] == 0
-    assert [claim["verdict"] for claim in summary["loops"][0]["claims"]] == ["void"]
+    assert_complete(finished.loop)
+    assert [claim["verdict"] for claim in finished.loop["claims"]] == ["void"]
     found = replay(record)
     compared = {leg.leg: leg.compared for leg in found.messages}
     assert compared["controller → netem"] == len(record[CONTROLLER_DELIVERY])
@@ -79,8 +83,8 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(
 
 
 def test_acknowledgements_are_counted_by_outcome(finished: Finished, record: RunRecord) -> None:
-    found = finished.summary["loops"][0]["acknowledgements"]
-    assert found["sent"] == finished.summary["loops"][0]["deliveries"] > 10
+    found = finished.loop["acknowledgements"]
+    assert found["sent"] == finished.loop["deliveries"] > 10
     assert found["lost"] > 3
     assert found["received"] > 3
     assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
@@ -134,7 +138,7 @@ def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     packets, taken = record[NETEM_PACKET], record[CONTROLLER_DELIVERY]
     updates = packets[packets["flow"] == UPDATES]
     forwarded = int((updates["release_ns"] >= 0).sum() + (updates["copy_ns"] >= 0).sum())
-    rejected = finished.summary["loops"][0]["rejected_datagrams"]["controller"]
+    rejected = finished.loop["rejected_datagrams"]["controller"]
     assert rejected["stale"] > 0
     assert forwarded == len(taken) + sum(rejected.values())
     sent = [read_header(head.tobytes()).sequence for head in updates["head"]]
@@ -142,7 +146,7 @@ def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     ends = np.concatenate([[-1], taken["sequence"], [len(sent)]])
     assert np.diff(ends).max() - 1 <= MANSD
     assert taken["dropouts"].max() == np.diff(ends[:-1]).max() - 1
-    assert finished.summary["loops"][0]["longest_loss_burst"] <= MANSD
-    causes = finished.summary["loops"][0]["drops_by_cause"]
+    assert finished.loop["longest_loss_burst"] <= MANSD
+    causes = finished.loop["drops_by_cause"]
     assert {"dropped", "corrupted"} <= set(causes)
-    assert sum(causes.values()) == finished.summary["loops"][0]["drops"]
+    assert sum(causes.values()) == finished.loop["drops"]

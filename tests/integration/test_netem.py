@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from noack.core.errors import ExitStatus
+from tests.attacks.attacked import unread_bytes
+from tests.integration.conftest import wait_for
 
 COMMAND = [sys.executable, "-m", "netem"]
 MIB = 2**20
@@ -213,10 +214,8 @@ def test_the_emulator_keeps_48_mib_of_the_allowed_memory() -> None:
         for number in range(5000):  # 300 MB
             sender.sendto(bytes(60_000), ("127.0.0.1", port))
             if number % 50 == 49:
-                time.sleep(0.02)  # for the emulator to read them
-        deadline_s = time.monotonic() + 60
-        while allowed - size_of(process.pid) > 112 * MIB and time.monotonic() < deadline_s:
-            time.sleep(0.1)
+                wait_for(lambda: not unread_bytes(process.pid)[port])
+        wait_for(lambda: allowed - size_of(process.pid) <= 112 * MIB)
         assert 40 * MIB < allowed - size_of(process.pid) <= 112 * MIB
         process.send_signal(signal.SIGINT)
         stdout, stderr = process.communicate(timeout=60)

@@ -50,6 +50,16 @@ def goes_on(running: live.Running, role: str) -> bool:
     return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
+def kill(running: live.Running, role: str) -> None:
+    """Kill a process that has rows on disk; wait until its replacement has, too."""
+    table = KEEPS[role]
+    live.wait_for(lambda: len(spooled(running, table)) > 0)
+    before = live.child_of(running.process, role)
+    assert before is not None
+    before.kill()
+    live.wait_for(lambda: goes_on(running, role))
+
+
 def let_run(running: live.Running, simulated_s: float) -> None:
     def now_ns() -> int:
         return int(spooled(running, "plant_step")["t_ns"].max())
@@ -69,13 +79,8 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
             *live.settings(realtime__enabled=False, network__mansd=1, trigger__floor=0.02),
         )
         running.wait_started()
-        # Each process has rows on disk before it is killed: its own, or of the recorder's tables.
-        live.wait_for(lambda: all(len(spooled(running, table)) > 0 for table in KEEPS.values()))
         for role in RESTARTED:
-            before = live.child_of(running.process, role)
-            assert before is not None
-            before.kill()
-            live.wait_for(lambda role=role: goes_on(running, role))
+            kill(running, role)
             if role == "recorder":
                 # Unacknowledged rows are sent again. Wait until all of them are on disk before
                 # the next process is killed.
@@ -91,7 +96,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> live.Finished:
 def test_the_run_continues_and_lists_its_restarts(restarted: live.Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
-    restarts = {one["process"]: one for one in restarted.summary["loops"][0]["restarts"]}
+    restarts = {one["process"]: one for one in restarted.loop["restarts"]}
     assert restarts.keys() == set(RESTARTED)
     for role, one in restarts.items():
         assert one["generation"] == 1
@@ -109,8 +114,8 @@ def rows_of_life(record: RunRecord, table: str, place: int) -> Rows:
 
 
 def test_no_recorded_row_is_lost_and_all_rows_are_replayed(restarted: live.Finished) -> None:
-    assert restarted.summary["loops"][0]["missing_samples"] == 0
-    verdict = restarted.summary["loops"][0]["replay"]
+    assert restarted.loop["missing_samples"] == 0
+    verdict = restarted.loop["replay"]
     assert verdict["bit_exact"], verdict
     record = load_record(restarted.run_dir)
     assert verdict["inputs"] == sum(len(record[table]) for table in record.tables)
@@ -147,7 +152,7 @@ def test_a_restarted_controller_outputs_zero_until_its_first_update(
 
 def test_the_loop_converges_again_and_its_identity_holds(restarted: live.Finished) -> None:
     record = load_record(restarted.run_dir)
-    assert restarted.summary["loops"][0]["identity_residual_relative"] < 1e-11
+    assert restarted.loop["identity_residual_relative"] < 1e-11
     joined = align_tables(record)
     away = np.isnan(joined.x_c).any(axis=1)
     known_ns = rows_of_life(record, "controller_delivery", 1)["model_t_ns"][0]

@@ -1,4 +1,8 @@
-"""Compare the record of a whole run of real processes with independent computations."""
+"""A whole run of real processes: its files, and what its processes did together.
+
+tests/cosim/simulation/test_whole_loop.py compares what each machine computes with a reference; the
+replay of this run shows that its processes computed the same.
+"""
 
 import json
 from collections import Counter
@@ -7,17 +11,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import rerun.chunk
-from scipy.linalg import expm
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record
-from cosim.shipped_files import find_shipped
-from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import Fate, tables
 from noack.protocol.wire_format import read_header
@@ -35,17 +34,6 @@ SUMMARY_KEYS = {
 
 CERTIFIED = "certified for the scenario's plant"
 OWN_CLAIMS = {"(I1)", "certificate", "box certificate"}
-
-CASES = {
-    "zoh": ["mode=zoh"],
-    "bursts_from_known_state": [
-        "network.initial_sync=known_state",
-        'network.loss={ model = "gilbert_elliott", good_to_bad = 0.4, bad_to_good = 0.2 }',
-        "plant.measure_every=2",
-        "controller.rate_hz=200.0",
-    ],
-}
-"""Variants in virtual time: the same machines without sockets."""
 
 
 @pytest.fixture(scope="module")
@@ -67,27 +55,18 @@ def live(finished: Finished) -> RunRecord:
     return load_record(finished.run_dir)
 
 
-@pytest.fixture(scope="module", params=["live", *CASES])
-def record(request: pytest.FixtureRequest) -> RunRecord:
-    if request.param == "live":
-        found: RunRecord = request.getfixturevalue("live")
-        return found
-    path = find_shipped("lane_following", "scenarios")
-    return simulate(resolve(load(path, ["horizon_s=8", *CASES[request.param]])))
-
-
 def test_a_run_completes_with_a_complete_summary(finished: Finished) -> None:
     assert finished.status == 0, finished.stderr
     (loop,) = finished.summary["loops"]
     assert finished.summary.keys() | loop.keys() >= SUMMARY_KEYS
     assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}
-    assert finished.summary["loops"][0]["missing_samples"] == 0
-    assert finished.summary["loops"][0]["unintended_losses"] == 0
-    violations = finished.summary["loops"][0]["assumption_violations"]
+    assert finished.loop["missing_samples"] == 0
+    assert finished.loop["unintended_losses"] == 0
+    violations = finished.loop["assumption_violations"]
     assert "dropouts" not in {one["cause"] for one in violations}  # deadlines may be missed
-    assert finished.summary["loops"][0]["rejected_datagrams"] == {}
+    assert finished.loop["rejected_datagrams"] == {}
     for role in ("plant", "sensor", "controller", "netem"):
-        assert finished.summary["loops"][0]["lateness_us"][role].keys() == {
+        assert finished.loop["lateness_us"][role].keys() == {
             "p50", "p99", "p999", "max", "steps", "late_steps",
         }  # fmt: skip
 
@@ -107,10 +86,10 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
     assert "warning" not in finished.stderr
 
 
-def test_every_sample_is_recorded(record: RunRecord) -> None:
-    scenario = record.scenario
+def test_every_sample_is_recorded(live: RunRecord) -> None:
+    scenario = live.scenario
     steps = scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1
-    plant, sensor = record["plant_step"], record["sensor_measurement"]
+    plant, sensor = live["plant_step"], live["sensor_measurement"]
     assert np.array_equal(plant["t_ns"], np.arange(steps) * scenario.timing.plant_period_ns)
     every = scenario.plant.measure_every
     assert np.array_equal(sensor["t_ns"], plant["t_ns"][::every])
@@ -118,7 +97,7 @@ def test_every_sample_is_recorded(record: RunRecord) -> None:
     ticks = (
         scenario.timing.horizon_ns - scenario.timing.controller_phase_ns
     ) // scenario.timing.controller_period_ns
-    assert len(record["controller_step"]) == ticks + 1
+    assert len(live["controller_step"]) == ticks + 1
 
 
 def test_each_process_receives_from_its_peer_only(live: RunRecord) -> None:
@@ -131,90 +110,41 @@ def test_each_process_receives_from_its_peer_only(live: RunRecord) -> None:
     assert local["controller"] not in channel["sensor"]["received_from"]
 
 
-def test_the_plant_follows_the_exact_solution_for_its_held_input(record: RunRecord) -> None:
-    loop, h_s = record.loop, record.scenario.timing.plant_period_ns * 1e-9
-    n, m = loop.n, loop.m
-    both = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * h_s)
-    x, u = record["plant_step"]["x"], record["plant_step"]["u"]
-    expected = x[:-1] @ both[:n, :n].T + u[:-1] @ both[:n, n:].T
-    assert np.allclose(x[1:], expected, rtol=1e-13, atol=1e-13)  # rounding of one product
-
-
-def test_the_plant_holds_only_inputs_that_the_controller_sent(record: RunRecord) -> None:
-    plant, sent = record["plant_step"], record["controller_step"]
+def test_the_plant_holds_only_inputs_that_the_controller_sent(live: RunRecord) -> None:
+    plant, sent = live["plant_step"], live["controller_step"]
     held = plant["actuation"] >= 0
     assert held.sum() > 0.9 * len(plant)
     assert np.array_equal(plant["u"][held], sent["u"][plant["actuation"][held]])
     assert not plant["u"][~held].any()
 
 
-def test_x_s_is_reset_at_every_event_and_only_there(record: RunRecord) -> None:
-    rows, loop = record["sensor_measurement"], record.loop
-    transition = expm(loop.H * (rows["t_ns"][1] - rows["t_ns"][0]) * 1e-9)
-    event = rows["event"] >= 0
-    after = np.where(event[:, None], rows["x"], rows["x_s"])
-    assert np.allclose(rows["x_s"][1:], after[:-1] @ transition.T, rtol=1e-12, atol=1e-12)
-    assert np.array_equal(rows["event"][event], np.arange(event.sum()))
-
-
-def test_events_are_exactly_where_the_error_exceeds_the_threshold(record: RunRecord) -> None:
-    rows, trigger = record["sensor_measurement"], record.scenario.trigger
-    threshold = trigger.beta * np.exp(-trigger.alpha_per_s * rows["t_ns"] * 1e-9)
-    error = np.linalg.norm(rows["x_s"] - rows["x"], axis=1)
-    due = error > threshold
-    if record.scenario.network.initial_sync == "first_packet":
-        due[0] = True
-    clear = np.abs(error - threshold) > 1e-12 * threshold  # numpy's exp and norm round differently
-    assert np.array_equal((rows["event"] >= 0)[clear], due[clear])
-
-
-def test_x_c_is_reset_only_at_deliveries(record: RunRecord) -> None:
-    steps, deliveries, loop = record["controller_step"], record["controller_delivery"], record.loop
-    assert np.array_equal(steps["u"], steps["x_c"] @ loop.K.T) or np.allclose(
-        steps["u"], steps["x_c"] @ loop.K.T, rtol=0, atol=1e-15
-    )
-    for delivery in deliveries:
-        late_s = (delivery["model_t_ns"] - delivery["t_ns"]) * 1e-9
-        assert late_s >= 0
-        assert np.allclose(delivery["x_c"], expm(loop.H * late_s) @ delivery["x"], atol=1e-12)
-    period_ns = record.scenario.timing.controller_period_ns
-    untouched = np.diff(steps["input"]) == 1  # no delivery between the two ticks
-    # A delivery before a late tick may have advanced the model's time further.
-    untouched &= np.diff(steps["model_t_ns"]) == period_ns
-    assert untouched.mean() > 0.5
-    transition = expm(loop.H * period_ns * 1e-9)
-    free = steps["x_c"][:-1] @ transition.T
-    assert np.allclose(steps["x_c"][1:][untouched], free[untouched], rtol=1e-12, atol=1e-12)
-    assert (~untouched).sum() <= len(deliveries)
-
-
-def test_the_controller_receives_what_the_network_delivers(record: RunRecord) -> None:
-    packets, deliveries = record["netem_packet"], record["controller_delivery"]
+def test_the_controller_receives_what_the_network_delivers(live: RunRecord) -> None:
+    packets, deliveries = live["netem_packet"], live["controller_delivery"]
     sequence = np.array([read_header(head.tobytes()).sequence for head in packets["head"]])
     assert np.array_equal(sequence, np.arange(len(packets)))
     survivors = sequence[packets["fate"] != Fate.DROPPED]
     assert np.array_equal(deliveries["sequence"], survivors)
-    sent = record["sensor_measurement"]
+    sent = live["sensor_measurement"]
     events = sent[sent["event"] >= 0]
     assert np.array_equal(deliveries["x"], events["x"][deliveries["sequence"]])
     assert np.array_equal(deliveries["dropouts"], np.diff(survivors, prepend=-1) - 1)
 
 
-def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:
-    link = update_link_of(record.scenario)
+def test_the_fates_depend_on_the_seed_only(live: RunRecord) -> None:
+    link = update_link_of(live.scenario)
     fates = []
-    for _ in range(len(record["netem_packet"])):
+    for _ in range(len(live["netem_packet"])):
         outputs = link.handle(Datagram(0, b"anything"), 0)
         fates += [output.row[5] for output in outputs if isinstance(output, Record)]
-    assert np.array_equal(record["netem_packet"]["fate"], fates)
+    assert np.array_equal(live["netem_packet"]["fate"], fates)
 
 
-def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> None:
-    joined = align_tables(record)
-    residual = identity_residual(record)
+def test_identity_i1_holds_to_rounding_at_every_sample(live: RunRecord) -> None:
+    joined = align_tables(live)
+    residual = identity_residual(live)
     in_common = joined.t_ns >= 0
-    if record.scenario.network.initial_sync == "first_packet":
-        in_common = joined.t_ns >= record["controller_delivery"]["model_t_ns"][0]
+    if live.scenario.network.initial_sync == "first_packet":
+        in_common = joined.t_ns >= live["controller_delivery"]["model_t_ns"][0]
     assert np.array_equal(np.isnan(residual), ~in_common)
     # States of a few units and some thousand steps: rounding is far below any physical difference.
     assert residual[in_common].max() < 1e-11
@@ -226,14 +156,14 @@ def test_the_run_is_replayed_bit_for_bit(live: RunRecord, finished: Finished) ->
     assert found.gaps == []
     assert found.inputs == sum(len(live[table]) for table in tables(1, 1))
     assert all(leg.compared == leg.received > 0 for leg in found.messages)
-    assert finished.summary["loops"][0]["replay"] == found.verdict().model_dump()
+    assert finished.loop["replay"] == found.verdict().model_dump()
     assert finished.summary["kind"] == live.kind == "live"
 
 
 def test_fidelity_explains_the_difference_to_the_ideal_loop(
     finished: Finished,
 ) -> None:
-    fidelity = finished.summary["loops"][0]["fidelity"]
+    fidelity = finished.loop["fidelity"]
     assert fidelity["reason"] is None
     # All effects together explain the run up to rounding: 1e-14 of x, relative to a few per cent.
     assert fidelity["explained_relative"] < 1e-6
@@ -267,13 +197,13 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
 
 def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> None:
     """After missed deadlines, certificates are void and state time and cause."""
-    claims = [c for c in finished.summary["loops"][0]["claims"] if c["source"] in OWN_CLAIMS]
+    claims = [c for c in finished.loop["claims"] if c["source"] in OWN_CLAIMS]
     assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
     for claim in claims:
         assert claim["verdict"] in ("held", "void"), claim
         assert (claim["since_s"] is None) == (claim["verdict"] == "held")
         assert claim["verdict"] == "held" or claim["why"]
-    conditions = finished.summary["loops"][0]["conditions"]
+    conditions = finished.loop["conditions"]
     mansd = finished.summary["mansd"]
     assert 0 < conditions["dropouts"] <= mansd
     assert conditions["delay_s"] >= conditions["sampling_s"] / 2 > 0

@@ -117,6 +117,7 @@ def test_margin_plays_the_destabilising_pattern(tmp_path: Path) -> None:
         "plant__rate_hz": 20.0,
         "controller__rate_hz": 20.0,
         "horizon_s": 5.0,
+        "speed": 4.0,
     }
     trigger = ("--set", 'trigger={policy="periodic", period_s=0.5}')
     options = (*settings(**values), *trigger, "--no-period", "--play", "--runs", str(tmp_path))

@@ -33,13 +33,11 @@ def test_a_process_may_be_restarted_by_hand(
     assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
     assert "sensor ended early: SIGINT at " in finished.stderr
     assert "the run goes on, restart it with: noack sensor" in finished.stderr
-    (restart,) = finished.summary["loops"][0]["restarts"]
+    (restart,) = finished.loop["restarts"]
     assert restart["what"] == "restarted: sensor ended early: SIGINT"
-    assert finished.summary["loops"][0]["replay"]["bit_exact"]
-    assert finished.summary["loops"][0]["replay"][
-        "complete"
-    ]  # on SIGINT, a process delivers all rows
-    assert finished.summary["loops"][0]["missing_samples"] == 0
+    assert finished.loop["replay"]["bit_exact"]
+    assert finished.loop["replay"]["complete"]  # on SIGINT, a process delivers all rows
+    assert finished.loop["missing_samples"] == 0
     for process in (*processes.values(), again):
         process.communicate(timeout=PATIENCE_S)
     assert [processes[role].returncode for role in ("plant", "sensor")] == [130, 130]

@@ -26,7 +26,7 @@ def _print(name: str, *parts: bytes) -> None:
 def _records() -> None:
     for name in shipped_names("scenarios"):
         try:
-            record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=5"])))
+            record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=2"])))
         except CallerError:  # several loops, or a plant that needs an extra
             continue
         for table in sorted(record.tables):
@@ -43,7 +43,7 @@ def _batches() -> None:
         trigger = setting.trigger
         if policy:
             trigger = random_rule(policy, rng, n, trigger.weight)
-        setting = replace(setting, trigger=trigger, most_events=200)
+        setting = replace(setting, trigger=trigger, most_events=100)
         rows, events = run_with_events(setting, random_population(rng, setting, 3))
         times = (run.event_s.tobytes() for run in events)
         _print(f"batch {policy} n={n}", rows.tobytes(), *times)

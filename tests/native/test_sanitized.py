@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from collections.abc import Sequence
 
 import pytest
 
@@ -23,12 +24,6 @@ def run(*module: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def run_tests(*arguments: str) -> None:
-    """Run tests in such a process."""
-    done = run(*PYTEST, *arguments)
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]
-
-
 def test_the_end_of_each_array_is_known() -> None:
     done = run("tests.native.out_of_bounds")
     assert done.stderr.count("ERROR: AddressSanitizer: heap-buffer-overflow") == len(ENDS)
@@ -37,39 +32,18 @@ def test_the_end_of_each_array_is_known() -> None:
     assert (done.returncode, done.stdout) == (0, "")
 
 
-def test_random_machines_run_clean() -> None:
-    run_tests("tests/native/machines_under_sanitizers.py")
-
-
-def test_random_links_run_clean() -> None:
-    run_tests("tests/native/links_under_sanitizers.py")
-
-
-def test_random_exact_simulations_run_clean() -> None:
-    run_tests("tests/native/exact_under_sanitizers.py")
-
-
-def test_links_of_any_numbers_are_refused_or_run_clean() -> None:
-    run_tests("tests/fuzz/test_parsers.py", "-k", "link_numbers")
-
-
-def test_captures_of_any_events_are_refused_or_run_clean() -> None:
-    run_tests("tests/netem/capture/test_pcapng.py")
-
-
-def test_any_datagrams_are_read_clean() -> None:
-    run_tests(
-        "tests/fuzz/test_parsers.py", "tests/noack/protocol/test_wire_format.py", "-k", "wire"
-    )
-
-
-def test_simulations_and_replays_run_clean() -> None:
-    run_tests("tests/netem/test_channel.py", "tests/cosim/simulation/test_event_order.py")
-    run_tests(
-        "tests/cosim/analysis/test_replay.py", "-k", "numbers or exact or bit_for_bit or runs_end"
-    )
-    run_tests("tests/cosim/analysis/adversary/test_worst_patterns.py", "-k", "machines or early")
-
-
-def test_the_live_driver_runs_clean() -> None:
-    run_tests("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py")
+@pytest.mark.parametrize("arguments", [
+    ("tests/native/machines_under_sanitizers.py", "tests/native/links_under_sanitizers.py",
+     "tests/native/exact_under_sanitizers.py"),
+    ("tests/fuzz/test_parsers.py", "tests/netem/capture/test_pcapng.py",
+     "tests/noack/protocol/test_wire_format.py", "-k", "link_numbers or pcapng or wire"),
+    ("tests/netem/test_channel.py", "tests/cosim/simulation/test_event_order.py",
+     "tests/cosim/analysis/test_replay.py", "tests/cosim/analysis/adversary/test_worst_patterns.py",
+     "-k", "channel or event_order or (test_replay and (numbers or exact or bit_for_bit or "
+           "runs_end)) or (test_worst_patterns and (machines or early))"),
+    ("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py"),
+], ids=["random machines, links and exact simulations", "parsers", "simulations and replays",
+        "the live driver"])  # fmt: skip
+def test_these_tests_run_clean(arguments: Sequence[str]) -> None:
+    done = run(*PYTEST, *arguments)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[:4000]

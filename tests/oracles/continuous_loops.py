@@ -1,23 +1,20 @@
-"""Many runs of a loop in continuous time, compiled; independent of the project's code.
+"""Many runs of a loop in continuous time; independent of the project's code.
 
 Between events z = (x, x_s, x_c) follows ż = Fz, from node to node of the grid by the matrix
-exponential, and in a step with an event by its Taylor series; the event is found by bisection.
+exponential, and in a step with an event by its Taylor series; the event is found by dividing the
+step again and again.
 Values just before an event count, too.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
 
-from noack.core.linear_systems import Matrix, Vector
-from noack.plants.systems.code_cache import cache_folder, compiler
-from tests.oracles.lossy_loops import PART, STEPS, Flags, Reals, Steps, System
+from tests.oracles.lossy_loops import STEPS, Flags, Reals, Steps, System, norms
 
 _ORDER = 16
-_HALVINGS = 60
-_COMPILED = compiler(cache_folder("tests_continuous", [Path(__file__)]))
+_PARTS, _DIVISIONS = 16, 12
 
 
 class ContinuousTrace(NamedTuple):
@@ -50,87 +47,65 @@ def simulate_continuous_time(system: System, delivered: Flags, _: Steps) -> Cont
         system.K @ np.hstack([-eye, none, eye]),
         W @ E @ np.hstack([eye, none, none]),
     ]
-    rows = np.cumsum([0, *(len(one) for one in signals)])
-    largest, shortest_s = _follow(
-        F, np.ascontiguousarray(expm(F * system.step_s)), np.vstack(signals), rows, delivered,
-        np.tile(system.x0, 3), system.alpha, system.beta, system.step_s, STEPS,
-    )  # fmt: skip
+    e_s = signals[0].T
+    rows, begins = np.vstack(signals).T, np.cumsum([0, *(len(one) for one in signals[:-1])])
+    leap, step_s = expm(F * system.step_s).T, system.step_s
+    z, events = np.tile(system.x0, (len(delivered), 3)), np.zeros(len(delivered), dtype=np.int64)
+    largest, last_s = np.zeros((len(z), len(signals))), np.full(len(z), -np.inf)
+    shortest_s, running = np.inf, np.arange(len(z))
+
+    def is_above(error: Reals, t_s: Reals | float) -> Flags:
+        return np.asarray(norms(error) * np.exp(system.alpha * t_s) >= system.beta)
+
+    def note(which: Steps, t_s: Reals | float) -> None:
+        """Take the state of these runs into account."""
+        sizes = np.sqrt(np.add.reduceat((z[which] @ rows) ** 2, begins, axis=1))
+        grown = (sizes.T * np.exp(system.alpha * t_s)).T
+        largest[which] = np.maximum(largest[which], grown)
+
+    for step in range(STEPS):
+        following, end_s = z @ leap, (step + 1) * step_s
+        begin_s = np.full(len(z), step * step_s)
+        crossing = running[is_above(following[running] @ e_s, end_s)]
+        while len(crossing):
+            series, low_s = _series(F, z[crossing]), np.zeros(len(crossing))
+            errors = series @ e_s
+            width_s = end_s - begin_s[crossing]
+            for _ in range(_DIVISIONS):
+                width_s = width_s / _PARTS
+                ends_s = low_s + width_s * np.arange(1, _PARTS + 1)[:, None]
+                above = is_above(_at(errors, ends_s), begin_s[crossing] + ends_s)
+                low_s = low_s + width_s * np.argmax(above, axis=0)
+            now_s = begin_s[crossing] + low_s
+            z[crossing], begin_s[crossing] = _at(series, low_s[None])[0], now_s
+            note(crossing, now_s)
+            more = events[crossing] < delivered.shape[1]
+            running = np.setdiff1d(running, crossing[~more])
+            crossing, now_s = crossing[more], now_s[more]
+            shortest_s = min(shortest_s, (now_s - last_s[crossing]).min(initial=np.inf))
+            last_s[crossing] = now_s
+            z[crossing, n : 2 * n] = z[crossing, :n]
+            received = crossing[delivered[crossing, events[crossing]]]
+            z[received, 2 * n :] = z[received, :n]
+            events[crossing] += 1
+            following[crossing] = _at(_series(F, z[crossing]), (end_s - now_s)[None])[0]
+            crossing = crossing[is_above(following[crossing] @ e_s, end_s)]
+        z = following
+        note(running, end_s)
     return ContinuousTrace(*largest.T[..., None], float(shortest_s))
 
 
-@PART
-def _series(F: Matrix, z: Vector) -> Matrix:  # pragma: no cover
-    """The coefficients of e^{Fs} z, (order + 1, 3n)."""
-    found = np.empty((_ORDER + 1, len(z)))
-    found[0] = z
+def _series(F: Reals, z: Reals) -> Reals:
+    """The coefficients of e^{Fs} z, (order + 1, runs, 3n)."""
+    found = [z]
     for k in range(1, _ORDER + 1):
-        for i in range(len(z)):
-            total = 0.0
-            for j in range(len(z)):
-                total += F[i, j] * found[k - 1, j]
-            found[k, i] = total / k
+        found.append(found[-1] @ F.T / k)
+    return np.array(found)
+
+
+def _at(series: Reals, s: Reals) -> Reals:
+    """The values at times (k, runs), as (k, runs, 3n)."""
+    found = np.broadcast_to(series[-1], (*s.shape, series.shape[2]))
+    for coefficients in series[-2::-1]:
+        found = found * s[..., None] + coefficients
     return found
-
-
-@PART
-def _at(series: Matrix, s: float) -> Vector:  # pragma: no cover
-    found = series[_ORDER].copy()
-    for k in range(_ORDER - 1, -1, -1):
-        found = found * s + series[k]
-    return found
-
-
-@PART
-def _size(signals: Matrix, first: int, last: int, z: Vector) -> float:  # pragma: no cover
-    total = 0.0
-    for row in range(first, last):
-        value = 0.0
-        for i in range(len(z)):
-            value += signals[row, i] * z[i]
-        total += value * value
-    return np.sqrt(total)
-
-
-@_COMPILED
-def _follow(
-    F: Matrix, leap: Matrix, signals: Matrix, rows: Steps, delivered: Flags, start: Vector,
-    alpha: float, beta: float, step_s: float, steps: int,
-) -> tuple[Matrix, float]:  # fmt: skip  # pragma: no cover
-    runs, n, kinds = len(delivered), len(start) // 3, len(rows) - 1
-    largest, shortest_s = np.zeros((runs, kinds)), np.inf
-    for run in range(runs):
-        z, events, last_s = start.copy(), 0, -np.inf
-        now_s, ends_s = 0.0, step_s * steps
-        grid_s, at_node = step_s, True
-        while now_s < ends_s:
-            left_s = grid_s - now_s
-            after = leap @ z if at_node else _at(_series(F, z), left_s)
-            crossed = _size(signals, rows[0], rows[1], after) * np.exp(alpha * grid_s) >= beta
-            if crossed:
-                series, low_s, high_s = _series(F, z), 0.0, left_s
-                for _ in range(_HALVINGS):
-                    middle_s = 0.5 * (low_s + high_s)
-                    size = _size(signals, rows[0], rows[1], _at(series, middle_s))
-                    if size * np.exp(alpha * (now_s + middle_s)) >= beta:
-                        high_s = middle_s
-                    else:
-                        low_s = middle_s
-                left_s = low_s
-                after = _at(series, left_s)
-            now_s = now_s + left_s if crossed else grid_s
-            z, at_node = after, not crossed
-            for kind in range(kinds):
-                size = _size(signals, rows[kind], rows[kind + 1], z) * np.exp(alpha * now_s)
-                largest[run, kind] = max(largest[run, kind], size)
-            if not crossed:
-                grid_s += step_s
-                continue
-            if events == delivered.shape[1]:
-                break
-            shortest_s = min(shortest_s, now_s - last_s)
-            last_s = now_s
-            z[n : 2 * n] = z[:n]
-            if delivered[run, events]:
-                z[2 * n :] = z[:n]
-            events += 1
-    return largest, shortest_s

@@ -1,18 +1,15 @@
 """Random lossy loops, simulated exactly and many at a time; independent of the project's code.
 
-Every signal is propagated by matrix exponentials on a grid finer than every period of the loop. The
-steps are compiled. In the compiled part signals are rows, so all matrices are transposed.
+Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from hypothesis import HealthCheck, Phase, assume, settings
 from hypothesis import strategies as st
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -24,261 +21,13 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.plants.systems.code_cache import CALLED_BY_CODE, cache_folder, compiler
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 
-COMPILED = compiler(cache_folder("tests", [Path(__file__)]))
-"""Its lock keeps two processes of the tests from compiling the same."""
-PART = njit(**CALLED_BY_CODE)
 Reals = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
-
-
-class Schedule(NamedTuple):
-    """The times of a loop, in steps."""
-
-    known_start: bool
-    sample: int
-    hold: int
-    lag: int
-
-
-class Propagators(NamedTuple):
-    """Matrices over one step; the first index of a plant's is its number in the pool."""
-
-    K: Reals
-    """(n, m)"""
-    weight: Reals
-    both: Reals
-    """(plants, 2n, n): x of u = K x_c, from x and x_c."""
-    held: Reals
-    """(plants, n + m, n): x of a held input, from x and u."""
-    free: Reals
-    """(plants, n, n): x without an input."""
-    pushed: Reals
-    """(plants, n, n): x of a constant disturbance of ẋ."""
-    model: Reals
-    late: Reals
-    """(delays, n, n): the models' propagators over the delay of an update."""
-
-
-class State(NamedTuple):
-    """All runs between two steps; the last index is the run."""
-
-    x: Reals
-    """(n, runs)"""
-    x_s: Reals
-    x_c: Reals
-    arriving: Reals
-    """(slots, n, runs) an update in flight, as its value on arrival."""
-    arrives: Steps
-    """(slots, runs) number of the update, from 1; 0: none."""
-    newest: Steps
-    events: Steps
-    last_event: Steps
-    synchronised: Flags
-    commands: Reals
-    """(steps, m, runs)"""
-    commanded: Flags
-    """(steps, runs) whether there is a command."""
-
-
-class Given(NamedTuple):
-    """What does not depend on the state."""
-
-    threshold: Reals
-    """(steps,)"""
-    delivered: Flags
-    """(runs, events)"""
-    delays: Steps
-    """(runs, events)"""
-    plants: Steps
-    """(steps, runs) number of the plant in the pool; or (0, 0) for the only one."""
-    pushes: Reals
-    """(steps, n, runs); or (0, 0, 0) for none."""
-
-
-class Seen(NamedTuple):
-    """The results."""
-
-    trace: Reals
-    """(5, steps, runs)"""
-    inputs: Reals
-    """(steps, m, runs)"""
-    shortest: Steps
-    """(runs,) the shortest inter-event time in steps."""
-    states: Reals
-    """(2, steps, n, runs): x, and what the sensor knows of it."""
-    is_event: Flags
-    """(steps, runs)"""
-    received: Steps
-    """(steps, runs) number of the newest update that has arrived."""
-
-
-@PART
-def add_product(total: Reals, v: Reals, matrix: Reals, first: int) -> None:
-    """Add v M, of the rows of M from ``first`` on; v and the total have shapes (n, runs)."""
-    for j in range(total.shape[0]):
-        for i in range(v.shape[0]):
-            factor = matrix[first + i, j]
-            for run in range(v.shape[1]):
-                total[j, run] += factor * v[i, run]
-
-
-@PART
-def distances(found: Reals, v: Reals, w: Reals, matrix: Reals) -> None:
-    """Set ‖(v − w) M‖, (runs,); v and w have the shapes (n, runs)."""
-    rest, found[:] = np.empty_like(found), 0.0
-    for j in range(matrix.shape[1]):
-        rest[:] = 0.0
-        for i in range(v.shape[0]):
-            factor = matrix[i, j]
-            for run in range(v.shape[1]):
-                rest[run] += factor * (v[i, run] - w[i, run])
-        for run in range(v.shape[1]):
-            found[run] += rest[run] * rest[run]
-    for run in range(v.shape[1]):
-        found[run] = np.sqrt(found[run])
-
-
-@COMPILED
-def follow(
-    first: int, last: int, schedule: Schedule, own: Propagators, given: Given, state: State,
-    seen: Seen, known: Reals, event: Flags,
-) -> None:  # fmt: skip
-    """Simulate the steps first … last − 1 of all runs, in place.
-
-    ``known``, (n, runs), is what the sensor knows of x at the step ``first``; (n, 0): x. ``event``
-    says which runs have an event then; (0,): those above the threshold.
-    """
-    x, x_s, x_c, trace = state.x, state.x_s, state.x_c, seen.trace
-    size, everything = np.empty(x.shape[1]), np.eye(len(x))
-    nothing, has_input = np.zeros_like(x), np.zeros(x.shape[1], dtype=np.bool_)
-    for step in range(first, last):
-        estimate = known if step == first and known.size else x
-        distances(trace[0, step], x_s, x, own.weight)
-        if step % schedule.sample == 0:
-            distances(size, x_s, estimate, own.weight)
-            for run in range(len(size)):
-                trace[0, step, run] = max(trace[0, step, run], size[run])
-                goes = event[run] if len(event) else size[run] > given.threshold[step]
-                if goes or (step == 0 and not schedule.known_start):
-                    _send(run, step, own, given, state, seen, estimate)
-        _deliver(step % len(state.arrives), state)
-        seen.states[0, step], seen.states[1, step] = x, estimate
-        seen.received[step] = state.newest
-        _command(step, schedule, own, state)
-        u, has_input[:] = seen.inputs[step], False
-        if step >= schedule.lag:
-            has_input[:] = state.commanded[step - schedule.lag]
-            u[:] = state.commands[step - schedule.lag] * has_input
-        distances(trace[1, step], x_c, x, own.weight)
-        distances(size, x_c, estimate, own.weight)
-        trace[1, step] = np.maximum(trace[1, step], size) * state.synchronised
-        distances(trace[2, step], x, nothing, everything)
-        distances(trace[3, step], x, nothing, own.weight)
-        gap = u.copy()
-        add_product(gap, x, -own.K, 0)
-        trace[4, step] = np.sqrt((gap * gap).sum(axis=0)) * has_input
-        _advance(step, schedule, own, given, state, u, has_input)
-
-
-@PART
-def _send(
-    run: int, step: int, own: Propagators, given: Given, state: State, seen: Seen, estimate: Reals
-) -> None:
-    """Let an event happen: x_s is reset, and an update is lost or in flight."""
-    number = state.events[run]
-    if number > 0:
-        seen.shortest[run] = min(seen.shortest[run], step - state.last_event[run])
-    state.x_s[:, run] = estimate[:, run]
-    state.last_event[run], seen.is_event[step, run] = step, True
-    if given.delivered[run, number]:
-        delay = given.delays[run, number]
-        slot = (step + delay) % len(state.arrives)
-        for j in range(len(estimate)):
-            value = 0.0
-            for i in range(len(estimate)):
-                value += estimate[i, run] * own.late[delay, i, j]
-            state.arriving[slot, j, run] = value
-        state.arrives[slot, run] = number + 1
-    state.events[run] = number + 1
-
-
-@PART
-def _deliver(slot: int, state: State) -> None:
-    """Let the updates arrive that are due; an older one than the newest is discarded."""
-    for run in range(len(state.newest)):
-        if state.arrives[slot, run] > state.newest[run]:
-            state.x_c[:, run] = state.arriving[slot, :, run]
-            state.newest[run] = state.arrives[slot, run]
-            state.synchronised[run] = True
-        state.arrives[slot, run] = 0
-
-
-@PART
-def _command(step: int, schedule: Schedule, own: Propagators, state: State) -> None:
-    """Note the controller's command of this step."""
-    if schedule.hold == 0 or step % schedule.hold == 0:
-        add_product(state.commands[step], state.x_c, own.K, 0)
-        state.commanded[step] = state.synchronised
-    else:
-        state.commands[step] = state.commands[step - 1]
-        state.commanded[step] = state.commanded[step - 1]
-
-
-@PART
-def _advance(
-    step: int, schedule: Schedule, own: Propagators, given: Given, state: State, u: Reals,
-    has_input: Flags,
-) -> None:  # fmt: skip
-    """Propagate x, x_s and x_c over one step; u = K x_c changes with x_c unless it is held."""
-    x, x_s, x_c = state.x, state.x_s, state.x_c
-    n = len(x)
-    following = np.zeros_like(x)
-    for plant in range(len(own.free)):
-        moved = np.zeros_like(x)
-        if schedule.hold > 0:
-            add_product(moved, x, own.held[plant], 0)
-            add_product(moved, u, own.held[plant], n)
-        elif has_input.any():
-            add_product(moved, x, own.both[plant], 0)
-            add_product(moved, x_c, own.both[plant], n)
-        if schedule.hold == 0 and not has_input.all():
-            free = np.zeros_like(x)
-            add_product(free, x, own.free[plant], 0)
-            moved = np.where(has_input, moved, free)
-        if len(given.pushes):
-            add_product(moved, given.pushes[step], own.pushed[plant], 0)
-        if len(own.free) == 1:
-            following = moved
-        else:
-            following += np.where(given.plants[step] == plant, moved, 0.0)
-    x[:] = following
-    for models in (x_s, x_c):
-        moved = np.zeros_like(x)
-        add_product(moved, models, own.model, 0)
-        models[:] = moved
-
-
-@COMPILED
-def allow(lost: Flags, mansd: int, most: int, width: int, recovery: int) -> None:
-    """Deliver what the guarantee does not allow to be lost, (runs, events), in place."""
-    for run in range(lost.shape[0]):
-        burst, since = 0, recovery
-        for event in range(lost.shape[1]):
-            if lost[run, event]:
-                recent = lost[run, max(event - width + 1, 0) : event].sum()
-                if burst >= mansd or recent >= most or (burst == 0 and since < recovery):
-                    lost[run, event] = False
-            if lost[run, event]:
-                burst, since = burst + 1, 0
-            else:
-                burst, since = 0, since + 1
-
 
 RUNS, STEPS = 128, 240
 
@@ -475,78 +224,99 @@ def simulate(
         estimate: what the sensor knows of x; errors are the larger of those to it and to x.
         rule: replaces the decaying threshold.
     """
-    runs, (n, m) = len(delivered), system.B.shape
+    runs, (n, m), K, W = len(delivered), system.B.shape, system.K.T, system.weight.T
     pool = [(system.A, system.B)] if plants is None else plants.pool
-    given = Given(
-        np.maximum(system.beta * np.exp(-system.alpha * times_s(system)), floor),
-        delivered, delays,
-        np.zeros((0, 0), dtype=np.int64) if plants is None else plants.which.T.copy(),
-        np.zeros((0, 0, 0)) if pushes is None else pushes.transpose(1, 2, 0).copy(),
+    steps = [_Propagators(system, A, B) for A, B in pool]
+    threshold = np.maximum(system.beta * np.exp(-system.alpha * times_s(system)), floor)
+    x = np.tile(system.x0, (runs, 1))
+    x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
+    # An update in flight is its value on arrival; 0 in ``arrives``: no update.
+    slots, every = system.delay_steps + 1, np.arange(runs)
+    arriving, arrives = np.zeros((runs, slots, n)), np.zeros((runs, slots), dtype=np.int64)
+    newest, events, last_event = (np.zeros(runs, dtype=np.int64) for _ in range(3))
+    synchronised, shortest = np.full(runs, system.known_start), 10**9
+    commands: list[tuple[Reals, Flags]] = []
+    inputs = np.zeros((STEPS, runs, m))
+    sensor_error, states = np.zeros((STEPS, runs)), np.zeros((3, STEPS, runs, n))
+    is_event, has_input, has_state = (np.zeros((STEPS, runs), bool) for _ in range(3))
+    received = np.zeros((STEPS, runs), dtype=np.int64)
+    for step in range(STEPS):
+        sensor_error[step], known = norms((x_s - x) @ W), x
+        if step % system.sample_steps == 0:
+            since = max(step - system.sample_steps, 0)
+            known = estimate(step, x, list(inputs[since:step]))
+            tested = norms((x_s - known) @ W)
+            sensor_error[step] = np.maximum(sensor_error[step], tested)
+            event = tested > threshold[step]
+            if rule is not None:
+                event = rule(step, step - last_event, x, x_s - x)
+            event = event | (step == 0 and not system.known_start)
+            again = event & (events > 0)
+            shortest = min(shortest, int((step - last_event)[again].min(initial=10**9)))
+            x_s, last_event = (
+                np.where(event[:, None], known, x_s),
+                np.where(event, step, last_event),
+            )
+            sent = np.flatnonzero(event & delivered[every, events])
+            delay = delays[sent, events[sent]]
+            slot = (step + delay) % slots
+            arriving[sent, slot] = np.einsum("ri,rij->rj", known[sent], steps[0].late[delay])
+            arrives[sent, slot] = events[sent] + 1
+            events, is_event[step] = events + event, event
+        now = step % slots
+        fresh = arrives[:, now] > newest
+        x_c = np.where(fresh[:, None], arriving[:, now], x_c)
+        newest, arrives[:, now] = np.where(fresh, arrives[:, now], newest), 0
+        synchronised = synchronised | fresh
+        is_new = system.hold_steps == 0 or step % system.hold_steps == 0
+        commands.append((x_c @ K, synchronised) if is_new else commands[-1])
+        if step >= system.lag:
+            u, has_input[step] = commands[step - system.lag]
+            inputs[step] = u * has_input[step][:, None]
+        states[:, step], has_state[step], received[step] = (x, known, x_c), synchronised, newest
+        push = None if pushes is None else pushes[:, step]
+        following = [one.advance(x, x_c, inputs[step], has_input[step], push) for one in steps]
+        x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
+        x_s, x_c = x_s @ steps[0].model, x_c @ steps[0].model
+    xs, knowns, x_cs = states
+    controller_error = np.maximum(norms((x_cs - xs) @ W), norms((x_cs - knowns) @ W)) * has_state
+    seen = (
+        sensor_error, controller_error, norms(xs), norms(xs @ W),
+        norms(inputs - xs @ K) * has_input,
     )  # fmt: skip
-    state, own = _start(system, runs), _propagators(system, pool)
-    schedule = Schedule(
-        system.known_start, system.sample_steps, system.hold_steps, system.lag
-    )  # fmt: skip
-    seen = Seen(
-        np.zeros((5, STEPS, runs)), np.zeros((STEPS, m, runs)), np.full(runs, 10**9),
-        np.zeros((2, STEPS, n, runs)), np.zeros((STEPS, runs), dtype=bool),
-        np.zeros((STEPS, runs), dtype=np.int64),
-    )  # fmt: skip
-    # What is called here is called at every test; otherwise all steps are compiled.
-    every = system.sample_steps if rule or estimate is not exact_state else STEPS
-    for step in range(0, STEPS, every):
-        known, event, x = np.zeros((n, 0)), np.zeros(0, dtype=bool), state.x.T
-        if estimate is not exact_state:
-            inputs = seen.inputs[max(step - every, 0) : step].transpose(0, 2, 1)
-            known = estimate(step, x, list(inputs)).T.copy()
-        if rule is not None:
-            event = rule(step, step - state.last_event, x, state.x_s.T - x)
-        last = min(step + every, STEPS)
-        follow(step, last, schedule, own, given, state, seen, known, event)
-    shortest_s = int(seen.shortest.min()) * system.step_s
     return Trace(
-        *seen.trace.transpose(0, 2, 1), shortest_s, *seen.states.transpose(0, 3, 1, 2),
-        seen.is_event.T, seen.received.T,
+        *(one.T for one in seen), shortest * system.step_s,
+        xs.transpose(1, 0, 2), knowns.transpose(1, 0, 2), is_event.T, received.T,
     )  # fmt: skip
 
 
 def norms(rows: Reals) -> Reals:
-    return np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    """The norms of vectors along the last axis."""
+    return np.asarray(np.sqrt(np.einsum("...j,...j->...", rows, rows)))
 
 
-def _start(system: System, runs: int) -> State:
-    n, m = system.B.shape
-    x, none = np.tile(system.x0[:, None], runs), np.zeros(runs, dtype=np.int64)
-    slots = system.delay_steps + 1
-    return State(
-        x, x.copy(), x.copy() if system.known_start else np.zeros_like(x),
-        np.zeros((slots, n, runs)), np.zeros((slots, runs), dtype=np.int64),
-        none, none.copy(), none.copy(), np.full(runs, system.known_start),
-        np.zeros((STEPS, m, runs)), np.zeros((STEPS, runs), dtype=bool),
-    )  # fmt: skip
+class _Propagators:
+    """Matrices over one step, transposed, as states are rows."""
 
+    def __init__(self, system: System, A: Matrix, B: Matrix) -> None:
+        (n, m), step_s = B.shape, system.step_s
+        both, held, pushed = (np.zeros((n + k, n + k)) for k in (n, m, n))
+        both[:n], both[n:, n:] = np.hstack([A, B @ system.K]), system.H
+        held[:n], pushed[:n] = np.hstack([A, B]), np.hstack([A, np.eye(n)])
+        self.is_held = system.hold_steps > 0
+        self.both, self.held = expm(both * step_s).T[:, :n], expm(held * step_s).T[:, :n]
+        self.free, self.model = expm(A * step_s).T, expm(system.H * step_s).T
+        self.pushed = expm(pushed * step_s)[:n, n:].T
+        self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
 
-def _propagators(system: System, pool: list[tuple[Matrix, Matrix]]) -> Propagators:
-    """Propagators over one step, for the system or for the plants between which it switches."""
-    (n, m), step_s = system.B.shape, system.step_s
-    both, held = np.zeros((len(pool), 2 * n, 2 * n)), np.zeros((len(pool), n + m, n + m))
-    pushed = np.zeros((len(pool), 2 * n, 2 * n))
-    for i, (A, B) in enumerate(pool):
-        both[i, :n, :n], both[i, :n, n:], both[i, n:, n:] = A, B @ system.K, system.H
-        held[i, :n, :n], held[i, :n, n:] = A, B
-        pushed[i, :n, :n], pushed[i, :n, n:] = A, np.eye(n)
-
-    def propagated(generators: Matrix, columns: slice) -> Matrix:
-        return np.ascontiguousarray(expm(generators * step_s)[:, :n, columns].transpose(0, 2, 1))
-
-    everything = slice(None)
-    late = np.array([k * system.H for k in range(system.delay_steps + 1)])
-    return Propagators(
-        np.ascontiguousarray(system.K.T), np.ascontiguousarray(system.weight.T),
-        propagated(both, everything), propagated(held, everything),
-        propagated(both[:, :n, :n], everything), propagated(pushed, slice(n, None)),
-        np.ascontiguousarray(expm(system.H * step_s).T), propagated(late, everything),
-    )  # fmt: skip
+    def advance(self, x: Reals, x_c: Reals, u: Reals, has_input: Flags, push: Any) -> Reals:
+        """x of all runs one step later; u = K x_c changes with x_c unless it is held."""
+        if self.is_held:
+            following = np.hstack([x, u]) @ self.held
+        else:
+            following = np.hstack([x, x_c]) @ self.both
+            following = np.where(has_input[:, None], following, x @ self.free)
+        return following if push is None else following + push @ self.pushed
 
 
 def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
@@ -562,11 +332,17 @@ def networks(seed: int, system: System) -> tuple[Flags, NDArray[np.int64]]:
 
 def allowed(lost: Flags, system: System) -> Flags:
     """The losses (runs, events) without those that the guarantee does not allow."""
-    lost = lost.copy()
+    lost, (runs, events) = lost.copy(), lost.shape
     if not system.known_start:
         lost[:, 0] = False
+    burst, since = np.zeros(runs, dtype=np.int64), np.full(runs, system.recovery)
     most, width = system.window if system.window[0] < system.window[1] else (1, 1)
-    allow(lost, system.mansd, most, width, system.recovery)
+    for event in range(events):
+        recent = lost[:, max(event - width + 1, 0) : event].sum(axis=1)
+        lost[:, event] &= (burst < system.mansd) & (recent < most)
+        lost[:, event] &= (burst > 0) | (since >= system.recovery)
+        burst = np.where(lost[:, event], burst + 1, 0)
+        since = np.where(lost[:, event], 0, since + 1)
     return lost
 
 

@@ -1,6 +1,7 @@
-"""Run the commands of the documentation."""
+"""Run the commands, the snippets and the example programs of the documentation."""
 
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -12,7 +13,13 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from tests.pages import PAGES, ROOT, blocks, fill
+from tests.pages import PAGES, ROOT, blocks, fill, target_exists
+
+EXAMPLES = ROOT / "docs/examples"
+FIGURES = {
+    "own_plant": {"own_plant.svg", "own_plant_errors.svg"},
+    "model_or_hold": {"model_or_hold.svg"},
+}
 
 
 def commands() -> Iterator[str]:
@@ -51,11 +58,7 @@ def test_every_command_works(
 ) -> None:
     program, *words = shlex.split(command.partition(" > ")[0])
     if program == "make":
-        # Running a make target could run this test again: check only that the target exists.
-        done = subprocess.run(
-            ["make", "--dry-run", *words], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+        assert target_exists(command)
         return
     assert program == "noack"
     if command in blocks("README.md", "sh")[-1]:
@@ -81,3 +84,48 @@ def emulate(words: list[str], folder: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=250)
     assert process.returncode == 0, stderr
+
+
+def snippets() -> list[str]:
+    """Return programs; a snippet that begins with a file name is a file instead."""
+    pages = ("docs/plants.md", "docs/record.md", "docs/library.md", "docs/howto.md")
+    found = [code for page in pages for code in blocks(page, "python")]
+    return [snippet for snippet in found if not snippet.startswith("#")]
+
+
+@pytest.mark.parametrize("snippet", snippets())
+def test_every_snippet_runs(
+    snippet: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(run_folder)
+    exec(compile(snippet, "snippet", "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.strip()
+
+
+def test_every_example_has_a_test() -> None:
+    assert {path.stem for path in EXAMPLES.iterdir()} == FIGURES.keys()
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_an_example_runs_and_leaves_its_figures(name: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py"],
+        cwd=tmp_path, env=os.environ | {"MPLBACKEND": "Agg"},
+        capture_output=True, text=True, check=False, timeout=250,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    assert done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == FIGURES[name]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_an_example_is_in_the_percent_format(name: str) -> None:
+    """The percent format: prose and code cells alternate, and the page begins with its title."""
+    first, *cells = (EXAMPLES / f"{name}.py").read_text().split("\n# %%")
+    assert first.startswith("# %% [markdown]\n# # ")
+    for cell in cells:
+        kind, _, body = cell.partition("\n")
+        prose = [line.startswith("#") for line in body.strip().splitlines()]
+        assert all(prose) if kind == " [markdown]" else (kind == "" and not any(prose))
