@@ -5,12 +5,12 @@ The report of a run is served below the page's address.
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
@@ -19,7 +19,7 @@ from noack.core.errors import NoackError
 
 def replayed(directory: Path) -> str:
     """Replay a run; called in the worker process."""
-    import noack
+    import noack  # the worker's
 
     found = noack.open_run(directory).replay()
     return (
@@ -31,7 +31,7 @@ def replayed(directory: Path) -> str:
 
 def compared(directory: Path) -> str:
     """Compare a run with the ideal loop; called in the worker process."""
-    import noack
+    import noack  # the worker's
 
     return str(noack.open_run(directory).fidelity().verdict)
 
@@ -72,7 +72,7 @@ class RunsPanel:
         self.refresh()
         self._select.set_value(name)
 
-    def _open(self, event: Any) -> None:
+    def _open(self, event: ValueChangeEventArguments[str]) -> None:
         if not event.value:
             return
         directory = self._services.runs / event.value
@@ -86,7 +86,7 @@ class RunsPanel:
             report.props(f'src="{_address(directory.name)}" title="report of the run"')
             report.on("load", lambda: waiting.set_visibility(False))
 
-    def _on_request(self, words: str, function: Any, directory: Path) -> None:
+    def _on_request(self, words: str, function: Callable[[Path], str], directory: Path) -> None:
         answer = ui.label()
 
         async def ask() -> None:
@@ -135,6 +135,6 @@ def serve_reports(application: FastAPI, services: LabServices) -> None:
 
 def report_page(directory: Path) -> bytes:
     """Return the report of a run, which is written if missing; called in the worker process."""
-    from cosim.live.finalize import run_report
+    from cosim.live.finalize import run_report  # the worker's
 
     return run_report(directory).read_bytes()

@@ -37,15 +37,20 @@ from cosim.output.figure_description import (
     Spans,
     finite,
 )
-from cosim.output.figure_placing import (
+from cosim.output.figure_layout import (
     BAR_IN,
+    PAPER,
+    POINTS_PER_IN,
     Box,
+    NotebookFigure,
     Place,
+    layout,
     legend_rows,
     legend_text,
     place_panels,
+    rgb,
+    settings,
 )
-from cosim.output.figure_style import PAPER, POINTS_PER_IN, NotebookFigure, layout, rgb, settings
 from cosim.record.align import Reals
 
 Shown = tuple[Artist, str]
@@ -77,7 +82,7 @@ _ELSEWHERE = str.maketrans({
 
 
 def draw(described: FigureDescription) -> Figure:
-    """Draw a figure for the width of :func:`cosim.output.figure_style.figure_width`."""
+    """Draw a figure for the width of :func:`cosim.output.figure_layout.figure_width`."""
     with settings():
         return _drawn(described)
 

@@ -474,7 +474,7 @@ def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]
         window: the viewer's process.
         output: its log, which contains the address at which it accepts requests.
     """
-    from rerun.experimental import ViewerClient
+    from rerun.experimental import ViewerClient  # slow to import
 
     with output:
         port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)

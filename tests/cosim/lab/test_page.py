@@ -24,6 +24,10 @@ def test_dragging_changes_the_run_and_the_address(browser: Browser, address: str
     # The address has the settings: another tab opens them.
     other = Page(browser, page.js("location.href"))
     other.wait(f"{TEXT}.includes('lost\\n0')")
+    # From then on, each tab has its own settings.
+    other.drag("loss probability", 1.0)
+    other.wait("location.search.includes('network.loss.probability=1')")
+    assert page.js(r"/loss\.probability=0(\.0)?(&|$)/.test(location.search)")
 
 
 def test_one_slider_makes_the_loop_unstable_and_the_page_says_why(

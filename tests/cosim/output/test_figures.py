@@ -30,7 +30,7 @@ from cosim.output.figure_description import (
 )
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline, save_figure
-from cosim.output.figure_style import figure_width, rgb, settings
+from cosim.output.figure_layout import figure_width, rgb, settings
 from cosim.output.page_kit import PAGES
 from cosim.output.run_figures import (
     Trajectory,
