@@ -33,7 +33,7 @@ LINES = {
     "cosim/lab": 2030,
     "cosim/live": 3550,
     "cosim/measurement": 2900,
-    "cosim/output": 7850,
+    "cosim/output": 8140,
     "cosim/record": 3250,
     "cosim/simulation": 1650,
     "cosim/studies": 6000,
