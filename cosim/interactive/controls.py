@@ -187,8 +187,9 @@ def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
     base = _base_of(draft)
     for key in slider.scaled:
         matrix = np.array(base.value(key), dtype=np.float64)
-        draft = draft.with_value(key, [[float(f"{value * one:.6g}") for one in row]
-                                       for row in matrix.tolist()])  # fmt: skip
+        draft = draft.with_value(
+            key, [[float(f"{value * one:.6g}") for one in row] for row in matrix.tolist()]
+        )
     return draft
 
 

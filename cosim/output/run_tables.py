@@ -94,7 +94,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
         *(network_rows(summary)[:_FEW] if shared else of_loop),
         ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
         ("directory", str(directory)),
-    ]  # fmt: skip
+    ]
 
 
 # One loop

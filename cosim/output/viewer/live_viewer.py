@@ -96,9 +96,7 @@ class RecordingServer:
         self.downloaded = threading.Event()
         self._downloads = 0
         self._lock = threading.Lock()
-        self._secret, self._window_secret = (
-            secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2)
-        )  # fmt: skip
+        self._secret, self._window_secret = (secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2))
         if not follow:
             self.finished.set()
         try:
