@@ -18,10 +18,9 @@ from cosim.output.figure_description import FigureDescription
 from cosim.output.figure_files import save_figure
 from cosim.output.run_figures import Trajectory, Transmissions, states_figure
 from cosim.simulation.continuous import run_continuous, timeless
-from cosim.studies.campaign.campaign_claims import CONFIRMED_FROM, PARTLY_FROM, share_text
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_summary import runs_at
-from cosim.studies.campaign.finished_campaign import FinishedCampaign
+from cosim.studies.campaign.campaign_report import FinishedCampaign
+from cosim.studies.campaign.campaign_summary import CONFIRMED_FROM, PARTLY_FROM, runs_at, share_text
 from cosim.studies.campaign.metrics import METRICS, Metric, quartiles
 from cosim.studies.paper.paper_evidence import MODES, evidence, resolved_draw
 from netem.channel import UPDATE_LINK
@@ -77,8 +76,10 @@ def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Pat
     found, inner = numbers(done), make_folder(folder)
     draw, scenario = found["representative"], _base(done)
     described = {one.name: one for one in figures(done.summary, done.store)}
-    described |= {policy.lower(): draw_figure(scenario, draw, mode)
-                  for policy, mode in zip(POLICIES, MODES, strict=True)}  # fmt: skip
+    described |= {
+        policy.lower(): draw_figure(scenario, draw, mode)
+        for policy, mode in zip(POLICIES, MODES, strict=True)
+    }
     written = [
         write_whole(folder / "paper.md", render(found)),
         write_whole(inner / "paper.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n"),
