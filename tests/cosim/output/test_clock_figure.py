@@ -2,7 +2,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cosim.output.signal_figures import ClockErrors
 
 from cosim.output.figure_drawing import draw
 from cosim.output.run_figures import ClockErrors, clock_errors, run_figures
