@@ -138,9 +138,9 @@ def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> 
 
 
 def test_a_figure_without_data_states_that() -> None:
-    for name, figure in drawn_for("empty").items():
-        texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-        assert {"no data", "no loss"} & {*texts} or name == "states", name
+    for name, describe in run_figures(CASES["empty"](), timed=True).items():
+        for axes in draw(describe()).axes:
+            assert {"no data", "no loss"} & {text.get_text() for text in axes.texts}, name
 
 
 def spike(k: int) -> np.ndarray:
