@@ -30,7 +30,7 @@ LINES = {
     "cosim/cli": 2850,
     "cosim/doctor": 800,
     "cosim/interactive": 1580,
-    "cosim/lab": 2030,
+    "cosim/lab": 2050,
     "cosim/live": 3550,
     "cosim/measurement": 2870,
     "cosim/output": 8140,

@@ -3,6 +3,7 @@
 The report of a run is served below the page's address.
 """
 
+from asyncio import CancelledError
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from urllib.parse import quote
@@ -118,19 +119,28 @@ def _address(name: str) -> str:
     return f"report/{quote(name)}"
 
 
-def serve_reports(application: FastAPI, services: LabServices) -> None:
-    """Serve the reports of recorded runs below the page's address; a missing one is written."""
+def serve_reports(application: FastAPI, services: LabServices) -> PageCalls:
+    """Serve the reports of recorded runs below the page's address; a missing one is written.
+
+    Returns:
+        The reports that are being written, which the end of the server gives up.
+    """
+    calls = PageCalls(services)
 
     @application.get("/report/{name}")
     async def report(name: str) -> Response:
         if name not in services.recorded():
             return PlainTextResponse(f"no run {name} is recorded in {services.runs}", 404)
         try:
-            page = await services.compute(report_page, services.runs / name)
+            page = await calls.compute(report_page, services.runs / name)
+        except CancelledError:
+            return PlainTextResponse("noack lab has ended", 503)
         except NoackError as error:
             return PlainTextResponse(str(error), 409)
         headers = {"content-security-policy": _POLICY, "cache-control": "no-store"}
         return HTMLResponse(page, headers=headers)
+
+    return calls
 
 
 def report_page(directory: Path) -> bytes:
