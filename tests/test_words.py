@@ -7,6 +7,7 @@ import pytest
 
 from cosim.output.glossary import as_markdown
 from tests.pages import ROOT
+from cosim.output.page_kit import glossary
 
 PHRASES = (
     "lost that nobody ordered", "lost outside the emulator", "in the long run, at most",
@@ -48,7 +49,7 @@ def test_no_phrase_of_the_list_is_left() -> None:
 
 
 def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
-    assert as_markdown() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
+    assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])

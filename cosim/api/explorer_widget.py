@@ -22,7 +22,7 @@ from cosim.interactive.exploration_figure import (
     exploration_figure,
 )
 from cosim.output.figure_drawing import draw
-from cosim.output.figure_style import settings
+from cosim.output.figure_layout import settings
 from noack.core.errors import NoackError
 from noack.core.number_format import as_html
 

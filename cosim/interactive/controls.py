@@ -36,7 +36,7 @@ _BELOW = 0.99
 """The largest share of a limit that must not be reached."""
 _SEEDS = 200
 _MOST_MODEL_ERROR = 20.0
-_LOSSES: Mapping[str, Mapping[str, Any]] = {
+_LOSSES: Mapping[str, Mapping[str, object]] = {
     "bernoulli": {"probability": 0.5},
     "gilbert_elliott": {"mean_loss": 0.5, "mean_burst": 3.0},
     "worst_case": {},
@@ -49,7 +49,7 @@ _LOSS_NAMES = {
     "worst_case": "worst case",
     "lossless": "no losses",
 }
-_WINDOW: Mapping[str, Any] = {"kind": "at_most", "losses": 5, "window": 10}
+_WINDOW: Mapping[str, object] = {"kind": "at_most", "losses": 5, "window": 10}
 
 
 @dataclass(frozen=True)
@@ -187,8 +187,9 @@ def dragged(draft: Draft, slider: Slider, value: float) -> Draft:
     base = _base_of(draft)
     for key in slider.scaled:
         matrix = np.array(base.value(key), dtype=np.float64)
-        draft = draft.with_value(key, [[float(f"{value * one:.6g}") for one in row]
-                                       for row in matrix.tolist()])  # fmt: skip
+        draft = draft.with_value(
+            key, [[float(f"{value * one:.6g}") for one in row] for row in matrix.tolist()]
+        )
     return draft
 
 
@@ -461,7 +462,7 @@ def _resolved(schema: Schema) -> Schema:
     return schema
 
 
-def _group(key: str, schema: Schema, help_: str, content: Any, default: Any) -> Group:
+def _group(key: str, schema: Schema, help_: str, content: object, default: object) -> Group:
     """Return the group of a table: of the kind that the content has, if there are kinds."""
     content = content if isinstance(content, Mapping) else {}
     default = default if isinstance(default, Mapping) else {}
@@ -500,7 +501,7 @@ def _kinds(schema: Schema) -> dict[str, Any]:
     return found
 
 
-def _field(key: str, label: str, schema: Schema, help_: str, default: Any) -> Field:
+def _field(key: str, label: str, schema: Schema, help_: str, default: object) -> Field:
     options = tuple(map(_text, schema.get("enum", ())))
     kind = FieldKind.CHOICE if options else FieldKind.TOML
     if schema.get("type") == "boolean":
@@ -510,7 +511,7 @@ def _field(key: str, label: str, schema: Schema, help_: str, default: Any) -> Fi
     return Field(key, label, " ".join(help_.split()), kind, _text(default), options)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None:
         return ""
     return value if isinstance(value, str) else value_text(value)

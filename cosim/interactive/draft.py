@@ -87,7 +87,7 @@ class Draft:
         found = leaf(self.content, key)
         return None if found is _ABSENT else found
 
-    def with_value(self, key: str, value: Any) -> "Draft":
+    def with_value(self, key: str, value: object) -> "Draft":
         """Return the draft with another value of a key; comments are kept where possible."""
         return self._changed(lambda content: put(content, key, value, key))
 
@@ -129,7 +129,7 @@ def leaf(content: Mapping[str, Any], key: str) -> Any:
     return table
 
 
-def differences(base: Any, content: Any, key: str = "") -> list[tuple[str, str]]:
+def differences(base: object, content: object, key: str = "") -> list[tuple[str, str]]:
     """Return the keys that differ, with their values as TOML; empty for a key that is gone."""
     if isinstance(base, Mapping) and isinstance(content, Mapping):
         found = []
@@ -237,7 +237,7 @@ def changed_text(
     return toml_text(wanted)
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Return a value as TOML on one line; tables are inline tables."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {value_text(one)}" for key, one in value.items()) + " }"

@@ -251,9 +251,10 @@ class DraftResults:
         if CERTIFICATE in self.known:
             found = self.certificate
             groups["certificate"] = [
-                ("certificate", f"{found.verdict}: {found.reason}"), *found.rows,
+                ("certificate", f"{found.verdict}: {found.reason}"),
+                *found.rows,
                 *((what, f"{verdict} ({why})") for verdict, what, why in found.assumptions),
-            ]  # fmt: skip
+            ]
         if MARGIN in self.known:
             groups["margin"] = [
                 ("margin", self.margin.verdict),

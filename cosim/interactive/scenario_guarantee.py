@@ -133,8 +133,9 @@ def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None
     """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
     parts = []
     if run.diverged_at_s is not None:
-        parts.append(f"The loop is unstable under these losses: it diverged at "
-                     f"{run.diverged_at_s:.3g} s.")  # fmt: skip
+        parts.append(
+            f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s."
+        )
     elif run.x_norm[-1] > run.x_norm[0]:
         first, last = (number(float(run.x_norm[i]), 3) for i in (0, -1))
         parts.append(f"‖x‖ grows from {first} to {last}.")

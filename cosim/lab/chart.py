@@ -35,8 +35,9 @@ _FONT_PX = 13
 _PIXELS_PER_POINT = 4 / 3
 _DASHES = {DASHED: "dashed", DOTTED: "dotted"}
 _CROSS: Options = {
-    "symbol": "path://M2 0L5 3L8 0L10 2L7 5L10 8L8 10L5 7L2 10L0 8L3 5L0 2Z", "symbolSize": 9,
-}  # fmt: skip
+    "symbol": "path://M2 0L5 3L8 0L10 2L7 5L10 8L8 10L5 7L2 10L0 8L3 5L0 2Z",
+    "symbolSize": 9,
+}
 _DOT: Options = {"symbol": "circle", "symbolSize": 8}
 
 

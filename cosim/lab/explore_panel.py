@@ -1,9 +1,9 @@
 """The figure of the run, its key numbers, and what is guaranteed."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 
 from cosim.interactive.exploration_figure import Shown, exploration_figure
 from cosim.interactive.scenario_guarantee import CERTIFIED
@@ -93,7 +93,7 @@ class ExplorePanel:
         if len(names) < 2:
             return
 
-        async def chosen(event: Any) -> None:
+        async def chosen(event: ValueChangeEventArguments[int]) -> None:
             session.state = event.value
             await session.on_drawn()
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 from pyarrow import csv
 
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
@@ -27,7 +28,7 @@ from cosim.lab.live_panel import LivePanel
 from cosim.lab.runs_panel import RunsPanel
 from cosim.lab.settings_panel import SettingsPanel
 from cosim.output.figure_format import FigureFormat, figure_width_in
-from cosim.output.glossary import TERMS
+from cosim.output.page_kit import TERMS
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 from noack.core.linear_systems import Vector
@@ -128,8 +129,10 @@ class _Page:
         await self._session.change(self._session.draft)
         await self._live.begin()
 
-    async def _show_tab(self, event: Any) -> None:
-        self._tab = event.value
+    async def _show_tab(
+        self, event: ValueChangeEventArguments[str | ui.tab | ui.tab_panel | None]
+    ) -> None:
+        self._tab = str(event.value)
         self._live.remove_old_viewer()
         if event.value == _RUNS:
             self._runs.refresh()
@@ -170,7 +173,7 @@ class _Page:
             return
         ui.run_javascript(f"labShowQuery({query})")
 
-    async def _choose(self, event: Any) -> None:
+    async def _choose(self, event: ValueChangeEventArguments[str]) -> None:
         if event.value == self._session.draft.base:
             return
         try:
@@ -287,6 +290,7 @@ def csv_of(run: Exploration) -> bytes:
 
 def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
+    # Imported here: only the worker needs matplotlib.
     from cosim.interactive.exploration_figure import exploration_figure
     from cosim.output.figure_files import file_content
 

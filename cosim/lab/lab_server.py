@@ -67,7 +67,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
         async def lab() -> None:
             await show_page(services)
 
-        serve_reports(application, services)
+        reports = serve_reports(application, services)
         # Without a history of messages: each redraw is one. A reconnected page loads itself again.
         ui.run_with(
             application, title="noack lab", favicon="🧪", dark=None, message_history_length=0,
@@ -84,7 +84,7 @@ def serve(options: LabOptions, announce: Callable[[str], None]) -> None:
             if options.open_browser:
                 webbrowser.open(f"{origin}/{opening if _CAN_CHECK else secret}/{query}")
 
-        server = _Server(config, announced)
+        server = _Server(config, announced, reports.give_up)
         with listener, suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
             asyncio.run(server.serve(sockets=[listener]))
 
@@ -96,11 +96,18 @@ _RECONNECT_S = 60.0
 
 
 class _Server(uvicorn.Server):
-    """A server that reports once it listens."""
+    """A server that reports once it listens, and when it begins to end."""
 
-    def __init__(self, config: uvicorn.Config, on_start: Callable[[], None]) -> None:
+    def __init__(
+        self, config: uvicorn.Config, on_start: Callable[[], None], on_end: Callable[[], None]
+    ) -> None:
         super().__init__(config)
-        self._on_start = on_start
+        self._on_start, self._on_end = on_start, on_end
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Give up what would keep it from ending, and end."""
+        self._on_end()
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to listen, and report it."""

@@ -154,9 +154,10 @@ class LivePanel:
         self._text.set_text(_words(live))
         self._bar.set_value(min(live.progress.get("t_s", 0.0) / live.horizon_s, 1.0))
         for button, enabled in (
-            (self._start, live.is_over), (self._stop, not live.is_over),
+            (self._start, live.is_over),
+            (self._stop, not live.is_over),
             *((one, live.state == "running") for one in self._kill),
-        ):  # fmt: skip
+        ):
             button.set_enabled(enabled)
         if live.viewer and live.viewer != self._viewer:
             self._viewer = live.viewer

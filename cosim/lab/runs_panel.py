@@ -3,14 +3,15 @@
 The report of a run is served below the page's address.
 """
 
+from asyncio import CancelledError
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 
 from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
@@ -19,7 +20,7 @@ from noack.core.errors import NoackError
 
 def replayed(directory: Path) -> str:
     """Replay a run; called in the worker process."""
-    import noack
+    import noack  # the worker's
 
     found = noack.open_run(directory).replay()
     return (
@@ -31,7 +32,7 @@ def replayed(directory: Path) -> str:
 
 def compared(directory: Path) -> str:
     """Compare a run with the ideal loop; called in the worker process."""
-    import noack
+    import noack  # the worker's
 
     return str(noack.open_run(directory).fidelity().verdict)
 
@@ -72,7 +73,7 @@ class RunsPanel:
         self.refresh()
         self._select.set_value(name)
 
-    def _open(self, event: Any) -> None:
+    def _open(self, event: ValueChangeEventArguments[str]) -> None:
         if not event.value:
             return
         directory = self._services.runs / event.value
@@ -86,7 +87,7 @@ class RunsPanel:
             report.props(f'src="{_address(directory.name)}" title="report of the run"')
             report.on("load", lambda: waiting.set_visibility(False))
 
-    def _on_request(self, words: str, function: Any, directory: Path) -> None:
+    def _on_request(self, words: str, function: Callable[[Path], str], directory: Path) -> None:
         answer = ui.label()
 
         async def ask() -> None:
@@ -118,23 +119,32 @@ def _address(name: str) -> str:
     return f"report/{quote(name)}"
 
 
-def serve_reports(application: FastAPI, services: LabServices) -> None:
-    """Serve the reports of recorded runs below the page's address; a missing one is written."""
+def serve_reports(application: FastAPI, services: LabServices) -> PageCalls:
+    """Serve the reports of recorded runs below the page's address; a missing one is written.
+
+    Returns:
+        The reports that are being written, which the end of the server gives up.
+    """
+    calls = PageCalls(services)
 
     @application.get("/report/{name}")
     async def report(name: str) -> Response:
         if name not in services.recorded():
             return PlainTextResponse(f"no run {name} is recorded in {services.runs}", 404)
         try:
-            page = await services.compute(report_page, services.runs / name)
+            page = await calls.compute(report_page, services.runs / name)
+        except CancelledError:
+            return PlainTextResponse("noack lab has ended", 503)
         except NoackError as error:
             return PlainTextResponse(str(error), 409)
         headers = {"content-security-policy": _POLICY, "cache-control": "no-store"}
         return HTMLResponse(page, headers=headers)
 
+    return calls
+
 
 def report_page(directory: Path) -> bytes:
     """Return the report of a run, which is written if missing; called in the worker process."""
-    from cosim.live.finalize import run_report
+    from cosim.live.finalize import run_report  # the worker's
 
     return run_report(directory).read_bytes()

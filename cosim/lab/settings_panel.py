@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
+from nicegui.events import ValueChangeEventArguments
 
 from cosim.interactive.controls import (
     Choice,
@@ -116,7 +117,7 @@ class SettingsPanel:
                 self._add_slider(slider)
 
     def _add_choice(self, choice: Choice) -> None:
-        def select(event: Any) -> Awaitable[None] | None:
+        def select(event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
             if self._quiet or event.value == choice.value:
                 return None
             return self._apply(lambda draft: chosen(draft, choice.key, event.value), "")
@@ -128,7 +129,7 @@ class SettingsPanel:
     def _add_slider(self, slider: Slider) -> None:
         key = slider.key
 
-        def moved(event: Any) -> Awaitable[None] | None:
+        def moved(event: ValueChangeEventArguments[float]) -> Awaitable[None] | None:
             current = self._sliders[key][0]
             value = current.value_at(float(event.value))
             self._sliders[key][2].set_text(_text(value))
@@ -153,7 +154,7 @@ class SettingsPanel:
         self.show(draft)
         return self._changed(draft, key)
 
-    def _edited(self, event: Any) -> Awaitable[None] | None:
+    def _edited(self, event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
         if self._quiet or event.value == self._draft.text:
             return None
         self.show(self._draft.with_text(event.value), text=False)

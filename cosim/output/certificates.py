@@ -92,9 +92,10 @@ class Certificates:
         scopes = (own_plant(scenario), None if BOX in void else box(scenario))
         self._scopes = [scope for scope in scopes if scope is not None]
         self._certificates = [
-            (under, scope.certificate(of)) for under, of in conditions.items()
+            (under, scope.certificate(of))
+            for under, of in conditions.items()
             for scope in self._scopes
-        ]  # fmt: skip
+        ]
         self.theorem_2 = _theorem_2(scenario, self.paper)
         self.unlimited, self.unpredictable = self._unlimited()
 

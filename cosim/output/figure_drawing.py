@@ -37,15 +37,20 @@ from cosim.output.figure_description import (
     Spans,
     finite,
 )
-from cosim.output.figure_placing import (
+from cosim.output.figure_layout import (
     BAR_IN,
+    PAPER,
+    POINTS_PER_IN,
     Box,
+    NotebookFigure,
     Place,
+    layout,
     legend_rows,
     legend_text,
     place_panels,
+    rgb,
+    settings,
 )
-from cosim.output.figure_style import PAPER, POINTS_PER_IN, NotebookFigure, layout, rgb, settings
 from cosim.record.align import Reals
 
 Shown = tuple[Artist, str]
@@ -70,14 +75,14 @@ _SHORTEST_LINE = 8
 _UNIT, _NO_BREAK = re.compile(r"\[[^]]*\]"), "\N{NO-BREAK SPACE}"
 _DOLLAR = re.compile(r"(?<!\\)\$")
 _BOLD = ["cmb10", "DejaVu Serif"]
-_ELSEWHERE = str.maketrans({
-    "_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''",
-})  # fmt: skip
+_ELSEWHERE = str.maketrans(
+    {"_": r"$\_$", "<": "$<$", ">": "$>$", "|": "$|$", "{": r"$\{$", "}": r"$\}$", '"': "''"}
+)
 """Characters at whose places Computer Modern has others; its mathematical fonts have them."""
 
 
 def draw(described: FigureDescription) -> Figure:
-    """Draw a figure for the width of :func:`cosim.output.figure_style.figure_width`."""
+    """Draw a figure for the width of :func:`cosim.output.figure_layout.figure_width`."""
     with settings():
         return _drawn(described)
 
@@ -113,9 +118,9 @@ def _axes(figure: Figure, place: Place, beside: Axes | None = None) -> Axes:
     (figure_in, whole_in), box = figure.get_size_inches(), place.box
     bottom_in = whole_in - box.top - box.height
     axes = figure.add_axes(
-        (box.left / figure_in, bottom_in / whole_in, box.width / figure_in,
-         box.height / whole_in), sharey=beside,
-    )  # fmt: skip
+        (box.left / figure_in, bottom_in / whole_in, box.width / figure_in, box.height / whole_in),
+        sharey=beside,
+    )
     factor = axes.yaxis.get_offset_text()  # e.g. ×10⁻⁶; above the axes it would overlap the title
     factor.set(x=-0.05 / box.width, horizontalalignment="right")
     for which, axis in (("x", place.panel.x), ("y", place.panel.y)):
@@ -291,8 +296,9 @@ def _(item: Heat, axes: Axes, norm: Normalize | None) -> Artist | None:
             if np.isfinite(value):
                 middle = left + (column + 0.5) * (right - left) / columns
                 colour = "#ffffff" if float(norm(value)) < _DARK else "#000000"
-                axes.text(middle, row, f"{value:.3g}", ha="center", va="center", size=7.5,
-                          color=colour)  # fmt: skip
+                axes.text(
+                    middle, row, f"{value:.3g}", ha="center", va="center", size=7.5, color=colour
+                )
     return None
 
 
@@ -430,8 +436,9 @@ def _fit_to_paper(figure: Figure) -> None:
     for axes in figure.axes:
         place, (width_in, height_in) = axes.get_position(), figure.get_size_inches()
         for axis, length_in in (
-            (axes.xaxis, place.width * width_in), (axes.yaxis, place.height * height_in),
-        ):  # fmt: skip
+            (axes.xaxis, place.width * width_in),
+            (axes.yaxis, place.height * height_in),
+        ):
             most = max(int(length_in / character_in), _SHORTEST_LINE)
             axis.set_label_text(_wrapped(axis.get_label_text(), most))
 

@@ -100,7 +100,7 @@ def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescrip
             f"delivery.{order}",
             f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _link_rows(
@@ -130,8 +130,9 @@ def norms_figure(
     """Describe ‖e_c‖ and ‖x‖ of all loops; the range of the axes is for those that stayed."""
     panels = []
     for title, values in (
-        (r"$\|e_c\|$ controller", over_time.errors), (r"$\|x\|$ plant", over_time.states),
-    ):  # fmt: skip
+        (r"$\|e_c\|$ controller", over_time.errors),
+        (r"$\|x\|$ plant", over_time.states),
+    ):
         about = _not_diverged(values, stayed).ravel()
         axis = Axis(label="norm", logarithmic=True, about=about, decades=_MAP_DECADES)
         panels.append((title, _curves(over_time.middles_s, values, names), axis))
@@ -195,10 +196,11 @@ def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> 
         items=[] if scale is None else [heat],
         x=replace(time_axis(over_time.edges_s), grid=False),
         y=Axis(
-            label="" if are_named else "number of the loop", grid=False,
+            label="" if are_named else "number of the loop",
+            grid=False,
             ticks=dict(enumerate(names)) if are_named else None,
         ),
-    )  # fmt: skip
+    )
     height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
     rows = [Row(panels=[panel], height_in=height_in)]
     return FigureDescription(name="map", rows=rows, scale=scale)

@@ -4,6 +4,7 @@ A page extends ``page.html.jinja`` and uses the macros for verdicts, tables and 
 escaped; figures are drawn where they are used.
 """
 
+import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,13 @@ from cosim.output.run_tables import interval_text
 from noack.core.number_format import number, percent
 
 PAGES = Path(__file__).with_name("pages")
+TERMS: tuple[tuple[str, str], ...] = tuple(
+    (entry["term"], entry["meaning"])
+    for entry in tomllib.loads(PAGES.with_name("glossary.toml").read_text(encoding="utf-8"))[
+        "terms"
+    ]
+)
+"""The project's words and their meanings, in an order in which each uses earlier ones only."""
 _NONE = "–"
 _TONES = {"held": "good", "holds": "good", "violated": "bad", "void": "doubt"}
 
@@ -55,7 +63,7 @@ def words(key: str) -> str:
     return str(key).replace("_", " ")
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Write a value of a JSON document as text."""
     if value is None:
         return _NONE
@@ -66,3 +74,9 @@ def value_text(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{words(key)} {value_text(entry)}" for key, entry in value.items())
     return str(value)
+
+
+def glossary() -> str:
+    """Return the words as the table of ``docs/glossary.md``."""
+    rows = [f"| **{term}** | {meaning} |" for term, meaning in TERMS]
+    return "\n".join(["| term | meaning |", "|---|---|", *rows])

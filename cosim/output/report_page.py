@@ -9,17 +9,15 @@ is the page of the loop.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from cosim.analysis.network_summary import worst_loop
 from cosim.analysis.summary_model import LoopSummary, RunSummary
-from cosim.output import glossary
 from cosim.output.figure_description import FigureDescription
 from cosim.output.network_figures import network_figures
-from cosim.output.page_kit import templates, value_text, words
+from cosim.output.page_kit import TERMS, templates, value_text, words
 from cosim.output.run_figures import envelopes, run_figures
 from cosim.output.run_tables import (
     LOOPS_CAPTION,
@@ -47,7 +45,7 @@ from noack.core.number_format import seconds
 TIMING_FIGURES = ("lateness", "latency", "clocks")
 """These have a section of their own, after the signals."""
 
-Content = Mapping[str, Any]
+Content = Mapping[str, object]
 """What a template shows."""
 SECTIONS: "dict[str, Callable[[Report], Content | None]]" = {}
 """The sections in their order, by the names of their templates."""
@@ -71,7 +69,7 @@ class Report:
     description: str = ""
     scenario_toml: str = ""
     """The scenario of the run, as stored in the run directory."""
-    environment: Mapping[str, Any] = field(default_factory=dict)
+    environment: Mapping[str, object] = field(default_factory=dict)
     """The content of ``environment.json``; empty if there is none."""
     links: Mapping[str, str] = field(default_factory=dict)
     """Addresses of the reports of loops, by name."""
@@ -240,7 +238,7 @@ def _scenario(report: Report) -> Content:
 
 @section
 def _words(report: Report) -> Content:
-    return {"terms": glossary.TERMS}
+    return {"terms": TERMS}
 
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
@@ -276,11 +274,11 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "seeds", f"plant {seeds.plant}, initial state {seeds.initial_state}, loss {seeds.loss}"
 
 
-def _settings(values: Mapping[str, Any]) -> str:
+def _settings(values: Mapping[str, object]) -> str:
     return ", ".join(f"{words(key)} {value_text(value)}" for key, value in values.items())
 
 
-def environment_rows(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
+def environment_rows(environment: Mapping[str, object]) -> list[tuple[str, str]]:
     """Return the properties of the environment, and their values as text."""
     return [
         (words(key), " ".join(map(str, value)) if isinstance(value, list) else value_text(value))

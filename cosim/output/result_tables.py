@@ -83,8 +83,7 @@ def terminal_table(
     for i, heading in enumerate(table.headings):
         words = " ".join([heading, *(row[i] for row in table.rows)]).split()
         least = max(map(len, words)) if dense else None
-        shown.add_column(escape(heading), justify="left" if i in left else "right",
-                         min_width=least)  # fmt: skip
+        shown.add_column(escape(heading), justify="left" if i in left else "right", min_width=least)
     for *cells, last in table.rows:
         style = next((one for word, one in (styles or {}).items() if last.startswith(word)), "")
         shown.add_row(*map(escape, cells), Text(last, style))

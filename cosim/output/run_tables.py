@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from cosim.analysis.fidelity import is_against
 from cosim.analysis.run_summary import linearisation_rows
@@ -95,7 +94,7 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
         *(network_rows(summary)[:_FEW] if shared else of_loop),
         ("claims", ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()) or "none"),
         ("directory", str(directory)),
-    ]  # fmt: skip
+    ]
 
 
 # One loop
@@ -322,7 +321,7 @@ def _quantiles(found: Quantiles) -> tuple[str, ...]:
 # The network and all loops
 
 
-def badness(loop: LoopSummary) -> tuple[Any, ...]:
+def badness(loop: LoopSummary) -> tuple[float, ...]:
     """Return a key that is larger for a worse loop."""
     claims, error = _verdicts(loop), loop.sup_e_c_norm
     return (

@@ -47,9 +47,7 @@ from noack.runtime.life_cycle import HORIZON
 from noack.theory.certificates.assumptions import Assumption, AssumptionStatus
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
-_CLAIM_STYLES = {
-    "held": GOOD, "violated": BAD, "void": DOUBTFUL, "not applicable": "dim",
-}  # fmt: skip
+_CLAIM_STYLES = {"held": GOOD, "violated": BAD, "void": DOUBTFUL, "not applicable": "dim"}
 _ASSUMPTION_STYLES: dict[str, str] = {
     AssumptionStatus.HOLDS: "green",
     AssumptionStatus.VIOLATED: "bold yellow",

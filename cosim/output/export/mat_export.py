@@ -36,7 +36,7 @@ def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
     Raises:
         MachineError: the file cannot be written, or a variable is larger than the format allows.
     """
-    from scipy.io import savemat
+    from scipy.io import savemat  # slow to import
 
     buffer = io.BytesIO()
     try:

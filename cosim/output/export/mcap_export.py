@@ -48,7 +48,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
         MachineError: the file cannot be written.
     """
     try:
-        from mcap.writer import CompressionType, Writer
+        from mcap.writer import CompressionType, Writer  # an extra
     except ImportError:
         raise CallerError(
             "MCAP needs the package mcap, which is not installed; pip install 'noack[mcap]'"

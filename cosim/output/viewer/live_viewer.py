@@ -96,9 +96,7 @@ class RecordingServer:
         self.downloaded = threading.Event()
         self._downloads = 0
         self._lock = threading.Lock()
-        self._secret, self._window_secret = (
-            secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2)
-        )  # fmt: skip
+        self._secret, self._window_secret = (secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2))
         if not follow:
             self.finished.set()
         try:
@@ -474,7 +472,7 @@ def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]
         window: the viewer's process.
         output: its log, which contains the address at which it accepts requests.
     """
-    from rerun.experimental import ViewerClient
+    from rerun.experimental import ViewerClient  # slow to import
 
     with output:
         port = logged_port(window, output, _TAKES_REQUESTS_AT, _LOAD_S)

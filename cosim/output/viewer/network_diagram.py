@@ -86,9 +86,8 @@ class NetworkDiagram:
         words = ("plant x", "sensor x_s", "network", "controller x_c")
         for text, (name, x), colour in zip(words, _BOXES.items(), colours, strict=True):
             found[f"box/{name}"] = rr.Boxes2D(
-                centers=[[x, 0.0]], half_sizes=[[_HALF_WIDE, _HALF_HIGH]], radii=0.04,
-                colors=colour,
-            )  # fmt: skip
+                centers=[[x, 0.0]], half_sizes=[[_HALF_WIDE, _HALF_HIGH]], radii=0.04, colors=colour
+            )
             found[f"box/{name}/word"] = label(text, (x, 0.28), colour)
         arrows = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
         if self._reverse is Flow.ACKNOWLEDGEMENT:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.analysis.network_summary import (
     INTERVALS,
@@ -44,6 +45,8 @@ _TURN_S, _SHARE = 0.03, 0.3
 _NAMED_S, _PATIENCE_S = 3.0, 10.0
 """Wall time by which the loops in detail may lag before it is said, and before they are dropped."""
 _MAP_EVERY_S = 2.0
+Reals = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 _NEVER_NS = 2**63 - 1
 _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
@@ -167,7 +170,7 @@ class _AllLoops:
         for rest, loop in zip(self._rest, self._loops, strict=True):
             if loop.setpoint is not None:
                 rest[: loop.n] = loop.setpoint
-        self._transitions: dict[int, Any] = {}
+        self._transitions: dict[int, Reals] = {}
         self._lag_ns = int(LAG_S * NS_PER_S * scenario.speed)
         self._phases_ns = np.array(phases_ns(scenario))
         numbers = [(name, "<i8") for name in (LOOP, "input", "t_ns")]
@@ -250,7 +253,7 @@ class _AllLoops:
         errors = row_norms(x_c - measured["x"])
         self._largest(self._over_time.errors, measured[LOOP], at_ns[known], errors)
 
-    def _flow(self, dt_ns: int, loops: Any, x_c: Any) -> Any:
+    def _flow(self, dt_ns: int, loops: Numbers, x_c: Reals) -> Reals:
         """Return models of controllers, (k, n), a time later, with the set-points of the start."""
         if dt_ns not in self._transitions:
             transitions = np.zeros((*self._entries.shape, self._entries.shape[1]))
@@ -258,12 +261,13 @@ class _AllLoops:
                 matrix[: loop.n, : loop.n] = Propagator(loop.H).transition(dt_ns)
             self._transitions[dt_ns] = transitions
         rest = self._rest[loops]
-        return rest + np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
+        moved: Reals = np.einsum("kij,kj->ki", self._transitions[dt_ns][loops], x_c - rest)
+        return rest + moved
 
-    def _largest(self, values: Any, loops: Any, t_ns: Any, norms: Any) -> None:
+    def _largest(self, values: Reals, loops: Numbers, t_ns: Numbers, norms: Reals) -> None:
         np.fmax.at(values, (loops, places(t_ns, self._horizon_ns)), norms)
 
-    def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Any]:
+    def _take(self, waiting: list[Rows], until_ns: int) -> tuple[Rows, Numbers]:
         """Return the waiting rows up to a time of the run, and their times of the run."""
         rows = np.concatenate([self._none, *waiting])
         of_run_ns = rows["t_ns"] + self._phases_ns[rows[LOOP]]
@@ -280,6 +284,7 @@ class _AllLoops:
         return found
 
 
-def _keys(rows: Rows) -> Any:
+def _keys(rows: Rows) -> Numbers:
     """Return keys that order rows by their loops, then by their times."""
-    return rows[LOOP] * _LONGEST_NS + rows["t_ns"]
+    keys: Numbers = rows[LOOP] * _LONGEST_NS + rows["t_ns"]
+    return keys

@@ -25,7 +25,6 @@ from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from shutil import disk_usage
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -159,7 +158,7 @@ to the right.
             },
         )
 
-    def queue(self, t_ns: Nanoseconds, largest: NDArray[Any], mean: Reals) -> None:
+    def queue(self, t_ns: Nanoseconds, largest: Reals | NDArray[np.int64], mean: Reals) -> None:
         """Add the numbers of datagrams in the network, (k,)."""
         self.send(QUEUE, t_ns, np.column_stack([largest, mean]))
 

@@ -67,7 +67,7 @@ Reals = NDArray[np.float64]
 _WARNINGS = ("failed", "violation", "void", "diverges", "watchdog", "clock lost")
 
 
-def log_level(notice: Mapping[str, Any]) -> str:
+def log_level(notice: Mapping[str, object]) -> str:
     """Return the viewer's level of a line of the run's log."""
     return "WARN" if notice["level"] in _WARNINGS else "INFO"
 

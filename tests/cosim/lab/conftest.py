@@ -1,4 +1,4 @@
-"""The page, served for all tests of a file, and a headless browser for each test."""
+"""The page, served for all tests of a file, and a headless browser for all of them."""
 
 import os
 import shutil
@@ -23,13 +23,23 @@ def address(folder: Path) -> Iterator[str]:
         yield server.address
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    program = shutil.which("chromium") or shutil.which("google-chrome")
-    if program is None or sys.platform != "linux" or not hasattr(os, "fork"):
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    found = shutil.which("chromium") or shutil.which("google-chrome")
+    if found is None or sys.platform != "linux" or not hasattr(os, "fork"):
         pytest.skip("no chromium here")
-    started = Browser(program, str(tmp_path))
+    started = Browser(found, str(tmp_path_factory.mktemp("browser")))
     try:
         yield started
     finally:
         started.close()
+
+
+@pytest.fixture
+def browser(program: Browser) -> Iterator[Browser]:
+    """The browser; the tabs of a test are closed after it."""
+    yield program
+    program.session = None
+    for target in program.call("Target.getTargets")["targetInfos"]:
+        if target["type"] == "page" and target["url"] != "about:blank":
+            program.call("Target.closeTarget", targetId=target["targetId"])

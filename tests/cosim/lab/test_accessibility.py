@@ -47,8 +47,7 @@ def nameless(page: Page) -> list[Any]:
     ]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("size", [(1280, 900), (390, 844)])
+@pytest.mark.parametrize(("scheme", "size"), [("light", (1280, 900)), ("dark", (390, 844))])
 def test_controls_have_names_and_text_has_contrast(
     browser: Browser, address: str, scheme: str, size: tuple[int, int]
 ) -> None:

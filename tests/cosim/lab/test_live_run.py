@@ -44,16 +44,13 @@ def test_the_states_follow_each_other() -> None:
     assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
 
 
-def test_each_warning_and_change_is_a_line_once() -> None:
+def test_a_report_gives_each_warning_and_change_once_and_the_viewers_address() -> None:
     run = LiveRun(20.0)
     said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"]})
-    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"], "changes": ["M 3"]})
+    live = "live view: http://127.0.0.1:1234/secret/"
+    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"], "changes": ["M 3"],
+                                      "live": live})  # fmt: skip
     assert run.lines == ["void from 1 s on", "changed: M 3"]
-
-
-def test_the_viewers_address_is_found() -> None:
-    run = LiveRun(20.0)
-    said(run, "progress", **REPORT | {"live": "live view: http://127.0.0.1:1234/secret/"})
     assert run.viewer == "http://127.0.0.1:1234/secret/"
 
 

@@ -1,4 +1,4 @@
-"""Two tabs, a server that ends under an open page, and an end by Ctrl-C at any time."""
+"""A server that ends under an open page, and an end by Ctrl-C at any time."""
 
 import time
 from pathlib import Path
@@ -14,16 +14,6 @@ from tools.screenshot_recording import Browser
 
 LOST = "getComputedStyle(document.getElementById('popup')).visibility === 'visible'"
 NO_LOSS = "network.loss.probability=0"
-
-
-def test_two_tabs_have_separate_settings(browser: Browser, address: str) -> None:
-    one = Page(browser, address)
-    other = Page(browser, address)
-    other.drag("loss probability", 0.0)
-    other.wait(f"location.search.includes('{NO_LOSS}')")
-    other.wait(f"{TEXT}.includes(', 0 (0 %) lost')")
-    assert not one.js(f"location.search.includes('{NO_LOSS}')")
-    assert not one.js(f"{TEXT}.includes(', 0 (0 %) lost')")
 
 
 def test_a_page_says_that_its_server_ended(browser: Browser, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Records of simulated runs, and data that no run produces."""
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,3 +51,29 @@ def make_record(scenario: Scenario, largest: float = 1.0) -> RunRecord:
 @pytest.fixture
 def record(content: dict[str, Any]) -> RunRecord:
     return make_record(scenario_of(content))
+
+
+def lone(*present: str) -> RunRecord:
+    """A record with only these tables."""
+    record = make_record(scenario_of(CONTENT))
+    rows = {t: record[t][: None if t in present else 0] for t in record.tables}
+    return changed(record, rows)
+
+
+CONTENT: dict[str, Any] = {
+    "name": "small",
+    "horizon_s": 1.0,
+    "model": {"name": "double_integrator"},
+    "plant": {"initial_state": [1.0, 0.0]},
+    "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
+    "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+}
+CASES: dict[str, Callable[[], RunRecord]] = {
+    "empty": lone,
+    "two steps": lambda: make_record(scenario_of(CONTENT | {"horizon_s": 0.002})),
+    "diverged": lambda: make_record(scenario_of(CONTENT), largest=np.inf),
+    "plant only": lambda: lone("plant_step"),
+    "deliveries only": lambda: lone("controller_delivery"),
+    "forty states": lambda: make_record(scenario_of(CONTENT, 40)),
+}
+"""Records that a run may leave."""

@@ -15,7 +15,7 @@ from cosim.output.figure_description import Axis, FigureDescription, Line, Panel
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import file_content, save_figures
 from cosim.output.figure_format import FigureFormat, figure_files
-from cosim.output.figure_style import figure_width
+from cosim.output.figure_layout import figure_width
 from noack.core.errors import CallerError
 
 
@@ -68,7 +68,7 @@ def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:
 
 def test_figures_are_as_wide_as_a_paper_wants_with_legible_texts(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
-    for width, points in ((None, 252.0), ("column", 252.0), ("page", 515.52), (5, 360.0)):
+    for width, points in ((None, 252.0), ("page", 515.52), (5, 360.0)):
         for path in run.save_figures("pdf", width):
             box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", path.read_bytes())
             assert box is not None

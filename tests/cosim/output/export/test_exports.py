@@ -75,14 +75,6 @@ def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     assert run.export(path)[0].read_bytes() == path.read_bytes()
 
 
-def test_a_mat_file_has_the_certificates(tmp_path: Path) -> None:
-    run = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1}))
-    found = loadmat(run.export(tmp_path / "run.mat")[0], simplify_cells=True)["certificates"]
-    document = noack.certify(run.scenario).to_json()
-    for one, other in zip(found["certificates"], document["certificates"], strict=True):
-        assert one["constants"]["state"] == other["constants"]["state"]
-
-
 def test_certificates_are_written_as_mat(tmp_path: Path) -> None:
     path = tmp_path / "c.mat"
     done = CliRunner().invoke(app, ["certify", "lane_following", "--out", str(path)])

@@ -19,7 +19,6 @@ from cosim.output.viewer.pictures.picture import (
     Picture,
     panel,
     picture_of,
-    reach_of,
 )
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
@@ -159,17 +158,6 @@ def test_tank_levels_are_drawn_to_scale() -> None:
     np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
 
 
-def test_a_trail_is_behind_its_body_and_does_not_share_a_layer() -> None:
-    scenery = PhasePicture(["a", "b"], np.ones(2)).scenery()
-
-    def layer(entity: str) -> float:
-        (order,) = scenery[entity].draw_order.as_arrow_array().to_pylist()
-        return float(order)
-
-    assert all(layer(f"{who}/trail") < layer(f"{who}/point") for who in WHO)
-    assert len({layer(f"{who}/trail") for who in WHO}) == len(WHO)
-
-
 def test_a_trail_continues_from_batch_to_batch() -> None:
     frames = frames_of(2, 0, k=12)
     whole = PhasePicture(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
@@ -182,13 +170,6 @@ def test_a_trail_continues_from_batch_to_batch() -> None:
         )["strips"]
     ]
     assert pieces == arrays(whole)["strips"]
-
-
-def test_the_range_of_a_picture_is_that_of_the_models_loop() -> None:
-    scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
-    reach = reach_of(loop_of(scenario), scenario.timing.horizon_ns)
-    assert (reach >= np.abs(loop_of(scenario).x0)).all()
-    assert reach[3] < 10.0
 
 
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
