@@ -31,7 +31,7 @@ LINES = {
     "cosim/doctor": 800,
     "cosim/interactive": 1600,
     "cosim/lab": 2100,
-    "cosim/live": 3550,
+    "cosim/live": 3510,
     "cosim/measurement": 2900,
     "cosim/output": 8400,
     "cosim/record": 3250,
