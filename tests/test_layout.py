@@ -34,7 +34,7 @@ LINES = {
     "cosim/live": 3510,
     "cosim/measurement": 2900,
     "cosim/output": 8400,
-    "cosim/record": 3250,
+    "cosim/record": 3280,
     "cosim/simulation": 1650,
     "cosim/studies": 6000,
     "plant_server": 450,
