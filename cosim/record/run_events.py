@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_of
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -350,7 +350,7 @@ def _scale(scenario: Scenario) -> float:
             until_s = min(one.until_s or scenario.horizon_s, scenario.horizon_s)
             carried += float(np.linalg.norm(push)) * max(until_s - one.from_s, 0.0)
     setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
-    threshold = scenario.trigger.largest_threshold
+    threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
     return max(carried, setpoint, threshold)

@@ -27,7 +27,7 @@ from cosim.cli import app
 from cosim.live.finalize import finalize, reopen
 from cosim.output.figure_description import Heat
 from cosim.output.figure_drawing import draw
-from cosim.output.run_figures import error_map, norms_figure
+from cosim.output.network_figures import error_map, norms_figure
 from cosim.output.run_tables import loop_row, network_rows
 from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables

@@ -10,12 +10,11 @@ from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.parameter_changes import LATE
 from noack.config.resolution import resolve
 from noack.config.scenario import loops_of, phases_ns
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, Fate
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
 from tests.cosim.record.changed_records import changed
 
@@ -147,17 +146,6 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
-
-
-def test_a_change_concerns_every_loop(short: Content) -> None:
-    changes = [{"trigger.beta": 0.005}, {"trigger.beta": 0.5, "network.mansd": 1}]
-    short["changes"] = [{"at_s": 1.0 * i, "set": one} for i, one in enumerate(changes)]
-    shared = run(short, {"name": "a", "count": 3})
-    for record in shared.loops:
-        assert len(record[NETEM_SETTING]) == len(record["sensor_setting"]) == 2
-        assert not [one for one in record.notices if one["level"] == LATE]
-        assert replay(record).bit_exact
-    assert replay(shared.network).bit_exact
 
 
 def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -> None:
