@@ -40,7 +40,7 @@ LINES = {
     "cosim/doctor": 800,
     "cosim/interactive": 1580,
     "cosim/lab": 2050,
-    "cosim/live": 3550,
+    "cosim/live": 3510,
     "cosim/measurement": 2870,
     "cosim/output": 8140,
     "cosim/record": 3250,

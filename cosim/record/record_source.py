@@ -36,16 +36,6 @@ def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     return found.view(dtype)
 
 
-def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
-    """Return the columns of a type, without gaps between them."""
-    if rows.dtype == dtype:
-        return rows
-    found = np.empty(len(rows), dtype)
-    for name in dtype.names or ():
-        found[name] = rows[name]
-    return found
-
-
 class RecordSource(ABC):
     """The tables of a record, with their row types; a table that is read as a whole is kept."""
 
@@ -201,8 +191,8 @@ def with_loop(rows: Rows, number: int, dtype: np.dtype[np.void]) -> Rows:
     return found
 
 
-def without_loop(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
-    """Return rows of a run, all of one loop, as rows of this loop, of a type."""
+def packed(rows: Rows, dtype: np.dtype[np.void]) -> Rows:
+    """Return the columns of a type without gaps, of a vector the first entries."""
     if rows.dtype == dtype:
         return rows
     found = np.empty(len(rows), dtype)
@@ -244,7 +234,7 @@ def rows_by_loop(
         chosen = rows.take(order[ends[number - 1] if number else 0 : ends[number]])
         if is_of_network(table):
             chosen = _of_loop(chosen, number, phases_ns)
-        yield number, without_loop(chosen, types[number][table])
+        yield number, packed(chosen, types[number][table])
 
 
 class NetworkRows:

@@ -21,8 +21,8 @@ from cosim.record.record_source import (
     RecordSource,
     Rows,
     joined,
+    packed,
     with_columns,
-    without_loop,
 )
 from cosim.record.spool_conversion import Segment
 from noack.core.cached_method import cached_method
@@ -87,7 +87,7 @@ class StoredTables(RecordSource):
                 yield next(own)
             else:
                 rows = self._mixed(table, place)
-                yield without_loop(rows.compress(rows[LOOP] == number), dtype)
+                yield packed(rows.compress(rows[LOOP] == number), dtype)
 
     def of_loops(
         self, table: str, loops: Sequence[int], types: Sequence[RowType]

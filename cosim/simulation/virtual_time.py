@@ -18,7 +18,7 @@ from cosim.record.record_source import (
     RecordSource,
     RowsInMemory,
     joined,
-    without_loop,
+    packed,
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
@@ -340,7 +340,7 @@ class _LoopRows(RecordSource):
         if is_of_network(table):
             yield from self._packets.of_loop(table, self._number)
         elif has_loop(table):  # nothing in virtual time compares clocks
-            yield without_loop(self._record.of_loop(table, self._number), self.types[table])
+            yield packed(self._record.of_loop(table, self._number), self.types[table])
 
 
 def _split(rows: Rows, loops: int) -> list[Rows]:

@@ -38,13 +38,13 @@ def seconds(value_s: float | None) -> str:
 
 
 def duration(value_s: float) -> str:
-    """Write a time with three digits, in s, ms, µs or ns."""
-    return with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
+    """Write a time with up to three digits, in s, ms, µs or ns."""
+    return _without_zeros(with_unit(value_s * 1e9, ("s", "ms", "µs", "ns")))
 
 
 def byte_size(value: float) -> str:
-    """Write a number of bytes with three digits, in GB, MB, kB or bytes."""
-    return with_unit(value, ("GB", "MB", "kB", "bytes"))
+    """Write a number of bytes with up to three digits, in GB, MB, kB or bytes."""
+    return _without_zeros(with_unit(value, ("GB", "MB", "kB", "bytes")))
 
 
 def ratio(part: int, of: int) -> str:
@@ -65,6 +65,11 @@ def with_unit(value: float, units: tuple[str, str, str, str]) -> str:
             digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
             return f"{value / size:.{digits}f} {unit}"
     return f"{value:.0f} {units[-1]}"
+
+
+def _without_zeros(text: str) -> str:
+    digits, unit = text.split()
+    return f"{digits.rstrip('0').rstrip('.') if '.' in digits else digits} {unit}"
 
 
 def plus_minus(mean: float, halfwidth: float) -> str:

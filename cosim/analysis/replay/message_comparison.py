@@ -70,9 +70,8 @@ class MessageComparison:
     def results(self) -> tuple[MessagesReplay, ...]:
         """Return the result of each hop after the last part."""
         netem = self._machines.get("netem")
-        # Of a killed emulator that serves several loops, the last rows may be missing.
-        is_alone = len(self._record.begun_lives("netem")) == 1
-        whole = is_alone if netem is None else netem.whole
+        # A killed emulator may have forwarded messages whose rows are missing.
+        whole = self._record.is_complete("netem") if netem is None else netem.whole
         found = [hop.result(network_is_whole=whole) for hop in self._hops]
         return (*found, *_compare_changes(self._record))
 

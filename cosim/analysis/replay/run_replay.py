@@ -9,7 +9,7 @@ import numpy as np
 from cosim.analysis.replay.machine_replay import MachineReplay, SharedMachines
 from cosim.analysis.replay.message_comparison import MessageComparison
 from cosim.analysis.replay.replay_result import MessagesReplay, ProcessReplay, Replay
-from cosim.analysis.summary_model import ReplayDifference, ReplayPart
+from cosim.analysis.summary_model import ReplayPart
 from cosim.record.run_record import RecordedRun, RunRecord, load_run
 from noack.protocol.topology import LOOP_ROLES
 
@@ -50,13 +50,16 @@ def replay_run(run: RecordedRun, loop: str | None = None) -> Replay:
     # A restarted process has a result of its own.
     processes = _by_name((one.process, one) for each in found for one in each.processes)
     messages = _by_name((one.leg, one) for each in found for one in each.messages)
+    in_order = sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
     return Replay(
-        processes=tuple(
-            _process(processes[name])
-            for name in sorted(processes, key=lambda name: LOOP_ROLES.index(name.split()[0]))
-        ),
-        messages=tuple(map(_leg, messages.values())),
+        processes=tuple(_added(processes[name]) for name in in_order),
+        messages=tuple(map(_added, messages.values())),
     )
+
+
+def stored_verdict(run_dir: Path) -> ReplayPart:
+    """Replay the only loop of a run directory; return the result for its summary."""
+    return replay(load_run(run_dir).loop()).verdict()
 
 
 def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
@@ -66,31 +69,14 @@ def _by_name(named: Iterable[tuple[str, Result]]) -> dict[str, list[Result]]:
     return found
 
 
-def stored_verdict(run_dir: Path) -> ReplayPart:
-    """Replay the only loop of a run directory; return the result for its summary."""
-    return replay(load_run(run_dir).loop()).verdict()
-
-
-def _process(found: Sequence[ProcessReplay]) -> ProcessReplay:
-    missing = (one.missing_from for one in found if one.missing_from is not None)
-    return ProcessReplay(
-        process=found[0].process,
-        inputs=sum(one.inputs for one in found),
-        compared=sum(one.compared for one in found),
-        missing_from=next(missing, None),
-        end_known=all(one.end_known for one in found),
-        difference=_first(one.difference for one in found),
-    )
-
-
-def _leg(found: Sequence[MessagesReplay]) -> MessagesReplay:
-    return MessagesReplay(
-        leg=found[0].leg,
-        received=sum(one.received for one in found),
-        compared=sum(one.compared for one in found),
-        difference=_first(one.difference for one in found),
-    )
-
-
-def _first(differences: Iterable[ReplayDifference | None]) -> ReplayDifference | None:
-    return min(filter(None, differences), key=lambda one: one.now_ns, default=None)
+def _added(found: Sequence[Result]) -> Result:
+    """Return the results of a process, or of a link, of all loops as one."""
+    differences = filter(None, (one.difference for one in found))
+    sums = {"inputs", "compared", "received"} & vars(found[0]).keys()
+    update: dict[str, object] = {name: sum(getattr(one, name) for one in found) for name in sums}
+    update["difference"] = min(differences, key=lambda one: one.now_ns, default=None)
+    if isinstance(found[0], ProcessReplay):
+        missing = (one.missing_from for one in found if one.missing_from is not None)
+        update["missing_from"] = next(missing, None)
+        update["end_known"] = all(one.end_known for one in found)
+    return found[0].model_copy(update=update)

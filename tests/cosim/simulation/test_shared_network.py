@@ -139,6 +139,8 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     head = bytearray(packets["head"][3].tobytes())
     head[6] = 1  # the number of another loop
     packets["head"][3] = bytes(head)
+    lost = {NETEM_PACKET: np.delete(shared.loops[2][NETEM_PACKET], -3)}
+    assert replay(changed(shared.loops[2], lost, reports={})).first_difference is None
     other = changed(shared.loops[2], {NETEM_PACKET: packets})
     found = replay(other)
     assert found == replay(other, SharedMachines([*shared.loops[:2], other]))

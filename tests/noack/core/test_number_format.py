@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from noack.core.number_format import plus_minus
+from noack.core.number_format import byte_size, duration, plus_minus
 
 
 @pytest.mark.parametrize(
@@ -28,3 +28,16 @@ def test_a_mean_has_as_many_digits_as_its_interval_supports(
     mean: float, halfwidth: float, written: str
 ) -> None:
     assert plus_minus(mean, halfwidth) == written
+
+
+@pytest.mark.parametrize(
+    ("value_s", "text"),
+    [(0.0, "0 ns"), (999.6e-9, "1 µs"), (0.004, "4 ms"), (-0.0125, "-12.5 ms"), (61.0, "61 s"),
+     (1234.0, "1234 s")],
+)  # fmt: skip
+def test_a_duration_has_a_unit_and_no_zeros_at_its_end(value_s: float, text: str) -> None:
+    assert duration(value_s) == text
+
+
+def test_a_size_has_a_unit() -> None:
+    assert [byte_size(size) for size in (12, 999_600, 1.5e9)] == ["12 bytes", "1 MB", "1.5 GB"]
