@@ -133,9 +133,8 @@ def command_line_parser() -> Parser:
     )
     alone.add_argument("--seed", type=int, help="seed of the random streams (0)")
     alone.add_argument(
-        "--explain", action="store_true",
-        help="explain the words, or the links of a file, and exit",
-    )  # fmt: skip
+        "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
+    )
     return parser
 
 

@@ -53,19 +53,22 @@ _SPIN_NS = 50_000
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("relay")
     group.add_argument(
-        "--segment", action="store_true",
+        "--segment",
+        action="store_true",
         help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--realtime", action="store_true",
+        "--realtime",
+        action="store_true",
         help="request SCHED_FIFO, locked memory and no deep idle states, each where permitted; "
         "poll during the last 50 µs before a delayed datagram is due",
-    )  # fmt: skip
+    )
     group = parser.add_argument_group("recording")
     group.add_argument(
-        "--capture", metavar="FILE.pcapng",
+        "--capture",
+        metavar="FILE.pcapng",
         help="capture all datagrams, with their fates as comments; - for standard output",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates"
     )
@@ -224,9 +227,7 @@ _SWITCH_S = 0.0002
 
 def _add_watching_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("statistics and changes during operation")
-    group.add_argument(
-        "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
-    )  # fmt: skip
+    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
     group.add_argument(
         "--stats", metavar="SECONDS", type=float,
         help="print statistics as JSON lines every SECONDS",
@@ -235,9 +236,10 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
         "--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead"
     )
     group.add_argument(
-        OPTION, metavar="[HOST]:PORT",
+        OPTION,
+        metavar="[HOST]:PORT",
         help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--log-format", choices=[*LogFormat], type=LogFormat, default=LogFormat.TEXT,
         help="format of standard error: text, or JSON Lines for log collectors (text)",

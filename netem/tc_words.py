@@ -49,8 +49,9 @@ KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 _WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.described()]
 _AFTER = {
     word.name: ", or after ".join(other.after for other in _WORDS if other.name == word.name)
-    for word in _WORDS if word.name not in _CLAUSES
-}  # fmt: skip
+    for word in _WORDS
+    if word.name not in _CLAUSES
+}
 """For each word that begins no clause: the words after which it is allowed."""
 EXAMPLES: Mapping[str, str] = {
     **{word.name: word.example for word in _WORDS},

@@ -199,8 +199,9 @@ def _warn_of_removed_caps(
                 print(
                     f"noack netem set: {new['name']} {direction} no longer has "
                     f"{', '.join(removed)}; the words replaced all settings",
-                    file=sys.stderr, flush=True,
-                )  # fmt: skip
+                    file=sys.stderr,
+                    flush=True,
+                )
 
 
 def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
@@ -225,8 +226,9 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
         "watch",
         "Show a running emulator's statistics live. If the output is not a terminal, print one\n"
         "line per second for each direction of a link that has received datagrams.",
-        ("noack netem watch", "noack netem watch dns --json"), "print one JSON document per second",
-    )  # fmt: skip
+        ("noack netem watch", "noack netem watch dns --json"),
+        "print one JSON document per second",
+    )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     name = _chosen(options)

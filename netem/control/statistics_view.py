@@ -111,9 +111,9 @@ class History:
 
     def __init__(self) -> None:
         self.latest: Statistics | None = None
-        self._samples: defaultdict[
-            tuple[str, Direction], deque[tuple[float, RecentRates]]
-        ] = defaultdict(deque)  # fmt: skip
+        self._samples: defaultdict[tuple[str, Direction], deque[tuple[float, RecentRates]]] = (
+            defaultdict(deque)
+        )
 
     def add(self, statistics: Statistics) -> None:
         """Add statistics that are newer than those before."""
@@ -179,9 +179,8 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
     title = Text.assemble(
-        (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ",
-        (_clients_text(link), "dim"),
-    )  # fmt: skip
+        (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ", (_clients_text(link), "dim")
+    )
     panel = Panel(
         Group(grid, *unintended), title=title, title_align="left",
         border_style="red" if unintended else "blue",

@@ -472,10 +472,11 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     if os.environ.pop(TICKET_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
     ticket = _wait_for(
-        lambda: find_ticket(session), signals,
+        lambda: find_ticket(session),
+        signals,
         f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
         "a run on another host, give its --invitation; Ctrl-C ends",
-    )  # fmt: skip
+    )
     if ticket is None:
         raise PeerError(
             f"no run to join in session {session!r}: start `noack record SCENARIO` first"

@@ -39,9 +39,10 @@ class Blackout(FileFeature, Impairment):
     """All packets that arrive during given intervals of time are lost."""
 
     kind: Literal["blackout"] = "blackout"
-    intervals_s: Annotated[
-        tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)
-    ] | None = None  # fmt: skip
+    intervals_s: (
+        Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)]
+        | None
+    ) = None
     """Begin and end of each, in seconds from the emulator's start (in a run: its epoch)."""
     file: Annotated[str, Field(min_length=1)] | None = None
     """Instead: a text file with begin and end of an interval on each line, e.g. 2s 3500ms."""
