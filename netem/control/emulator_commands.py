@@ -19,7 +19,7 @@ from zenoh.handlers import RingChannel
 
 from netem.control.control_server import EMULATORS, find, running
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_view import History, Screen, render
+from netem.control.statistics_view import Screen, picture_of
 from netem.relay_links import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
@@ -141,10 +141,8 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     if options.json:
         print(json.dumps(statistics, indent=2), flush=True)
     else:
-        history = History()
-        history.add(statistics)
         console = _Console()
-        console.print(render(history, _title(name), console.width, None))
+        console.print(picture_of(statistics, _title(name), console.width))
     return ExitStatus.OK
 
 

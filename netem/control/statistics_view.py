@@ -151,6 +151,13 @@ class History:
         return [sum(values) / len(values) if values else None for values in found]
 
 
+def picture_of(statistics: Statistics, title: str, width: int) -> RenderableType:
+    """Return the view of one statistics document, of any height, without the last minute."""
+    history = History()
+    history.add(statistics)
+    return render(history, title, width, None)
+
+
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
     """Return the full-screen view of the latest statistics, for a terminal of this size."""
     latest = history.latest
@@ -175,6 +182,8 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
     lines = 2
     forward, reverse = (_cells(history, link, name, column) for name in DIRECTIONS)
     for (label, left), (_, right) in zip(forward, reverse, strict=True):
+        if not (label + left.plain + right.plain).strip():  # a chart without data
+            continue
         grid.add_row(label, left, right)
         lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
@@ -190,10 +199,14 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
 
 def _clients_text(link: LinkStatistics) -> str:
     text = f"{link['clients']} client{'' if link['clients'] == 1 else 's'}"
+    if link["clients_ever"] > link["clients"]:
+        text += f" ({link['clients_ever']} ever)"
     if link["refused"]:
         text += f", {link['refused']:,} datagrams refused"
     if link["port_unreachable"]:
         text += f", port unreachable {link['port_unreachable']:,} times"
+    if link["discarded"]:
+        text += f", {link['discarded']:,} answers discarded"
     return text
 
 
@@ -243,15 +256,18 @@ def _cells(
 
 
 def _rate(of: DirectionStatistics, key: str) -> str:
+    """Return a recent rate in datagrams per second; without one, the number of datagrams."""
     recent = of["recent"]
-    return NONE if recent is None else rate_text(recent[key])  # type: ignore[literal-required]
+    if recent is None:
+        return f"{of[key]:,}"  # type: ignore[literal-required]
+    return rate_text(recent[f"{key}_per_s"])  # type: ignore[literal-required]
 
 
 def _flow(of: DirectionStatistics, key: str) -> str:
-    """Return a recent rate in datagrams and in bits per second."""
+    """Return :func:`_rate`, and the rate in bits per second."""
     recent = of["recent"]
     bits = "" if recent is None else bits_text(recent[f"{key}_bits_per_s"])  # type: ignore[literal-required]
-    return f"{_rate(of, f'{key}_per_s')}  {bits}".strip()
+    return f"{_rate(of, key)}  {bits}".strip()
 
 
 def _times(times: DelayQuantiles, width: int) -> str:
@@ -311,8 +327,8 @@ def _burst_of_cap(of: DirectionStatistics) -> str:
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
-    "received": lambda of: _rate(of, "received_per_s"),
-    "forwarded": lambda of: _rate(of, "forwarded_per_s"),
+    "received": lambda of: _rate(of, "received"),
+    "forwarded": lambda of: _rate(of, "forwarded"),
     "loss": lambda of: percent_text(of["loss"]["lost"]),
     "predicted": lambda of: percent_text(of["loss"]["predicted"]),
     "burst/cap": _burst_of_cap,

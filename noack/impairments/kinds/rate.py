@@ -61,19 +61,21 @@ class Rate(Impairment):
     discipline: Discipline = TailDrop.model_construct()
     """Which packets the queue drops."""
 
-    clauses: ClassVar = Clause(
-        "rate",
-        "rate 1mbit",
-        (
-            Part(("rate_bps",), RATE_BPS, "RATE"),
-            Part(("overhead_bytes",), SIGNED_COUNT, "OVERHEAD"),
-            Part(("cell_bytes",), COUNT, "CELL"),
-            Part(("cell_overhead_bytes",), SIGNED_COUNT, "CELL_OVERHEAD"),
-            Part(("queue",), COUNT, "N", "queue", "rate 1mbit queue 20"),
-            *(
-                _DisciplinePart(("discipline",), word=clause.word)
-                for kind in DISCIPLINES
-                for clause in kind.clauses
+    clauses: ClassVar = (
+        Clause(
+            "rate",
+            "rate 1mbit",
+            (
+                Part(("rate_bps",), RATE_BPS, "RATE"),
+                Part(("overhead_bytes",), SIGNED_COUNT, "OVERHEAD"),
+                Part(("cell_bytes",), COUNT, "CELL"),
+                Part(("cell_overhead_bytes",), SIGNED_COUNT, "CELL_OVERHEAD"),
+                Part(("queue",), COUNT, "N", "queue", "rate 1mbit queue 20"),
+                *(
+                    _DisciplinePart(("discipline",), word=clause.word)
+                    for kind in DISCIPLINES
+                    for clause in kind.clauses
+                ),
             ),
         ),
     )
