@@ -1,6 +1,6 @@
 """Clocks with an added offset and drift, for measurements whose true offset is known."""
 
-from noack.runtime.time_exchange import HostClocks
+from noack.runtime.host_clocks.time_exchange import HostClocks
 
 
 class DrivenClocks(HostClocks):

@@ -23,8 +23,8 @@ import numpy as np
 from benchmarks._driven_clocks import DrivenClocks
 from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address
+from noack.runtime.host_clocks.time_exchange import TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
-from noack.runtime.time_exchange import TimeClient, TimeReference, answering
 
 KEY = bytes(range(32))
 CHECKS_AT_ONCE = 25

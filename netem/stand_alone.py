@@ -36,7 +36,7 @@ from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
 from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
-from noack.runtime.metrics_server import OPTION, metrics_server, require_package
+from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
 from noack.runtime.real_time_loop import realtime
 
 _FIFO_PRIORITY = 50

@@ -112,7 +112,7 @@ def _served_metrics(scenario: "Scenario", where: str) -> "Iterator[Watcher]":
     """Serve the metrics of a run within the context; yield what updates them."""
     from noack.runtime.address import text_of
     from noack.runtime.command_line import print_to_stderr
-    from noack.runtime.metrics_server import metrics_server, require_package
+    from noack.runtime.connections.metrics_server import metrics_server, require_package
 
     require_package()
     from cosim.live.run_metrics import RunMetrics

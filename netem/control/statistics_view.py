@@ -32,9 +32,12 @@ from netem.control.emulator_statistics import (
     Statistics,
 )
 from netem.relay_links import DIRECTIONS, Direction
+from noack.core.clock import NS_PER_S
+from noack.core.number_format import duration, with_unit
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
-NONE = "–"
+_NONE = "–"
+_BIT_RATES = ("Gbit/s", "Mbit/s", "kbit/s", "bit/s")
 
 
 def rate_text(per_s: float) -> str:
@@ -42,20 +45,15 @@ def rate_text(per_s: float) -> str:
     return f"{per_s:,.0f}/s" if per_s >= 10 or per_s == 0 else f"{per_s:.2g}/s"
 
 
-def bits_text(bits_per_s: float) -> str:
-    """Bits per second, with three digits."""
-    return _with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
-
-
 def time_text(t_ns: float | None) -> str:
     """A duration, with three digits."""
-    return NONE if t_ns is None else _with_unit(t_ns, ("s", "ms", "µs", "ns"))
+    return _NONE if t_ns is None else duration(t_ns / NS_PER_S)
 
 
 def percent_text(share: float | None) -> str:
     """A share in percent, to 0.01 % below 10 %."""
     if share is None:
-        return NONE
+        return _NONE
     percent = 100 * share
     if percent == 0 or percent >= 99.995:
         return f"{percent:.0f} %"
@@ -84,16 +82,6 @@ def bar(share: float, width: int) -> tuple[str, str]:
     """Return the filled part and the rest of a bar of ``width`` characters."""
     filled = round(min(max(share, 0.0), 1.0) * width)
     return "━" * filled, "─" * (width - filled)
-
-
-def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
-    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
-    for unit, size in zip(units, (1e9, 1e6, 1e3), strict=False):
-        if value >= 0.9995 * size:
-            part = value / size
-            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
-            return f"{part:.{digits}f} {unit}"
-    return f"{value:.0f} {units[-1]}"
 
 
 _SPAN_S = 60.0
@@ -266,13 +254,13 @@ def _rate(of: DirectionStatistics, key: str) -> str:
 def _flow(of: DirectionStatistics, key: str) -> str:
     """Return :func:`_rate`, and the rate in bits per second."""
     recent = of["recent"]
-    bits = "" if recent is None else bits_text(recent[f"{key}_bits_per_s"])  # type: ignore[literal-required]
+    bits = "" if recent is None else with_unit(recent[f"{key}_bits_per_s"], _BIT_RATES)  # type: ignore[literal-required]
     return f"{_rate(of, key)}  {bits}".strip()
 
 
 def _times(times: DelayQuantiles, width: int) -> str:
     if times["p50"] is None:
-        return NONE
+        return _NONE
     text = f"p50 {time_text(times['p50']):<9} p99 {time_text(times['p99'])}"
     return text if len(text) <= width else text.removeprefix("p50 ").replace("  ", " ")
 
@@ -323,7 +311,7 @@ def _wrapped(text: str, width: int) -> Text:
 
 
 def _burst_of_cap(of: DirectionStatistics) -> str:
-    return f"{of['longest_loss_burst']:,}/{NONE if of['mansd'] is None else of['mansd']}"
+    return f"{of['longest_loss_burst']:,}/{_NONE if of['mansd'] is None else of['mansd']}"
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {

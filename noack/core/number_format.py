@@ -39,12 +39,12 @@ def seconds(value_s: float | None) -> str:
 
 def duration(value_s: float) -> str:
     """Write a time with three digits, in s, ms, µs or ns."""
-    return _with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
+    return with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
 
 
 def byte_size(value: float) -> str:
     """Write a number of bytes with three digits, in GB, MB, kB or bytes."""
-    return _with_unit(value, ("GB", "MB", "kB", "bytes"))
+    return with_unit(value, ("GB", "MB", "kB", "bytes"))
 
 
 def ratio(part: int, of: int) -> str:
@@ -57,10 +57,10 @@ def percent(share: float) -> str:
     return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
-def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
-    size, unit = next(
-        (pair for pair in zip(_SIZES, units, strict=False) if abs(value) >= pair[0]), (1, units[-1])
-    )
+def with_unit(value: float, units: tuple[str, str, str, str]) -> str:
+    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
+    pairs = zip(_SIZES, units, strict=False)  # 999.6 is rounded to 1 of the next unit
+    size, unit = next((pair for pair in pairs if abs(value) >= 0.9995 * pair[0]), (1, units[-1]))
     return f"{value / size:.3g} {unit}"
 
 

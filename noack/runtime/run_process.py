@@ -54,6 +54,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,
     STANDARD_INPUT,
@@ -64,7 +65,6 @@ from noack.runtime.join_ticket import (
 )
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
-from noack.runtime.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
 

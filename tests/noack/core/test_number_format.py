@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from noack.core.number_format import plus_minus
+from noack.core.number_format import byte_size, plus_minus
 
 
 @pytest.mark.parametrize(
@@ -28,3 +28,7 @@ def test_a_mean_has_as_many_digits_as_its_interval_supports(
     mean: float, halfwidth: float, written: str
 ) -> None:
     assert plus_minus(mean, halfwidth) == written
+
+
+def test_a_size_is_in_the_unit_that_it_is_rounded_to() -> None:
+    assert [byte_size(size) for size in (999.4, 999.6, 123.4e9)] == ["999 bytes", "1 kB", "123 GB"]

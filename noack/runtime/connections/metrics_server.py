@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from noack.core.errors import CallerError, MachineError, why
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connection_gate import FirstBytes, TaskLimit, accepting
+from noack.runtime.connections.connection_gate import FirstBytes, TaskLimit, accepting
 
 if TYPE_CHECKING:
     from prometheus_client import Metric

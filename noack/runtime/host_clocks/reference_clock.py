@@ -23,8 +23,8 @@ from noack.core.errors import PeerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import LOST_NS, clock_table
 from noack.runtime.address import Address, text_of
+from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.time_exchange import HostClocks, TimeClient
 
 LOST_AFTER_NS = 500_000_000
 """Without an answer of the reference for this time, the bound counts as lost."""
