@@ -116,9 +116,11 @@ class LinkState:
             raise ValueError("rows: a flow has not begun")
         decisions = np.zeros(len(rows), dtype_of("noack_decision"))
         core.noack_link_decide_many(
-            self.core, len(rows), *(pointer_to(one, "int64_t *") for one in
-            (rows, sizes_bytes, arrivals_ns)), pointer_to(decisions, "noack_decision *"),
-        )  # fmt: skip
+            self.core,
+            len(rows),
+            *(pointer_to(one, "int64_t *") for one in (rows, sizes_bytes, arrivals_ns)),
+            pointer_to(decisions, "noack_decision *"),
+        )
         return decisions
 
     def leave(self, row: int, packet: int, size_bytes: int, *, delayed: bool, counts: bool) -> bool:

@@ -63,9 +63,11 @@ class RelayMemory:
         self._block_next = np.zeros(0, np.int32)
         self._add_chunk()
         for name, kind in (
-            ("events", "noack_event *"), ("data", "uint8_t *"), ("packets", "noack_packet_row *"),
+            ("events", "noack_event *"),
+            ("data", "uint8_t *"),
+            ("packets", "noack_packet_row *"),
             ("releases", "noack_release_row *"),
-        ):  # fmt: skip
+        ):
             setattr(self.core, name, pointer_to(getattr(self, name), kind))
         core.noack_relay_open(self.core)
 

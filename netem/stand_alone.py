@@ -67,10 +67,12 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
         "--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates"
     )
     group.add_argument(
-        "--replay-fates", metavar="FILE.parquet", type=Path,
+        "--replay-fates",
+        metavar="FILE.parquet",
+        type=Path,
         help="replay recorded packet fates, matched by flow and packet number; the recorded cap "
         "applies unless mansd sets another",
-    )  # fmt: skip
+    )
     _add_watching_options(parser)
 
 
@@ -166,11 +168,13 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
 
     return [
         replace(
-            spec, forward=settings(spec, "forward"), reverse=settings(spec, "reverse"),
+            spec,
+            forward=settings(spec, "forward"),
+            reverse=settings(spec, "reverse"),
             decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
         )
         for spec in specs
-    ]  # fmt: skip
+    ]
 
 
 def _check_files(options: argparse.Namespace) -> None:
@@ -230,9 +234,11 @@ def _add_watching_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("statistics and changes during operation")
     group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
     group.add_argument(
-        "--stats", metavar="SECONDS", type=float,
+        "--stats",
+        metavar="SECONDS",
+        type=float,
         help="print statistics as JSON lines every SECONDS",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead"
     )

@@ -41,8 +41,10 @@ _REFUSED = {
 _KINDS: Sequence[type[Feature]] = (*IMPAIRMENTS, *CONSTRAINTS)
 _CLAUSES = {
     name: (kind, clause)
-    for kind in _KINDS for clause in kind.clauses for name in (clause.word, *clause.synonyms)
-}  # fmt: skip
+    for kind in _KINDS
+    for clause in kind.clauses
+    for name in (clause.word, *clause.synonyms)
+}
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
 KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 """Words that begin a clause."""
@@ -62,9 +64,11 @@ EXAMPLES: Mapping[str, str] = {
 """By word; ``seed`` is missing because it is also an option."""
 GRAMMAR = [
     word.grammar
-    for kind in IMPAIRMENTS for clause in kind.clauses for word in clause.described()
+    for kind in IMPAIRMENTS
+    for clause in kind.clauses
+    for word in clause.described()
     if word.grammar
-]  # fmt: skip
+]
 """The words of each impairment, for ``--help``."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
 _CONSTRAINT: TypeAdapter[Any] = TypeAdapter(AnyConstraint)

@@ -130,9 +130,11 @@ def _chosen(options: argparse.Namespace) -> str:
 
 def _show(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
-        "show", "Show the statistics of a running emulator.",
-        ("noack netem show", "noack netem show dns --json"), "print one JSON document",
-    )  # fmt: skip
+        "show",
+        "Show the statistics of a running emulator.",
+        ("noack netem show", "noack netem show dns --json"),
+        "print one JSON document",
+    )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     name = _chosen(options)
@@ -169,9 +171,11 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     with Client(_chosen(options)) as client:
         before = client.ask("settings")
         answer = client.ask(
-            "change", link=options.link, direction=options.direction,
+            "change",
+            link=options.link,
+            direction=options.direction,
             settings=settings.model_dump(mode="json"),
-        )  # fmt: skip
+        )
     if options.json:
         print(json.dumps(answer, indent=2), flush=True)
         return ExitStatus.OK

@@ -179,9 +179,11 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ", (_clients_text(link), "dim")
     )
     panel = Panel(
-        Group(grid, *unintended), title=title, title_align="left",
+        Group(grid, *unintended),
+        title=title,
+        title_align="left",
         border_style="red" if unintended else "blue",
-    )  # fmt: skip
+    )
     return panel, lines + len(unintended)
 
 

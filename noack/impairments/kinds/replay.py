@@ -222,9 +222,11 @@ class Replay(FileFeature, Impairment):
         if (trace.delay_ns > LONGEST_DELAY_NS).any():
             file.wrong("has a delay of more than an hour; a replay can have none")
         update = {
-            "sent_ns": tuple(trace.sent_ns.tolist()), "delays_ns": tuple(trace.delay_ns.tolist()),
-            "file": None, "clocks_differ": False,
-        }  # fmt: skip
+            "sent_ns": tuple(trace.sent_ns.tolist()),
+            "delays_ns": tuple(trace.delay_ns.tolist()),
+            "file": None,
+            "clocks_differ": False,
+        }
         read = self.model_copy(update=update)
         require_inside(self.offset_s, read.length_ns, file)
         return read
