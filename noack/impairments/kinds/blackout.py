@@ -32,7 +32,7 @@ _INTERVALS = Quantity("intervals of time, e.g. 2s-3s,5s-5500ms", _read_intervals
 
 
 def _every(example: str) -> Part:
-    return Part(("every_s",), OWN_TIME_S, "T", "every", example)
+    return Part("every_s", OWN_TIME_S, "T", "every", example)
 
 
 class Blackout(FileFeature, Impairment):
@@ -53,15 +53,14 @@ class Blackout(FileFeature, Impairment):
         Clause(
             "blackout",
             "blackout 2s-3s",
-            (
-                Part(("intervals_s",), _INTERVALS, "T-T[,T-T...]"),
-                _every("blackout 2s-3s every 10s"),
-            ),
+            Part("intervals_s", _INTERVALS, "T-T[,T-T...]"),
+            _every("blackout 2s-3s every 10s"),
         ),
         Clause(
             "outages",
             "outages outages.txt",
-            (file_name("a file of outages"), _every("outages outages.txt every 60s")),
+            file_name("a file of outages"),
+            _every("outages outages.txt every 60s"),
         ),
     )
     tc_missing: ClassVar = "blackouts"

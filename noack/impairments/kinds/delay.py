@@ -124,26 +124,34 @@ class Delay(FileFeature, Impairment):
         Clause(
             "delay",
             "delay 10ms",
-            (
-                Part(("delay_s",), TIME_S, "TIME"),
-                _JitterPart(("jitter_s",), TIME_S, "JITTER"),
-                Part(("correlation",), CORRELATION, "CORR"),
-                _DistributionPart(
-                    ("distribution",), None, f"{'|'.join(SHAPES)}|FILE", "distribution",
-                    "delay 10ms 2ms distribution normal",
-                ),
-                Part(
-                    ("samples_s",), _SAMPLES, "T,T,...", "samples", "delay 0s samples 1ms,2ms,10ms",
-                    {"distribution": "empirical"},
-                ),
-                Part(
-                    ("loss_correlation",), SIGNED_PERCENT, "P", "lossrel",
-                    "loss 5% delay 10ms 2ms lossrel 50%",
-                ),
+            Part("delay_s", TIME_S, "TIME"),
+            _JitterPart("jitter_s", TIME_S, "JITTER"),
+            Part("correlation", CORRELATION, "CORR"),
+            _DistributionPart(
+                "distribution",
+                None,
+                f"{'|'.join(SHAPES)}|FILE",
+                "distribution",
+                "delay 10ms 2ms distribution normal",
             ),
-            ("latency",),
+            Part(
+                "samples_s",
+                _SAMPLES,
+                "T,T,...",
+                "samples",
+                "delay 0s samples 1ms,2ms,10ms",
+                {"distribution": "empirical"},
+            ),
+            Part(
+                "loss_correlation",
+                SIGNED_PERCENT,
+                "P",
+                "lossrel",
+                "loss 5% delay 10ms 2ms lossrel 50%",
+            ),
+            synonyms=("latency",),
         ),
-    )  # fmt: skip
+    )
     delays: ClassVar = True
 
     @model_validator(mode="after")

@@ -41,7 +41,7 @@ class FourStateLoss(LossModel):
         Clause(
             "state",
             "loss state 1% 10%",
-            tuple(Part((name,), PERCENT, name.upper()) for name in _NAMES),
+            *tuple(Part(name, PERCENT, name.upper()) for name in _NAMES),
             complement=True,
         ),
     )
