@@ -314,7 +314,7 @@ def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRela
 @contextmanager
 def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
     require_package()
-    from netem.control.emulator_metrics import EmulatorMetrics
+    from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
 
     with metrics_server(where, EmulatorMetrics(commands).collect) as address:
         say(f"metrics: http://{text_of(address)}/metrics")

@@ -215,7 +215,7 @@ def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
     """
     *lead, n, _ = M.shape
     if n > _MOST_STATES:
-        from scipy.linalg import solve_continuous_lyapunov
+        from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
         if lead:
             return np.array([solve_lyapunov(matrix, Q) for matrix in M])

@@ -82,9 +82,8 @@ class EncryptedSeal:
     version = 2
 
     def __init__(self, key: bytes) -> None:
-        # Loaded here, since few runs are encrypted.
-        from cryptography.exceptions import InvalidTag
-        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+        from cryptography.exceptions import InvalidTag  # few runs are encrypted
+        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # the same
 
         require_key(key)
         # A key of its own: the tags of other datagrams are made with the run's key itself.
