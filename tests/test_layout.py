@@ -12,7 +12,7 @@ MOST_MODULES = 400
 LINES = {
     "noack/config": 3850,
     "noack/controllers": 200,
-    "noack/core": 1480,
+    "noack/core": 1470,
     "noack/disturbances": 250,
     "noack/impairments": 3900,
     "noack/machines": 450,
@@ -24,7 +24,7 @@ LINES = {
     "noack/theory": 8240,
     "noack/traces": 1350,
     "noack/trigger": 1250,
-    "netem": 5700,
+    "netem": 5650,
     "cosim/analysis": 7180,
     "cosim/api": 1500,
     "cosim/cli": 2850,
