@@ -238,6 +238,7 @@ def _cells(
         ("", Text(sparkline(losses, _top([*losses, of["loss"]["predicted"]])), "yellow")),
         ("drawn", Text(_drawn(of))),
         ("lost", _wrapped(_lost_text(of), width)),
+        ("", _wrapped(_further_counts(of), width)),
         ("burst", _burst(of, width)),
         ("delay", Text(_times(delay, width))),
         ("lateness", Text(_times(late, width))),
@@ -287,6 +288,15 @@ def _lost_text(of: DirectionStatistics) -> str:
     lost = [(fate.replace("_", " "), of["fates"][fate]) for fate in _LOST]
     lost.append(("stale", of["delivered_out_of_order"]))
     return ", ".join(f"{number:,} {cause}" for cause, number in lost if number) or "0"
+
+
+def _further_counts(of: DirectionStatistics) -> str:
+    counts = {
+        "duplicated": of["duplicated"],
+        "held back for the guarantee": of["held_back"],
+        "received before the last change": of["received_before"],
+    }
+    return ", ".join(f"{number:,} {what}" for what, number in counts.items() if number)
 
 
 def burst_text(of: DirectionStatistics) -> str:

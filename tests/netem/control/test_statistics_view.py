@@ -87,12 +87,14 @@ def test_the_last_minute_is_drawn() -> None:
 
 
 def test_totals_are_counts_without_charts() -> None:
-    file = io.StringIO()
-    Console(file=file, width=80).print(picture_of(documents(FakeRelay("up"), 3)[0], "totals", 80))
+    relay, file = FakeRelay("up"), io.StringIO()
+    relay.counters["up", "forward"].duplicated = 12
+    Console(file=file, width=80).print(picture_of(documents(relay, 1)[0], "totals", 80))
     lines = file.getvalue().splitlines()
     assert lines[0].split() == ["totals", "0:01"]
     assert "1 client (3 ever)" in lines[1]
     assert line_of(lines, "received") == "received 0 0"
+    assert any(line.strip("│ ") == "12 duplicated" for line in lines)
     assert not any(line.strip("│ ") == "" for line in lines)
 
 
