@@ -32,8 +32,7 @@ from netem.control.emulator_statistics import (
     Statistics,
 )
 from netem.relay_links import DIRECTIONS, Direction
-from noack.core.clock import NS_PER_S
-from noack.core.number_format import duration, with_unit
+from noack.core.number_format import with_unit
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _NONE = "–"
@@ -47,7 +46,7 @@ def rate_text(per_s: float) -> str:
 
 def time_text(t_ns: float | None) -> str:
     """A duration, with three digits."""
-    return _NONE if t_ns is None else duration(t_ns / NS_PER_S)
+    return _NONE if t_ns is None else with_unit(t_ns, ("s", "ms", "µs", "ns"))
 
 
 def percent_text(share: float | None) -> str:

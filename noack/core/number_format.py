@@ -59,9 +59,12 @@ def percent(share: float) -> str:
 
 def with_unit(value: float, units: tuple[str, str, str, str]) -> str:
     """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
-    pairs = zip(_SIZES, units, strict=False)  # 999.6 is rounded to 1 of the next unit
-    size, unit = next((pair for pair in pairs if abs(value) >= 0.9995 * pair[0]), (1, units[-1]))
-    return f"{value / size:.3g} {unit}"
+    for unit, size in zip(units, _SIZES, strict=False):
+        if abs(value) >= 0.9995 * size:
+            part = abs(value) / size
+            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
+            return f"{value / size:.{digits}f} {unit}"
+    return f"{value:.0f} {units[-1]}"
 
 
 def plus_minus(mean: float, halfwidth: float) -> str:

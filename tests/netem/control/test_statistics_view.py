@@ -63,7 +63,7 @@ def test_a_link_is_shown_with_both_directions() -> None:
     assert "up  127.0.0.1:5000 → [::1]:6000  1 client" in lines[1]
     assert "loss 10% delay 10ms mansd 2" in lines[3]
     assert "no impairment" in lines[3]
-    assert line_of(lines, "received") == "received 2,000/s 1.6 Mbit/s 0/s 0 bit/s"
+    assert line_of(lines, "received") == "received 2,000/s 1.60 Mbit/s 0/s 0 bit/s"
     assert line_of(lines, "forwarded") == "forwarded 1,600/s 1.28 Mbit/s 0/s 0 bit/s"
     assert line_of(lines, "loss") == "loss 20.0 % –"
     assert line_of(lines, "drawn") == "drawn 20.0 %, predicted 9.91 % –, predicted 0 %"
@@ -164,7 +164,7 @@ def test_a_pipe_gets_one_line_per_direction_in_use() -> None:
     assert plain_lines(first) == []
     up, down = plain_lines(last)
     assert up.startswith(
-        "3.0 s  up forward  received 2,000/s  1.6 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
+        "3.0 s  up forward  received 2,000/s  1.60 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
         "loss 20.0 %  drawn 20.0 %, predicted 9.91 %  longest loss burst 2, cap 2  forced 300  "
     )
     assert up.endswith("in flight 5  UNINTENDED 3 send_errors")

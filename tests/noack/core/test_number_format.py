@@ -31,4 +31,8 @@ def test_a_mean_has_as_many_digits_as_its_interval_supports(
 
 
 def test_a_size_is_in_the_unit_that_it_is_rounded_to() -> None:
-    assert [byte_size(size) for size in (999.4, 999.6, 123.4e9)] == ["999 bytes", "1 kB", "123 GB"]
+    assert [byte_size(size) for size in (999.4, 999.6, 123.4e9)] == [
+        "999 bytes",
+        "1.00 kB",
+        "123 GB",
+    ]
