@@ -39,8 +39,8 @@ from benchmarks.report import (
 )
 from noack.core.clock import ClockOffset, Restart
 from noack.runtime.address import Address
+from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient, TimeReference, answering
 from noack.runtime.real_time_loop import realtime
-from noack.runtime.time_exchange import HostClocks, TimeClient, TimeReference, answering
 
 
 class DrivenClocks(HostClocks):

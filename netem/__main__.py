@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the emulator (stand-alone or in a run), or a command for a running emulator."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in ("show", "set", "watch"):
-        from netem.control import emulator_commands
+        from netem.control import emulator_commands  # a run's emulator starts without it
 
         return emulator_commands.main(given)
     joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
             with join_run("netem", given) as run:
                 run_network(run)
             return ExitStatus.OK
-        from netem.stand_alone import alone
+        from netem.stand_alone import alone  # a run's emulator starts without it
 
         return alone(given)
     except NoackError as error:

@@ -7,7 +7,7 @@ import argparse
 import difflib
 import json
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +117,11 @@ def command_line_parser() -> Parser:
     add_options(parser)
     alone = parser.add_argument_group("links")
     alone.add_argument(
-        "--listen", metavar="HOST:PORT", help="address for the clients; "
+        "--listen",
+        metavar="HOST:PORT",
+        help="address for the clients; "
         ":9000 is 127.0.0.1:9000, and 0.0.0.0:9000 or [::]:9000 is any address of this machine",
-    )  # fmt: skip
+    )
     alone.add_argument("--to", metavar="HOST:PORT", help="address of the server")
     alone.add_argument("words", nargs="*", metavar="WORDS", help="impairments, clients to server")
     alone.add_argument(
@@ -133,9 +135,8 @@ def command_line_parser() -> Parser:
     )
     alone.add_argument("--seed", type=int, help="seed of the random streams (0)")
     alone.add_argument(
-        "--explain", action="store_true",
-        help="explain the words, or the links of a file, and exit",
-    )  # fmt: skip
+        "--explain", action="store_true", help="explain the words, or the links of a file, and exit"
+    )
     return parser
 
 
@@ -287,27 +288,22 @@ def _document(settings: LinkSettings) -> dict[str, Any]:
     }
 
 
-def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
-    """Return (words, meaning) of the cap and the other settings."""
-    found = []
+def settings_meaning(settings: LinkSettings) -> Iterator[tuple[str, str]]:
+    """Yield (words, meaning) of the cap and the other settings."""
     if settings.mansd is not None:
-        found.append((
+        meaning = f"at most {settings.mansd} consecutive packets of a flow are not delivered"
+        yield (
             f"mansd {settings.mansd}",
-            f"the cap (M − 1): at most {settings.mansd} consecutive packets of a flow are not "
-            "delivered; the next one is always delivered",
-        ))  # fmt: skip
-    found += [(one.text(), one.meaning()) for one in settings.constraints]
+            f"the cap (M − 1): {meaning}; the next one is always delivered",
+        )
+    for one in settings.constraints:
+        yield one.text(), one.meaning()
     if settings.first_delivered:
-        found.append((
-            "first",
-            "the first packet of each flow is always delivered; the cap for later packets is mansd",
-        ))  # fmt: skip
+        meaning = "the first packet of each flow is always delivered"
+        yield "first", f"{meaning}; the cap for later packets is mansd"
     if any(one.delays for one in settings.impairments):
-        found.append((
-            f"limit {settings.limit}",
-            f"at most {settings.limit} packets are delayed at once; more are dropped",
-        ))  # fmt: skip
-    return found
+        most = settings.limit
+        yield f"limit {most}", f"at most {most} packets are delayed at once; more are dropped"
 
 
 def _print_link(console: Console, spec: LinkSpec, named: LinkSpec) -> None:
@@ -390,8 +386,10 @@ def _uncapped(settings: LinkSettings) -> LinkSettings:
 def _link_table(spec: LinkSpec) -> dict[str, Any]:
     """Return a link's table in a file of links, without default values."""
     table: dict[str, Any] = {
-        "name": spec.name, "listen": address_text(spec.listen), "to": address_text(spec.to),
-    }  # fmt: skip
+        "name": spec.name,
+        "listen": address_text(spec.listen),
+        "to": address_text(spec.to),
+    }
     for key in ("seed", "return_path", "idle_s"):
         if getattr(spec, key) != getattr(LinkSpec, key):
             table[key] = getattr(spec, key)

@@ -32,11 +32,10 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from netem.relay_links import DIRECTIONS, EVENT, Direction, LinkSpec, say
-from noack.core.core_library import dtype_of
+from netem.relay_links import DIRECTIONS, EVENT, Bytes, Direction, LinkSpec, say
+from noack.core.core_library import Array, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent
@@ -125,7 +124,7 @@ class FateRecorder:
         }
         self._gathered = 0
         self._max_waiting = max_waiting
-        self._queue: SimpleQueue[NDArray[Any] | str | None] = SimpleQueue()
+        self._queue: SimpleQueue[Array | str | None] = SimpleQueue()
         self._taken = 0
         self._done = 0
         self._missed = 0
@@ -166,7 +165,7 @@ class FateRecorder:
         """Number of events that are not in the trace."""
         return self._missed + self._unwritten
 
-    def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
+    def take(self, events: Array, data: Bytes) -> None:
         """Queue the arrivals; called in the relay's thread."""
         try:
             rows = events.view(_RAW)[events["departure"] == 0]
@@ -195,7 +194,7 @@ class FateRecorder:
             self._write()
         self._end()
 
-    def _gather(self, rows: NDArray[Any]) -> None:
+    def _gather(self, rows: Array) -> None:
         """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
             part, rows = np.split(rows, [_GROUP_ROWS - self._gathered])
@@ -291,7 +290,7 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     return Fates(found, guarantees)
 
 
-def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[Any]]) -> bool:
+def _is_kept(settings: "_Direction", rows: Mapping[str, Array]) -> bool:
     """Whether the losses of each flow are allowed, not counting those out of order."""
     losses = rows["consecutive_losses"]
     if settings.mansd is not None and losses.max(initial=0) > settings.mansd:
@@ -384,7 +383,7 @@ def _document(path: Path, text: bytes | None) -> _Document:
         raise CallerError(f"{path}: not a fate trace of this program") from None
 
 
-def _flows(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> Decisions:
+def _flows(rows: Mapping[str, Array], most_flows: int, place: str) -> Decisions:
     """Return the decisions of each flow, from the rows of a direction."""
     _check(rows, most_flows, place)
     order = np.lexsort((rows["packet"], rows["flow"]))
@@ -408,7 +407,7 @@ def _flows(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> Dec
     return found
 
 
-def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> None:
+def _check(rows: Mapping[str, Array], most_flows: int, place: str) -> None:
     """Check that an emulator could have made these decisions."""
     delay, copy = rows["delay_ns"], rows["copy_delay_ns"]
     lost = np.isin(rows["fate"], _LOST)

@@ -7,12 +7,11 @@ are several of a kind. Hence adding a delay does not change which packets are lo
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import accumulate, chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.core_library import Array, CData, core, dtype_of, ffi, pointer_to
 from noack.core.random_streams import stream_key
 from noack.impairments.feature import Stage, StageTables
 from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
@@ -62,13 +61,13 @@ class LinkState:
         self._decisions_begin = np.array(begins, np.int64)
         self.flows: NDArray[np.void] = np.zeros(rows, dtype_of("noack_flow"))
         """(rows,) of ``noack_flow``."""
-        self.decision: Any = ffi.new("noack_decision *")
+        self.decision: CData = ffi.new("noack_decision *")
         """The decision for the last packet, a ``noack_decision``; overwritten by the next."""
-        self.core: Any = ffi.new("noack_link *")
+        self.core: CData = ffi.new("noack_link *")
         """The link, as the core's functions take it; its address does not change. It is valid as
         long as this object lives."""
-        self._memory: dict[str, Any] = {}
-        self._stages: Any = None
+        self._memory: dict[str, Array] = {}
+        self._stages: CData = None
         self.core[0] = self._filled(settings, rows, tracks=bool(decisions))[0]
         _require(core.noack_recorded_check(self.core))
 
@@ -87,7 +86,7 @@ class LinkState:
         """The counts so far."""
         return Counters(*(getattr(self.core.counters, name) for name in _COUNTED))
 
-    def flow(self, row: int) -> Any:
+    def flow(self, row: int) -> CData:
         """Return the ``noack_flow`` in a row."""
         return self.core.flows[row]
 
@@ -98,7 +97,7 @@ class LinkState:
         first = self.settings.first_delivered
         core.noack_link_start_flow(self.core, row, number, first, self._restarted)
 
-    def decide(self, row: int, size_bytes: int, now_ns: int) -> Any:
+    def decide(self, row: int, size_bytes: int, now_ns: int) -> CData:
         """Decide for the next packet of the flow in a row; return :attr:`decision`."""
         core.noack_link_decide(self.core, row, size_bytes, now_ns, self.decision)
         return self.decision
@@ -117,9 +116,11 @@ class LinkState:
             raise ValueError("rows: a flow has not begun")
         decisions = np.zeros(len(rows), dtype_of("noack_decision"))
         core.noack_link_decide_many(
-            self.core, len(rows), *(pointer_to(one, "int64_t *") for one in
-            (rows, sizes_bytes, arrivals_ns)), pointer_to(decisions, "noack_decision *"),
-        )  # fmt: skip
+            self.core,
+            len(rows),
+            *(pointer_to(one, "int64_t *") for one in (rows, sizes_bytes, arrivals_ns)),
+            pointer_to(decisions, "noack_decision *"),
+        )
         return decisions
 
     def leave(self, row: int, packet: int, size_bytes: int, *, delayed: bool, counts: bool) -> bool:
@@ -147,7 +148,7 @@ class LinkState:
         self.settings = settings
         del kept  # the core has read the earlier state
 
-    def _filled(self, settings: LinkSettings, rows: int, *, tracks: bool) -> Any:
+    def _filled(self, settings: LinkSettings, rows: int, *, tracks: bool) -> CData:
         """Return a new ``noack_link`` of these settings, which shares the array of flows."""
         settings = with_kept_loss(settings)
         tables = StageTables(
@@ -200,7 +201,7 @@ class LinkState:
         _require(core.noack_link_check(link))
         return link
 
-    def _point(self, link: Any) -> None:
+    def _point(self, link: CData) -> None:
         for name, array in self._memory.items():
             setattr(link, name, ffi.cast(ffi.typeof(getattr(link, name)), array.ctypes.data))
 
@@ -235,7 +236,7 @@ def _stages(
             yield stage, tables.key, stream
 
 
-def _write_stage(row: Any, stage: Stage, key: tuple[int, int], queue_begin: int) -> None:
+def _write_stage(row: CData, stage: Stage, key: tuple[int, int], queue_begin: int) -> None:
     row.kind = getattr(core, f"NOACK_{stage.kind.upper()}")
     row.key0, row.key1 = key
     row.queue_places, row.queue_begin = stage.queue_places, queue_begin
@@ -243,7 +244,7 @@ def _write_stage(row: Any, stage: Stage, key: tuple[int, int], queue_begin: int)
         setattr(getattr(row, stage.structure or stage.kind), field, number)
 
 
-def _require(wrong: Any) -> None:
+def _require(wrong: CData) -> None:
     """Raise ValueError for what the core found wrong with a link."""
     if wrong != ffi.NULL:
         raise ValueError(f"link: {ffi.string(wrong).decode()}")

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,7 +131,7 @@ class Tap(Protocol):
     wants_data: bool
     """Whether it needs payloads."""
 
-    def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
+    def take(self, events: Events, data: Bytes) -> None:
         """Receive events, (k,) of :data:`netem.relay_links.EVENT`, and their payloads.
 
         Both arrays are overwritten after the call.
@@ -325,7 +325,7 @@ def raise_file_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def address_of(name: Sequence[Any]) -> Address:
+def address_of(name: SocketName) -> Address:
     """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
     host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
     return (f"{host}%{scope}" if scope else host), int(name[1])
@@ -341,7 +341,7 @@ def unpacked_address(packed: bytes) -> Address:
     return address_of((socket.inet_ntop(socket.AF_INET6, packed[8:24]), port, 0, scope))
 
 
-def _host(name: Sequence[Any]) -> IPv4Address | IPv6Address:
+def _host(name: SocketName) -> IPv4Address | IPv6Address:
     host, _ = address_of(name)
     return ip_address(host)
 

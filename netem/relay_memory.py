@@ -2,18 +2,15 @@
 
 import select
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
 from netem.relay_links import EVENT
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.core_library import Array, CData, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
-Array = NDArray[Any]
 CLIENT, SOCKET, SLOT = map(dtype_of, ("noack_client", "noack_socket", "noack_slot"))
 ENTRY = dtype_of("noack_heap_entry")
 PACKET_ROW, RELEASE_ROW = dtype_of("noack_packet_row"), dtype_of("noack_release_row")
@@ -43,13 +40,13 @@ class RelayMemory:
         self.first_path = 2 * links
         self._chunks: list[Array] = []
         self._epoll = select.epoll()
-        self.directions: Any = ffi.new("noack_direction[]", 2 * links)
+        self.directions: CData = ffi.new("noack_direction[]", 2 * links)
         self.events: Array = np.zeros(_EVENTS if taps else 0, EVENT)
         self.data: Array = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
         self.packets: Array = np.zeros(row_count, PACKET_ROW)
         self.releases: Array = np.zeros(row_count, RELEASE_ROW)
         self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
-        self.core: Any = ffi.new("noack_relay *", {
+        self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
             "clock": {"speed": 1.0}, "change_ns": 2**63 - 1, "segment": segment,
             "segment_below": 2**16, "taps": taps, "records": row_count > 0,
@@ -66,9 +63,11 @@ class RelayMemory:
         self._block_next = np.zeros(0, np.int32)
         self._add_chunk()
         for name, kind in (
-            ("events", "noack_event *"), ("data", "uint8_t *"), ("packets", "noack_packet_row *"),
+            ("events", "noack_event *"),
+            ("data", "uint8_t *"),
+            ("packets", "noack_packet_row *"),
             ("releases", "noack_release_row *"),
-        ):  # fmt: skip
+        ):
             setattr(self.core, name, pointer_to(getattr(self, name), kind))
         core.noack_relay_open(self.core)
 
@@ -188,7 +187,7 @@ class RelayDirection(LinkState):
         settings: LinkSettings,
         seed: int,
         name: Sequence[str],
-        row: Any,
+        row: CData,
         decisions: Decisions = (),
         restarted: bool = False,
     ) -> None:

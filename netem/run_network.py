@@ -11,11 +11,11 @@ import numpy as np
 
 from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.relay_links import let_wait, stamp_arrivals
-from netem.relay_memory import PACKET_ROW, Array, RelayDirection, RelayMemory, name_array
+from netem.relay_memory import PACKET_ROW, RelayDirection, RelayMemory, name_array
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
-from noack.core.core_library import core
+from noack.core.core_library import Array, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import (

@@ -1,8 +1,7 @@
 """A stand-alone emulator: runs a relay, with what watches, changes and records it; prints totals.
 
 :func:`alone` reads the command line, :func:`relay` relays until Ctrl-C, :func:`attached` adds live
-control, statistics lines, metrics and the live screen, and :func:`print_totals` shows the totals as
-a table for people.
+control, statistics lines, metrics and the live screen.
 """
 
 import argparse
@@ -10,29 +9,24 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from netem.capture import CaptureWriter
 from netem.control.control_server import ControlServer, starting
 from netem.control.emulator_statistics import (
     CommandQueue,
-    DelayQuantiles,
-    DirectionStatistics,
-    LinkStatistics,
     Statistics,
     StatisticsThread,
     statistics,
     unintended,
 )
-from netem.control.statistics_view import NONE, Screen, burst_text, percent_text, time_text
+from netem.control.statistics_view import Screen, picture_of
 from netem.emulator_options import command_line_parser, explain, parsed, specs_of
 from netem.fates import FateRecorder, read_fates
 from netem.relay import Relay
@@ -42,7 +36,7 @@ from noack.core.file_access import open_growing
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
 from noack.runtime.command_line import LogFormat, Signals, failed, log_event, log_format
-from noack.runtime.metrics_server import OPTION, metrics_server, require_package
+from noack.runtime.connections.metrics_server import OPTION, metrics_server, require_package
 from noack.runtime.real_time_loop import realtime
 
 _FIFO_PRIORITY = 50
@@ -53,27 +47,32 @@ _SPIN_NS = 50_000
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("relay")
     group.add_argument(
-        "--segment", action="store_true",
+        "--segment",
+        action="store_true",
         help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--realtime", action="store_true",
+        "--realtime",
+        action="store_true",
         help="request SCHED_FIFO, locked memory and no deep idle states, each where permitted; "
         "poll during the last 50 µs before a delayed datagram is due",
-    )  # fmt: skip
+    )
     group = parser.add_argument_group("recording")
     group.add_argument(
-        "--capture", metavar="FILE.pcapng",
+        "--capture",
+        metavar="FILE.pcapng",
         help="capture all datagrams, with their fates as comments; - for standard output",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates"
     )
     group.add_argument(
-        "--replay-fates", metavar="FILE.parquet", type=Path,
+        "--replay-fates",
+        metavar="FILE.parquet",
+        type=Path,
         help="replay recorded packet fates, matched by flow and packet number; the recorded cap "
         "applies unless mansd sets another",
-    )  # fmt: skip
+    )
     _add_watching_options(parser)
 
 
@@ -104,12 +103,19 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
 
 
 def _report_totals(totals: Statistics, options: argparse.Namespace) -> None:
+    if options.replay_fates is not None:  # the settings do not predict the loss of replayed fates
+        for direction in (link[name] for link in totals["links"] for name in DIRECTIONS):
+            direction["loss"]["predicted"] = None
     if options.json:
         print(json.dumps(totals, indent=2))
     logged = log_event("info", "noack netem", "ended", event="totals", totals=totals)
     if not (options.json or logged):
         console = Console(stderr=True, highlight=False)
-        print_totals(totals, console, predicted=options.replay_fates is None)
+        console.print(picture_of(totals, "totals", console.width))
+        if lost := unintended(totals):
+            status = ExitStatus.UNINTENDED_LOSSES
+            text = f"{lost:,} datagrams; the guarantee does not hold (exit status {status})"
+            console.print(f"unintended losses: {text}", style="bold red", soft_wrap=True)
 
 
 def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
@@ -162,11 +168,13 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
 
     return [
         replace(
-            spec, forward=settings(spec, "forward"), reverse=settings(spec, "reverse"),
+            spec,
+            forward=settings(spec, "forward"),
+            reverse=settings(spec, "reverse"),
             decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
         )
         for spec in specs
-    ]  # fmt: skip
+    ]
 
 
 def _check_files(options: argparse.Namespace) -> None:
@@ -224,20 +232,21 @@ _SWITCH_S = 0.0002
 
 def _add_watching_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("statistics and changes during operation")
+    group.add_argument("--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`")
     group.add_argument(
-        "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
-    )  # fmt: skip
-    group.add_argument(
-        "--stats", metavar="SECONDS", type=float,
+        "--stats",
+        metavar="SECONDS",
+        type=float,
         help="print statistics as JSON lines every SECONDS",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--stats-file", metavar="FILE", type=Path, help="write these lines to FILE instead"
     )
     group.add_argument(
-        OPTION, metavar="[HOST]:PORT",
+        OPTION,
+        metavar="[HOST]:PORT",
         help="serve the statistics for Prometheus (OpenMetrics); the loopback without a HOST",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--log-format", choices=[*LogFormat], type=LogFormat, default=LogFormat.TEXT,
         help="format of standard error: text, or JSON Lines for log collectors (text)",
@@ -305,7 +314,7 @@ def attached(relay: Relay, options: argparse.Namespace) -> Iterator[AttachedRela
 @contextmanager
 def _metrics(commands: CommandQueue, where: str) -> Iterator[None]:
     require_package()
-    from netem.control.emulator_metrics import EmulatorMetrics
+    from netem.control.emulator_metrics import EmulatorMetrics  # an optional package
 
     with metrics_server(where, EmulatorMetrics(commands).collect) as address:
         say(f"metrics: http://{text_of(address)}/metrics")
@@ -341,89 +350,3 @@ def _statistics_lines(commands: CommandQueue, period_s: float, path: Path | None
     finally:
         if path is not None:
             file.close()
-
-
-_COUNTS: Mapping[str, str] = {
-    "dropped by a loss model": "dropped",
-    "corrupted": "corrupted",
-    "dropped by a full queue": "overflowed",
-    "dropped in a blackout": "blacked_out",
-    "forced by the guarantee": "forced",
-    "delivered out of order (stale)": "delivered_out_of_order",
-    "held back for the guarantee": "held_back",
-    "duplicated": "duplicated",
-    "in flight at the end": "in_flight",
-}
-"""Rows that are shown if their value is not 0: label, and fate or key of the statistics."""
-_Row = tuple[str, Sequence[str], str]
-"""Label, a text per direction, style."""
-
-
-def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> None:
-    """Print a table for each link; settings do not predict the loss of replayed fates."""
-    for link in totals["links"]:
-        clients = link["clients_ever"]
-        title = f"{link['name']}: {link['listen']} → {link['to']}, {clients:,} client"
-        # As text: the brackets of an IPv6 address are not markup.
-        console.print(Text(title + "s" * (clients != 1), "bold"), soft_wrap=True)
-        console.print(_table(link, predicted))
-    if lost := unintended(totals):
-        status = ExitStatus.UNINTENDED_LOSSES
-        console.print(
-            f"unintended losses: {lost:,} datagrams; the guarantee does not hold (exit status "
-            f"{status})", style="bold red", soft_wrap=True,
-        )  # fmt: skip
-
-
-def _table(link: LinkStatistics, predicted: bool) -> Table:
-    reverse = link["reverse"]
-    both = bool(reverse["received"] or reverse["words"] or link["discarded"])
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    table.add_column("")
-    for name in DIRECTIONS[: 1 + both]:
-        table.add_column(name, justify="right")
-    for label, texts, style in _rows(link, predicted):
-        table.add_row(label, *texts[: 1 + both], style=style)
-    return table
-
-
-def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
-    sides = link["forward"], link["reverse"]
-
-    def row(label: str, text: Callable[[DirectionStatistics], str]) -> _Row:
-        return label, tuple(map(text, sides)), ""
-
-    yield row("received", lambda side: f"{side['received']:,}")
-    yield row("forwarded", lambda side: f"{side['forwarded']:,}")
-    for label, key in _COUNTS.items():
-        counts = [{**side, **side["fates"]}[key] for side in sides]
-        if any(counts):
-            yield label, [f"{count:,}" for count in counts], ""
-    if any(side["received_before"] for side in sides):
-        yield "since the last change:", (), "dim"
-    yield row("longest loss burst", burst_text)
-    yield row("loss rate", lambda side: percent_text(side["loss"]["lost"]))
-    if predicted and any(side["loss"]["predicted"] is not None for side in sides):
-        full = any(side["fates"]["overflowed"] for side in sides)
-        label = "  predicted, without full queues" if full else "  predicted"
-        yield row(label, lambda side: percent_text(side["loss"]["predicted"]))
-    if any(side["delivered_out_of_order"] for side in sides):
-        yield row("loss rate with stale", lambda side: percent_text(side["loss"]["realised"]))
-    yield row("delay p50, p99", lambda side: _times(side["delay_ns"]))
-    if any(side["lateness_ns"]["p50"] is not None for side in sides):
-        yield row("lateness p50, p99", lambda side: _times(side["lateness_ns"]))
-    for cause in sorted({cause for side in sides for cause, n in side["unintended"].items() if n}):
-        numbers = tuple(f"{side['unintended'].get(cause, 0):,}" for side in sides)
-        yield (f"unintended: {cause.replace('_', ' ')}", numbers, "bold red")
-    if link["refused"]:
-        yield ("refused: too many clients", (f"{link['refused']:,}",), "bold red")
-    if link["port_unreachable"]:
-        yield ("port unreachable (ICMP)", (f"≥ {link['port_unreachable']:,}",), "yellow")
-    if link["discarded"]:
-        yield "answers discarded (--one-way)", ("", f"{link['discarded']:,}"), ""
-
-
-def _times(times: DelayQuantiles) -> str:
-    if times["p50"] is None:
-        return NONE
-    return f"{time_text(times['p50'])}, {time_text(times['p99'])}"

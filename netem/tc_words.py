@@ -41,16 +41,19 @@ _REFUSED = {
 _KINDS: Sequence[type[Feature]] = (*IMPAIRMENTS, *CONSTRAINTS)
 _CLAUSES = {
     name: (kind, clause)
-    for kind in _KINDS for clause in kind.clauses for name in (clause.word, *clause.synonyms)
-}  # fmt: skip
+    for kind in _KINDS
+    for clause in kind.clauses
+    for name in (clause.word, *clause.synonyms)
+}
 _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
 KEYWORDS = (*_CLAUSES, *_SETTINGS, "seed")
 """Words that begin a clause."""
 _WORDS = [word for kind in _KINDS for clause in kind.clauses for word in clause.described()]
 _AFTER = {
     word.name: ", or after ".join(other.after for other in _WORDS if other.name == word.name)
-    for word in _WORDS if word.name not in _CLAUSES
-}  # fmt: skip
+    for word in _WORDS
+    if word.name not in _CLAUSES
+}
 """For each word that begins no clause: the words after which it is allowed."""
 EXAMPLES: Mapping[str, str] = {
     **{word.name: word.example for word in _WORDS},
@@ -61,9 +64,11 @@ EXAMPLES: Mapping[str, str] = {
 """By word; ``seed`` is missing because it is also an option."""
 GRAMMAR = [
     word.grammar
-    for kind in IMPAIRMENTS for clause in kind.clauses for word in clause.described()
+    for kind in IMPAIRMENTS
+    for clause in kind.clauses
+    for word in clause.described()
     if word.grammar
-]  # fmt: skip
+]
 """The words of each impairment, for ``--help``."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
 _CONSTRAINT: TypeAdapter[Any] = TypeAdapter(AnyConstraint)

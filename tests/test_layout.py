@@ -21,7 +21,7 @@ MOST_MODULES = 400
 LINES = {
     "noack/config": 3820,
     "noack/controllers": 190,
-    "noack/core": 1480,
+    "noack/core": 1470,
     "noack/disturbances": 220,
     "noack/impairments": 3900,
     "noack/machines": 450,
@@ -33,7 +33,7 @@ LINES = {
     "noack/theory": 8225,
     "noack/traces": 1350,
     "noack/trigger": 1135,
-    "netem": 5700,
+    "netem": 5650,
     "cosim/analysis": 7180,
     "cosim/api": 1420,
     "cosim/cli": 2830,

@@ -32,7 +32,8 @@ with lazy_modules():
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.config import link_load, resolution, scenario
     from noack.protocol import topology
-    from noack.runtime import address, metrics_server, run_registry
+    from noack.runtime import address, run_registry
+    from noack.runtime.connections import metrics_server
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:

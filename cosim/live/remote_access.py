@@ -30,10 +30,15 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
+from noack.runtime.connections.coordinator_link import (
+    InvitationProof,
+    Protection,
+    forwarding,
+    tls_context,
+)
 from noack.runtime.control_plane import RUNS, run_name, socket_path
-from noack.runtime.coordinator_link import InvitationProof, Protection, forwarding, tls_context
+from noack.runtime.host_clocks.time_exchange import TimeReference, answering
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
-from noack.runtime.time_exchange import TimeReference, answering
 
 _BACKLOG = 4096
 _FLOOD_PER_S = 100

@@ -19,7 +19,7 @@ from zenoh.handlers import RingChannel
 
 from netem.control.control_server import EMULATORS, find, running
 from netem.control.emulator_statistics import Statistics
-from netem.control.statistics_view import History, Screen, render
+from netem.control.statistics_view import Screen, picture_of
 from netem.relay_links import DIRECTIONS
 from netem.tc_words import guarantee_words, require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
@@ -130,9 +130,11 @@ def _chosen(options: argparse.Namespace) -> str:
 
 def _show(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
-        "show", "Show the statistics of a running emulator.",
-        ("noack netem show", "noack netem show dns --json"), "print one JSON document",
-    )  # fmt: skip
+        "show",
+        "Show the statistics of a running emulator.",
+        ("noack netem show", "noack netem show dns --json"),
+        "print one JSON document",
+    )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     name = _chosen(options)
@@ -141,10 +143,8 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
     if options.json:
         print(json.dumps(statistics, indent=2), flush=True)
     else:
-        history = History()
-        history.add(statistics)
         console = _Console()
-        console.print(render(history, _title(name), console.width, None))
+        console.print(picture_of(statistics, _title(name), console.width))
     return ExitStatus.OK
 
 
@@ -171,9 +171,11 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
     with Client(_chosen(options)) as client:
         before = client.ask("settings")
         answer = client.ask(
-            "change", link=options.link, direction=options.direction,
+            "change",
+            link=options.link,
+            direction=options.direction,
             settings=settings.model_dump(mode="json"),
-        )  # fmt: skip
+        )
     if options.json:
         print(json.dumps(answer, indent=2), flush=True)
         return ExitStatus.OK
@@ -199,8 +201,9 @@ def _warn_of_removed_caps(
                 print(
                     f"noack netem set: {new['name']} {direction} no longer has "
                     f"{', '.join(removed)}; the words replaced all settings",
-                    file=sys.stderr, flush=True,
-                )  # fmt: skip
+                    file=sys.stderr,
+                    flush=True,
+                )
 
 
 def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
@@ -225,8 +228,9 @@ def _watch(arguments: Sequence[str]) -> ExitStatus:
         "watch",
         "Show a running emulator's statistics live. If the output is not a terminal, print one\n"
         "line per second for each direction of a link that has received datagrams.",
-        ("noack netem watch", "noack netem watch dns --json"), "print one JSON document per second",
-    )  # fmt: skip
+        ("noack netem watch", "noack netem watch dns --json"),
+        "print one JSON document per second",
+    )
     parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
     name = _chosen(options)

@@ -37,16 +37,18 @@ _COUNTERS = {
 _GAUGES = {
     "in_flight_datagrams": ("in_flight", "datagrams inside the emulator"),
     "longest_loss_burst": (
-        "longest_loss_burst", "most consecutive losses of a flow under the present settings",
+        "longest_loss_burst",
+        "most consecutive losses of a flow under the present settings",
     ),
     "loss_burst_limit": ("mansd", "most consecutive losses that the guarantee allows (M - 1)"),
-}  # fmt: skip
+}
 _LOSSES = {
     "loss_ratio": (
-        "realised", "share of the datagrams not effectively delivered, present settings",
+        "realised",
+        "share of the datagrams not effectively delivered, present settings",
     ),
     "predicted_loss_ratio": ("predicted", "expected share of datagrams lost by a random draw"),
-}  # fmt: skip
+}
 _BY_KEY = {
     "datagrams": ("fates", "fate", "datagrams by their fate"),
     "unintended_losses": ("unintended", "cause", "losses that no setting caused"),
@@ -84,9 +86,9 @@ def metrics(found: Statistics) -> Iterator[Metric]:
     """Yield the metrics of a relay's statistics; ``docs/operations.md`` lists them."""
     links: Any = found["links"]
     sides: Any = [([link["name"], name], link[name]) for link in links for name in DIRECTIONS]
-    yield _gauge("elapsed_seconds", "time since the emulator started", [], [
-        ([], found["elapsed_s"]),
-    ])  # fmt: skip
+    yield _gauge(
+        "elapsed_seconds", "time since the emulator started", [], [([], found["elapsed_s"])]
+    )
     yield _gauge(
         "clients", "clients of a link", ["link"], [([one["name"]], one["clients"]) for one in links]
     )

@@ -35,7 +35,8 @@ from netem.relay_links import DIRECTIONS, Direction
 from noack.core.number_format import with_unit
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
-NONE = "–"
+_NONE = "–"
+_BIT_RATES = ("Gbit/s", "Mbit/s", "kbit/s", "bit/s")
 
 
 def rate_text(per_s: float) -> str:
@@ -43,20 +44,15 @@ def rate_text(per_s: float) -> str:
     return f"{per_s:,.0f}/s" if per_s >= 10 or per_s == 0 else f"{per_s:.2g}/s"
 
 
-def bits_text(bits_per_s: float) -> str:
-    """Bits per second, with three digits."""
-    return with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
-
-
 def time_text(t_ns: float | None) -> str:
     """A duration, with three digits."""
-    return NONE if t_ns is None else with_unit(t_ns, ("s", "ms", "µs", "ns"))
+    return _NONE if t_ns is None else with_unit(t_ns, ("s", "ms", "µs", "ns"))
 
 
 def percent_text(share: float | None) -> str:
     """A share in percent, to 0.01 % below 10 %."""
     if share is None:
-        return NONE
+        return _NONE
     percent = 100 * share
     if percent == 0 or percent >= 99.995:
         return f"{percent:.0f} %"
@@ -102,9 +98,9 @@ class History:
 
     def __init__(self) -> None:
         self.latest: Statistics | None = None
-        self._samples: defaultdict[
-            tuple[str, Direction], deque[tuple[float, RecentRates]]
-        ] = defaultdict(deque)  # fmt: skip
+        self._samples: defaultdict[tuple[str, Direction], deque[tuple[float, RecentRates]]] = (
+            defaultdict(deque)
+        )
 
     def add(self, statistics: Statistics) -> None:
         """Add statistics that are newer than those before."""
@@ -142,6 +138,13 @@ class History:
         return [sum(values) / len(values) if values else None for values in found]
 
 
+def picture_of(statistics: Statistics, title: str, width: int) -> RenderableType:
+    """Return the view of one statistics document, of any height, without the last minute."""
+    history = History()
+    history.add(statistics)
+    return render(history, title, width, None)
+
+
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
     """Return the full-screen view of the latest statistics, for a terminal of this size."""
     latest = history.latest
@@ -166,26 +169,33 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
     lines = 2
     forward, reverse = (_cells(history, link, name, column) for name in DIRECTIONS)
     for (label, left), (_, right) in zip(forward, reverse, strict=True):
+        if not (label + left.plain + right.plain).strip():  # a chart without data
+            continue
         grid.add_row(label, left, right)
         lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
     title = Text.assemble(
-        (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ",
-        (_clients_text(link), "dim"),
-    )  # fmt: skip
+        (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ", (_clients_text(link), "dim")
+    )
     panel = Panel(
-        Group(grid, *unintended), title=title, title_align="left",
+        Group(grid, *unintended),
+        title=title,
+        title_align="left",
         border_style="red" if unintended else "blue",
-    )  # fmt: skip
+    )
     return panel, lines + len(unintended)
 
 
 def _clients_text(link: LinkStatistics) -> str:
     text = f"{link['clients']} client{'' if link['clients'] == 1 else 's'}"
+    if link["clients_ever"] > link["clients"]:
+        text += f" ({link['clients_ever']} ever)"
     if link["refused"]:
         text += f", {link['refused']:,} datagrams refused"
     if link["port_unreachable"]:
         text += f", port unreachable {link['port_unreachable']:,} times"
+    if link["discarded"]:
+        text += f", {link['discarded']:,} answers discarded"
     return text
 
 
@@ -227,6 +237,7 @@ def _cells(
         ("", Text(sparkline(losses, _top([*losses, of["loss"]["predicted"]])), "yellow")),
         ("drawn", Text(_drawn(of))),
         ("lost", _wrapped(_lost_text(of), width)),
+        ("", _wrapped(_further_counts(of), width)),
         ("burst", _burst(of, width)),
         ("delay", Text(_times(delay, width))),
         ("lateness", Text(_times(late, width))),
@@ -235,20 +246,23 @@ def _cells(
 
 
 def _rate(of: DirectionStatistics, key: str) -> str:
+    """Return a recent rate in datagrams per second; without one, the number of datagrams."""
     recent = of["recent"]
-    return NONE if recent is None else rate_text(recent[key])  # type: ignore[literal-required]
+    if recent is None:
+        return f"{of[key]:,}"  # type: ignore[literal-required]
+    return rate_text(recent[f"{key}_per_s"])  # type: ignore[literal-required]
 
 
 def _flow(of: DirectionStatistics, key: str) -> str:
-    """Return a recent rate in datagrams and in bits per second."""
+    """Return :func:`_rate`, and the rate in bits per second."""
     recent = of["recent"]
-    bits = "" if recent is None else bits_text(recent[f"{key}_bits_per_s"])  # type: ignore[literal-required]
-    return f"{_rate(of, f'{key}_per_s')}  {bits}".strip()
+    bits = "" if recent is None else with_unit(recent[f"{key}_bits_per_s"], _BIT_RATES)  # type: ignore[literal-required]
+    return f"{_rate(of, key)}  {bits}".strip()
 
 
 def _times(times: DelayQuantiles, width: int) -> str:
     if times["p50"] is None:
-        return NONE
+        return _NONE
     text = f"p50 {time_text(times['p50']):<9} p99 {time_text(times['p99'])}"
     return text if len(text) <= width else text.removeprefix("p50 ").replace("  ", " ")
 
@@ -275,6 +289,15 @@ def _lost_text(of: DirectionStatistics) -> str:
     return ", ".join(f"{number:,} {cause}" for cause, number in lost if number) or "0"
 
 
+def _further_counts(of: DirectionStatistics) -> str:
+    counts = {
+        "duplicated": of["duplicated"],
+        "held back for the guarantee": of["held_back"],
+        "received before the last change": of["received_before"],
+    }
+    return ", ".join(f"{number:,} {what}" for what, number in counts.items() if number)
+
+
 def burst_text(of: DirectionStatistics) -> str:
     """Return the longest loss burst beside its cap, and the constraints."""
     cap = of["mansd"]
@@ -299,12 +322,12 @@ def _wrapped(text: str, width: int) -> Text:
 
 
 def _burst_of_cap(of: DirectionStatistics) -> str:
-    return f"{of['longest_loss_burst']:,}/{NONE if of['mansd'] is None else of['mansd']}"
+    return f"{of['longest_loss_burst']:,}/{_NONE if of['mansd'] is None else of['mansd']}"
 
 
 _COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
-    "received": lambda of: _rate(of, "received_per_s"),
-    "forwarded": lambda of: _rate(of, "forwarded_per_s"),
+    "received": lambda of: _rate(of, "received"),
+    "forwarded": lambda of: _rate(of, "forwarded"),
     "loss": lambda of: percent_text(of["loss"]["lost"]),
     "predicted": lambda of: percent_text(of["loss"]["predicted"]),
     "burst/cap": _burst_of_cap,

@@ -127,9 +127,11 @@ class ClockOffset:
             raise ValueError(f"timestamps in the wrong order: {exchange}")
         self.exchanges += 1
         new = _Limits(
-            (reference_received_ns + 1 - sent_ns) * _PPB - self.rate_ppb * sent_ns, sent_ns,
-            (reference_sent_ns - received_ns - 1) * _PPB + self.rate_ppb * received_ns, received_ns,
-        )  # fmt: skip
+            (reference_received_ns + 1 - sent_ns) * _PPB - self.rate_ppb * sent_ns,
+            sent_ns,
+            (reference_sent_ns - received_ns - 1) * _PPB + self.rate_ppb * received_ns,
+            received_ns,
+        )
         common = new if self._limits is None else _intersection(self._limits, new)
         if self._possible(common):
             self._limits = common

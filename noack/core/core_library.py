@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
+CData = Any
+"""A structure or pointer of the core: mypy does not know its fields."""
+Array = NDArray[Any]
+"""Numbers, or rows of a structure of the core."""
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
@@ -22,7 +26,7 @@ except ImportError:
     raise CallerError(f"noack's core in C has not been built; {_REMEDY}") from None
 
 
-def load_core(path: Path) -> Any:
+def load_core(path: Path) -> CData:
     """Return the functions and constants of native/noack.h in a library.
 
     Raise CallerError if there is no library that goes with the declarations.
@@ -38,7 +42,7 @@ def load_core(path: Path) -> Any:
     return library
 
 
-core: Any = load_core(LIBRARY)
+core: CData = load_core(LIBRARY)
 """The functions and constants of native/noack.h."""
 
 _FORMATS = {
@@ -65,13 +69,13 @@ def dtype_of(name: str) -> np.dtype[np.void]:
     )
 
 
-def _format_of(kind: Any) -> Any:
+def _format_of(kind: CData) -> Any:
     if kind.kind == "array":
         return _format_of(kind.item), (kind.length,)
     return _FORMATS[kind.cname]
 
 
-def pointer_to(array: NDArray[Any], kind: str) -> Any:
+def pointer_to(array: Array, kind: str) -> CData:
     """Return a pointer to the rows of a contiguous array, e.g. of kind ``"noack_flow *"``.
 
     It is valid while the array lives.
@@ -81,6 +85,6 @@ def pointer_to(array: NDArray[Any], kind: str) -> Any:
     return ffi.cast(kind, array.ctypes.data)
 
 
-def address_of(pointer: Any) -> int:
+def address_of(pointer: CData) -> int:
     """Return the address that a pointer of the core has."""
     return int(ffi.cast("intptr_t", pointer))

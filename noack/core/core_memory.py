@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_library import Array, CData, core, ffi, pointer_to
 from noack.core.linear_systems import SCRATCH_MATRICES, Matrix, Vector
 
 Structure = Any
@@ -28,27 +28,27 @@ class CoreMemory:
 
     def __init__(self) -> None:
         self._kept: list[Any] = []
-        self._transitions: dict[bytes, Any] = {}
-        self._shared: list[NDArray[Any]] = []
+        self._transitions: dict[bytes, CData] = {}
+        self._shared: list[Array] = []
 
     def keep(self, owner: Any) -> Any:
         """Keep an object alive as long as this memory; return it."""
         self._kept.append(owner)
         return owner
 
-    def reals(self, values: ArrayLike) -> Any:
+    def reals(self, values: ArrayLike) -> CData:
         """Return a pointer to a copy of numbers, ``double *``."""
         return self._pointer(np.array(values, np.float64, order="C"), "double *")
 
-    def integers(self, values: ArrayLike) -> Any:
+    def integers(self, values: ArrayLike) -> CData:
         """Return a pointer to a copy of whole numbers, ``int64_t *``."""
         return self._pointer(np.array(values, np.int64, order="C"), "int64_t *")
 
-    def zeros(self, count: int) -> Any:
+    def zeros(self, count: int) -> CData:
         """Return a pointer to zeros, ``double *``; memory is taken when it is first used."""
         return self._pointer(np.zeros(max(count, 1)), "double *")
 
-    def transitions(self, H: Matrix, steps_ns: Iterable[int] = ()) -> Any:
+    def transitions(self, H: Matrix, steps_ns: Iterable[int] = ()) -> CData:
         """Return the ``noack_transitions *`` of H, (n, n); loops with the same H share it.
 
         The matrices of ``steps_ns`` are computed at once, so that first deadlines are not delayed.
@@ -65,8 +65,8 @@ class CoreMemory:
 
     def set_model(
         self,
-        model: Any,
-        transitions: Any,
+        model: CData,
+        transitions: CData,
         since_ns: Iterable[int] = (),
         points: Iterable[Vector | None] = (None,),
     ) -> None:
@@ -78,7 +78,7 @@ class CoreMemory:
         model.has_point = self.integers([point is not None for point in known])
         model.points = self.reals([np.zeros(n) if point is None else point for point in known])
 
-    def fill(self, structure: Any, numbers: Mapping[str, Any]) -> None:
+    def fill(self, structure: CData, numbers: Mapping[str, Any]) -> None:
         """Set fields of a structure; an array becomes a pointer to a copy of it."""
         for name, number in numbers.items():
             value = self.reals(number) if isinstance(number, np.ndarray) else number
@@ -89,7 +89,7 @@ class CoreMemory:
         """What is kept: a mark for :meth:`copy`."""
         return len(self._kept)
 
-    def copy(self, structures: Any, first: int, others: Sequence[int], mark: int) -> None:
+    def copy(self, structures: CData, first: int, others: Sequence[int], mark: int) -> None:
         """Make structures of an array copies of one of them, each with arrays of its own.
 
         Args:
@@ -111,7 +111,7 @@ class CoreMemory:
                 copies[:, word] = own.ctypes.data + start * 8 + own.strides[0] * np.arange(len(own))
         words[others] = copies
 
-    def _new_transitions(self, H: Matrix) -> Any:
+    def _new_transitions(self, H: Matrix) -> CData:
         n = len(H)
         fits = max(_MOST_NUMBERS // (n * n), 4)
         places = min(_MOST_PLACES, 1 << fits.bit_length() - 1)
@@ -125,13 +125,13 @@ class CoreMemory:
         self._shared += [H, steps_ns, matrices, scratch]
         return made
 
-    def _pointer(self, array: NDArray[Any], kind: str) -> Any:
+    def _pointer(self, array: Array, kind: str) -> CData:
         self._kept.append(array)
         return ffi.cast(kind, array.ctypes.data)
 
 
 @cache
-def _pointer_words(kind: Any) -> tuple[int, ...]:
+def _pointer_words(kind: CData) -> tuple[int, ...]:
     """Return the places of the pointers in a structure of words of 64 bits, e.g. noack_plant."""
     words: list[int] = []
     for _, field in kind.fields:
@@ -143,7 +143,7 @@ def _pointer_words(kind: Any) -> tuple[int, ...]:
     return tuple(words)
 
 
-def reals_at(pointer: Any, *shape: int) -> NDArray[np.float64]:
+def reals_at(pointer: CData, *shape: int) -> NDArray[np.float64]:
     """Return the numbers at a ``double *`` as an array, which shares their memory."""
     data = ffi.buffer(pointer, 8 * math.prod(shape))
     return np.frombuffer(data, np.float64).reshape(shape)

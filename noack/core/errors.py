@@ -77,7 +77,7 @@ def did_you_mean(name: str, files: Iterable[str]) -> str:
 
     Names are compared without folder and suffix.
     """
-    from difflib import get_close_matches
+    from difflib import get_close_matches  # only after a mistake
 
     by_stem = {Path(file).stem: file for file in files}
     close = get_close_matches(Path(name).stem, by_stem, n=1)

@@ -12,12 +12,11 @@ bounds, which are enlarged by more than the rounding.
 
 from bisect import bisect_right
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_library import CData, core, ffi, pointer_to
 
 SCRATCH_MATRICES = 10
 """Matrices of its size that the core needs for scratch."""
@@ -160,7 +159,7 @@ def spectral_abscissa(matrix: Matrix) -> float:
     return float(np.linalg.eigvals(matrix).real.max())
 
 
-def _reals(values: Matrix | Vector) -> Any:
+def _reals(values: Matrix | Vector) -> CData:
     return ffi.from_buffer("double[]", np.ascontiguousarray(values, np.float64))
 
 
@@ -216,7 +215,7 @@ def solve_lyapunov(M: Matrix, Q: Matrix) -> Matrix:
     """
     *lead, n, _ = M.shape
     if n > _MOST_STATES:
-        from scipy.linalg import solve_continuous_lyapunov
+        from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
         if lead:
             return np.array([solve_lyapunov(matrix, Q) for matrix in M])

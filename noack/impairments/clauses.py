@@ -7,6 +7,7 @@ written as words, its lines of ``--help``, and which words go after which.
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from noack.impairments.words import Quantity, WordReader
@@ -35,8 +36,8 @@ class Part:
     after these, in any order; they may be left out.
     """
 
-    keys: tuple[str, ...]
-    """The keys of the value; several if it has several parts."""
+    key: str
+    """The key of the value; if it has several parts, their keys, with spaces between them."""
     quantity: Quantity[Any] | None = None
     """What the value is; None: the word alone implies the settings."""
     symbol: str = ""
@@ -46,6 +47,11 @@ class Part:
     """Words in which the word occurs."""
     implied: Mapping[str, Any] = field(default_factory=dict)
     """Settings that the word implies."""
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of the value's parts."""
+        return tuple(self.key.split())
 
     @property
     def grammar(self) -> str:
@@ -80,7 +86,7 @@ class Part:
 
 def flag(word: str, example: str, key: str, value: bool) -> Part:
     """Return a word that sets a key to a value."""
-    return Part((key,), word=word, example=example, implied={key: value})
+    return Part(key, word=word, example=example, implied={key: value})
 
 
 @dataclass(frozen=True)
@@ -114,25 +120,41 @@ class FileOr(Part):
 
 def file_name(expected: str) -> FileOr:
     """Return the name of a file, which is described by ``expected``."""
-    return FileOr(("file",), expected=expected)
+    return FileOr("file", expected=expected)
 
 
-@dataclass(frozen=True)
 class Clause:
-    """A first word and its parts."""
+    """A first word and its parts.
 
-    word: str
-    example: str
-    parts: tuple[Part, ...] = ()
-    synonyms: tuple[str, ...] = ()
-    least: int = 1
-    """How many of the values right after the word must be given."""
-    implied: Mapping[str, Any] = field(default_factory=dict)
-    """Settings that the first word implies."""
-    complement: bool = False
-    """Whether the second value, if left out, is 1 minus the first, as in tc."""
-    is_bare: bool = False
-    """Whether settings are written without the first word."""
+    Args:
+        word: the first word.
+        example: words in which it occurs.
+        parts: what may follow it.
+        synonyms: other first words.
+        least: how many of the values right after the word must be given.
+        implied: settings that the first word implies.
+        complement: whether the second value, if left out, is 1 minus the first, as in tc.
+        is_bare: whether settings are written without the first word.
+    """
+
+    def __init__(
+        self,
+        word: str,
+        example: str,
+        *parts: Part,
+        synonyms: tuple[str, ...] = (),
+        least: int = 1,
+        implied: Mapping[str, Any] = MappingProxyType({}),
+        complement: bool = False,
+        is_bare: bool = False,
+    ) -> None:
+        self.word, self.example, self.parts, self.synonyms = word, example, parts, synonyms
+        self.least, self.implied, self.complement, self.is_bare = (
+            least,
+            implied,
+            complement,
+            is_bare,
+        )
 
     @property
     def _values(self) -> list[Part]:

@@ -235,7 +235,7 @@ class Impairment(StageFeature):
         return delayed, reordered
 
 
-CHANCE = (Part(("probability",), PERCENT, "P"), Part(("correlation",), CORRELATION, "CORR"))
+CHANCE = (Part("probability", PERCENT, "P"), Part("correlation", CORRELATION, "CORR"))
 """The words of a probability and its correlation."""
 
 

@@ -162,8 +162,9 @@ def _together_lost(patterns: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
     """Return the joint chain: start, matrix, probability of no effective delivery."""
-    states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start)
-                       for part in parts)  # fmt: skip
+    states = math.prod(
+        len(part.lost if isinstance(part, Pattern) else part.start) for part in parts
+    )
     if states > MOST_STATES:
         raise NotPredictableError(
             f"together the impairments have {states} states, too many to compute with"

@@ -176,7 +176,7 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
     Raises:
         NotPredictableError: there are too many states, or the rate depends on chance.
     """
-    from scipy import sparse
+    from scipy import sparse  # slow to import
 
     n = len(start)
     after_loss, after_delivery = list_moves(guarantee, MOST_JOINT_STATES // n)
@@ -201,7 +201,7 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
 
 def _stationary(joint: Any, start: Array) -> Array:
     """Return the stationary distribution of the states that remain possible."""
-    from scipy.sparse import csgraph
+    from scipy.sparse import csgraph  # slow to import
 
     steps = csgraph.dijkstra(joint, indices=np.flatnonzero(start), unweighted=True, min_only=True)
     places = np.flatnonzero(np.isfinite(steps))
@@ -224,7 +224,7 @@ def _balance(moves: Any) -> Array:
     With π = 1 for a likely state, the other equations are a regular, well-conditioned system. It is
     sparse: few states of the guarantee follow a state.
     """
-    from scipy.sparse import eye_array, linalg
+    from scipy.sparse import eye_array, linalg  # slow to import
 
     count = moves.shape[0]
     distribution: Array = np.ones(count)

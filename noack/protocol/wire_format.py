@@ -24,11 +24,11 @@ writes datagrams, with their tags by keyed BLAKE2b; :class:`EncryptedSeal` encry
 import hashlib
 import struct
 from enum import IntEnum, StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from noack.core.core_library import core, ffi
+from noack.core.core_library import CData, core, ffi
 from noack.core.linear_systems import Vector
 
 KEY_BYTES = 32
@@ -82,9 +82,8 @@ class EncryptedSeal:
     version = 2
 
     def __init__(self, key: bytes) -> None:
-        # Loaded here, since few runs are encrypted.
-        from cryptography.exceptions import InvalidTag
-        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+        from cryptography.exceptions import InvalidTag  # few runs are encrypted
+        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # the same
 
         require_key(key)
         # A key of its own: the tags of other datagrams are made with the run's key itself.
@@ -240,12 +239,12 @@ class Encoder:
         return self._wire.seal.close(datagram[:HEADER_BYTES], datagram[HEADER_BYTES:-TAG_BYTES])
 
 
-def rejected_of(reception: Any) -> dict[Rejection, int]:
+def rejected_of(reception: CData) -> dict[Rejection, int]:
     """Return the number of datagrams that a ``noack_reception`` rejected, by reason."""
     return dict(zip(Rejection, reception.rejected, strict=True))
 
 
-def reception_report(reception: Any) -> dict[str, object]:
+def reception_report(reception: CData) -> dict[str, object]:
     """Return the counters of a ``noack_reception`` for the run's summary."""
     rejected = {reason.value: n for reason, n in rejected_of(reception).items() if n}
     return {"accepted": reception.accepted, "rejected": rejected}

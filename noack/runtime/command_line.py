@@ -83,7 +83,7 @@ class JsonLog(io.TextIOBase):
 
     def log(self, level: str, source: str, message: str, **fields: Any) -> None:
         """Write an object; a number that is not finite becomes null."""
-        from pydantic_core import to_json
+        from pydantic_core import to_json  # only for logs as JSON Lines
 
         now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         content = {"time": now, "level": level, "source": source, "message": printable(message)}

@@ -2,7 +2,7 @@
 
 Loop data never travels here, and the loop never waits for it. The coordinator listens on a Unix
 socket in the user's runtime directory, which is closed to other users; all other processes connect
-to it. From another host, a session connects through :mod:`noack.runtime.coordinator_link` by TLS to
+to it. From another host, a session connects through ``connections/coordinator_link.py`` by TLS to
 :mod:`cosim.live.remote_access`, which forwards to that socket. Both ends have certificates of the
 run.
 """
@@ -64,7 +64,7 @@ def open_remote_session(remote: RemoteAccess, key: bytes) -> Iterator[zenoh.Sess
     started, CallerError if other users have access to the user's runtime directory.
     """
     # Processes on the coordinator's host need neither TLS nor asyncio.
-    from noack.runtime.coordinator_link import Destination, coordinator_link
+    from noack.runtime.connections.coordinator_link import Destination, coordinator_link
 
     own = remote.coordinator, remote.certificate, remote.private_key
     destination = Destination(remote.host, remote.port, *own, key.hex())

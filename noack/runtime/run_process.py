@@ -54,6 +54,7 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.control_plane import ControlPlane, ParameterUpdates, run_name
+from noack.runtime.host_clocks.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.join_ticket import (
     DEFAULT_SESSION,
     STANDARD_INPUT,
@@ -64,7 +65,6 @@ from noack.runtime.join_ticket import (
 )
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, LifeCycle, Side, State
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
-from noack.runtime.reference_clock import ClockRecord, ReferenceClock, reference_clock
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
 
@@ -472,10 +472,11 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     if os.environ.pop(TICKET_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
     ticket = _wait_for(
-        lambda: find_ticket(session), signals,
+        lambda: find_ticket(session),
+        signals,
         f"noack {role}: waiting for `noack record SCENARIO` on this host (session {session!r}); of "
         "a run on another host, give its --invitation; Ctrl-C ends",
-    )  # fmt: skip
+    )
     if ticket is None:
         raise PeerError(
             f"no run to join in session {session!r}: start `noack record SCENARIO` first"

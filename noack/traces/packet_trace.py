@@ -101,9 +101,10 @@ def packet_trace(
     _check_numbers(number, row, most_packets)
     sent, received, lost = sent_ns[row], received_ns[row], lost[row]
     _refuse(
-        np.flatnonzero(np.diff(sent) < 0) + 1, row,
+        np.flatnonzero(np.diff(sent) < 0) + 1,
+        row,
         "is sent before the packet that precedes it; sending times must not descend",
-    )  # fmt: skip
+    )
     if int(sent[-1]) - int(sent[0]) > LONGEST_NS:
         raise TraceRecordError(int(row[-1]), "is sent more than 31 years after the first packet")
     origin_ns = sent[0]

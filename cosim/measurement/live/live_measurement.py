@@ -32,7 +32,7 @@ from noack.protocol.probe_format import (
 )
 from noack.runtime.address import Address, family_of, parse_address, parse_destination, text_of
 from noack.runtime.command_line import Signals, print_to_stderr
-from noack.runtime.time_exchange import Arrival, ArrivalSocket, HostClocks
+from noack.runtime.host_clocks.time_exchange import Arrival, ArrivalSocket, HostClocks
 from noack.runtime.udp_sockets import drops_of, enlarge_buffer
 
 _ADDRESS = re.compile(r".*:[0-9]{1,5}")

@@ -23,7 +23,8 @@ class AtMost(Constraint):
         Clause(
             "atmost",
             "atmost 3 in 10",
-            (Part(("losses",), COUNT, "M"), Part(("window",), COUNT, "K", "in", "atmost 3 in 10")),
+            Part("losses", COUNT, "M"),
+            Part("window", COUNT, "K", "in", "atmost 3 in 10"),
         ),
     )
 

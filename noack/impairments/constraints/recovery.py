@@ -20,9 +20,7 @@ class Recovery(Constraint):
     deliveries: Annotated[int, Field(ge=1, le=10_000)]
     """h: minimum number of consecutive deliveries."""
 
-    clauses: ClassVar = (
-        Clause("recover", "mansd 2 recover 3", (Part(("deliveries",), COUNT, "H"),)),
-    )
+    clauses: ClassVar = (Clause("recover", "mansd 2 recover 3", Part("deliveries", COUNT, "H")),)
 
     @property
     def rule(self) -> DeliveriesBetweenBursts:

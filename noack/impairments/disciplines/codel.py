@@ -29,11 +29,9 @@ class Codel(QueueDiscipline):
         Clause(
             "codel",
             _EXAMPLE,
-            (
-                Part(("target_s",), OWN_TIME_S, "T", "target", _EXAMPLE),
-                Part(("interval_s",), OWN_TIME_S, "T", "interval", _EXAMPLE),
-                Part(("mtu_bytes",), COUNT, "BYTES", "mtu", f"{_EXAMPLE} mtu 1200"),
-            ),
+            Part("target_s", OWN_TIME_S, "T", "target", _EXAMPLE),
+            Part("interval_s", OWN_TIME_S, "T", "interval", _EXAMPLE),
+            Part("mtu_bytes", COUNT, "BYTES", "mtu", f"{_EXAMPLE} mtu 1200"),
             least=0,
             implied={"kind": "codel"},
         ),

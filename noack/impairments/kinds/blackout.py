@@ -32,16 +32,17 @@ _INTERVALS = Quantity("intervals of time, e.g. 2s-3s,5s-5500ms", _read_intervals
 
 
 def _every(example: str) -> Part:
-    return Part(("every_s",), OWN_TIME_S, "T", "every", example)
+    return Part("every_s", OWN_TIME_S, "T", "every", example)
 
 
 class Blackout(FileFeature, Impairment):
     """All packets that arrive during given intervals of time are lost."""
 
     kind: Literal["blackout"] = "blackout"
-    intervals_s: Annotated[
-        tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)
-    ] | None = None  # fmt: skip
+    intervals_s: (
+        Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1, max_length=MOST_INTERVALS)]
+        | None
+    ) = None
     """Begin and end of each, in seconds from the emulator's start (in a run: its epoch)."""
     file: Annotated[str, Field(min_length=1)] | None = None
     """Instead: a text file with begin and end of an interval on each line, e.g. 2s 3500ms."""
@@ -52,15 +53,14 @@ class Blackout(FileFeature, Impairment):
         Clause(
             "blackout",
             "blackout 2s-3s",
-            (
-                Part(("intervals_s",), _INTERVALS, "T-T[,T-T...]"),
-                _every("blackout 2s-3s every 10s"),
-            ),
+            Part("intervals_s", _INTERVALS, "T-T[,T-T...]"),
+            _every("blackout 2s-3s every 10s"),
         ),
         Clause(
             "outages",
             "outages outages.txt",
-            (file_name("a file of outages"), _every("outages outages.txt every 60s")),
+            file_name("a file of outages"),
+            _every("outages outages.txt every 60s"),
         ),
     )
     tc_missing: ClassVar = "blackouts"

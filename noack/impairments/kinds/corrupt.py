@@ -15,7 +15,7 @@ class Corrupt(CorrelatedChance, Impairment):
     probability: Probability
     """Probability of a flipped bit."""
 
-    clauses: ClassVar = (Clause("corrupt", "corrupt 1%", CHANCE),)
+    clauses: ClassVar = (Clause("corrupt", "corrupt 1%", *CHANCE),)
     behaviour: ClassVar = "corrupt"
     action: ClassVar = "corrupt"
     flips_bits: ClassVar = True

@@ -82,6 +82,12 @@ class _DistributionPart(Part):
     def is_default(self, settings: Any) -> bool:
         return settings.distribution == "uniform" or settings.samples_s is not None
 
+    def text(self, settings: Any) -> str:
+        name = settings.file
+        if name is None:
+            return f"distribution {settings.distribution}"
+        return f"distribution {shlex.quote(f'./{name}' if name in SHAPES else name)}"
+
 
 _SAMPLES = list_of(OWN_TIME_S, "delays with their units, e.g. 1ms,2ms,10ms")
 _DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
@@ -118,26 +124,34 @@ class Delay(FileFeature, Impairment):
         Clause(
             "delay",
             "delay 10ms",
-            (
-                Part(("delay_s",), TIME_S, "TIME"),
-                _JitterPart(("jitter_s",), TIME_S, "JITTER"),
-                Part(("correlation",), CORRELATION, "CORR"),
-                _DistributionPart(
-                    ("distribution",), None, f"{'|'.join(SHAPES)}|FILE", "distribution",
-                    "delay 10ms 2ms distribution normal",
-                ),
-                Part(
-                    ("samples_s",), _SAMPLES, "T,T,...", "samples", "delay 0s samples 1ms,2ms,10ms",
-                    {"distribution": "empirical"},
-                ),
-                Part(
-                    ("loss_correlation",), SIGNED_PERCENT, "P", "lossrel",
-                    "loss 5% delay 10ms 2ms lossrel 50%",
-                ),
+            Part("delay_s", TIME_S, "TIME"),
+            _JitterPart("jitter_s", TIME_S, "JITTER"),
+            Part("correlation", CORRELATION, "CORR"),
+            _DistributionPart(
+                "distribution",
+                None,
+                f"{'|'.join(SHAPES)}|FILE",
+                "distribution",
+                "delay 10ms 2ms distribution normal",
             ),
-            ("latency",),
+            Part(
+                "samples_s",
+                _SAMPLES,
+                "T,T,...",
+                "samples",
+                "delay 0s samples 1ms,2ms,10ms",
+                {"distribution": "empirical"},
+            ),
+            Part(
+                "loss_correlation",
+                SIGNED_PERCENT,
+                "P",
+                "lossrel",
+                "loss 5% delay 10ms 2ms lossrel 50%",
+            ),
+            synonyms=("latency",),
         ),
-    )  # fmt: skip
+    )
     delays: ClassVar = True
 
     @model_validator(mode="after")
@@ -169,24 +183,6 @@ class Delay(FileFeature, Impairment):
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         varies = bool(self.jitter_s or self.samples_s or self.file)
         return delayed or varies or self.delay_s > 0, reordered or varies
-
-    def text(self) -> str:
-        words = ["delay", time_text(self.delay_s)]
-        shaped = self.distribution in SHAPES and self.distribution != "uniform"
-        if self.jitter_s or self.correlation or shaped:
-            words.append(time_text(self.jitter_s))
-        if self.correlation:
-            words.append(percent_text(self.correlation))
-        if shaped:
-            words += ["distribution", self.distribution]
-        elif self.file is not None:
-            name = f"./{self.file}" if self.file in SHAPES else self.file
-            words += ["distribution", shlex.quote(name)]
-        elif self.samples_s is not None:
-            words += ["samples", ",".join(map(time_text, self.samples_s))]
-        if self.loss_correlation:
-            words += ["lossrel", percent_text(self.loss_correlation)]
-        return " ".join(words)
 
     def meaning(self) -> str:
         text = f"delays each packet by {time_text(self.delay_s)}"

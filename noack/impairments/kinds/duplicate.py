@@ -15,7 +15,7 @@ class Duplicate(CorrelatedChance, Impairment):
     probability: Probability
     """Probability of a copy."""
 
-    clauses: ClassVar = (Clause("duplicate", "duplicate 1%", CHANCE),)
+    clauses: ClassVar = (Clause("duplicate", "duplicate 1%", *CHANCE),)
     behaviour: ClassVar = "duplicate"
     action: ClassVar = "duplicate"
     copies: ClassVar = True

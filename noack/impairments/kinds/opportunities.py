@@ -56,24 +56,26 @@ class Opportunities(FileFeature, Impairment):
         Clause(
             "opportunities",
             "opportunities trace.up",
-            (
-                FileOr(
-                    ("times_ms",), list_of(COUNT, "times in ms that do not descend, e.g. 0,1,5"),
-                    "N,N,...", "at", "opportunities at 0,1,5",
-                    expected="a file with delivery opportunities, in ms",
-                ),
-                Part(
-                    ("overhead_bytes",), SIGNED_COUNT, "N", "overhead",
-                    "opportunities trace.up overhead 28",
-                ),
-                Part(("queue",), COUNT, "N", "queue", "opportunities trace.up queue 20"),
-                Part(("queue_bytes",), COUNT, "N", "bytes", "opportunities trace.up bytes 30000"),
-                Part(
-                    ("offset_s",), OFFSET, "T|random", "from", "opportunities trace.up from random"
-                ),
+            FileOr(
+                "times_ms",
+                list_of(COUNT, "times in ms that do not descend, e.g. 0,1,5"),
+                "N,N,...",
+                "at",
+                "opportunities at 0,1,5",
+                expected="a file with delivery opportunities, in ms",
             ),
+            Part(
+                "overhead_bytes",
+                SIGNED_COUNT,
+                "N",
+                "overhead",
+                "opportunities trace.up overhead 28",
+            ),
+            Part("queue", COUNT, "N", "queue", "opportunities trace.up queue 20"),
+            Part("queue_bytes", COUNT, "N", "bytes", "opportunities trace.up bytes 30000"),
+            Part("offset_s", OFFSET, "T|random", "from", "opportunities trace.up from random"),
         ),
-    )  # fmt: skip
+    )
     delays: ClassVar = True
     tc_missing: ClassVar = "delivery opportunities"
 

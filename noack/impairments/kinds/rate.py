@@ -65,19 +65,18 @@ class Rate(Impairment):
         Clause(
             "rate",
             "rate 1mbit",
-            (
-                Part(("rate_bps",), RATE_BPS, "RATE"),
-                Part(("overhead_bytes",), SIGNED_COUNT, "OVERHEAD"),
-                Part(("cell_bytes",), COUNT, "CELL"),
-                Part(("cell_overhead_bytes",), SIGNED_COUNT, "CELL_OVERHEAD"),
-                Part(("queue",), COUNT, "N", "queue", "rate 1mbit queue 20"),
-                *(
-                    _DisciplinePart(("discipline",), word=clause.word)
-                    for kind in DISCIPLINES for clause in kind.clauses
-                ),
+            Part("rate_bps", RATE_BPS, "RATE"),
+            Part("overhead_bytes", SIGNED_COUNT, "OVERHEAD"),
+            Part("cell_bytes", COUNT, "CELL"),
+            Part("cell_overhead_bytes", SIGNED_COUNT, "CELL_OVERHEAD"),
+            Part("queue", COUNT, "N", "queue", "rate 1mbit queue 20"),
+            *(
+                _DisciplinePart("discipline", word=clause.word)
+                for kind in DISCIPLINES
+                for clause in kind.clauses
             ),
         ),
-    )  # fmt: skip
+    )
     delays: ClassVar = True
 
     @model_validator(mode="after")

@@ -24,9 +24,10 @@ class Reorder(CorrelatedChance, Impairment):
         Clause(
             "reorder",
             "delay 10ms reorder 5%",
-            (*CHANCE, Part(("gap",), COUNT, "N", "gap", "delay 10ms reorder 5% gap 5")),
+            *CHANCE,
+            Part("gap", COUNT, "N", "gap", "delay 10ms reorder 5% gap 5"),
         ),
-        Clause("gap", "delay 10ms gap 5", (Part(("gap",), COUNT, "N"),)),
+        Clause("gap", "delay 10ms gap 5", Part("gap", COUNT, "N")),
     )
     behaviour: ClassVar = "reorder"
 

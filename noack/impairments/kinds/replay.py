@@ -93,19 +93,21 @@ class Replay(FileFeature, Impairment):
         Clause(
             "replay",
             "replay trace.csv",
-            (
-                FileOr(
-                    ("sent_ns", "delays_ns"), _RECORDS, "T+T,T+lost,...", "records",
-                    "replay records 0ms+12ms,50ms+lost", expected="a file with a packet trace",
-                ),
-                Part(("by",), _BY, "packet|time", "by", "replay trace.csv by time"),
-                Part(("offset_s",), OFFSET, "T|random", "from", "replay trace.csv from random"),
-                Part(("delay_share",), PERCENT, "P", "share", "replay trace.csv share 50%"),
-                flag("relative", "replay trace.csv relative", "clocks_differ", True),
-                flag("once", "replay trace.csv once", "repeat", False),
+            FileOr(
+                "sent_ns delays_ns",
+                _RECORDS,
+                "T+T,T+lost,...",
+                "records",
+                "replay records 0ms+12ms,50ms+lost",
+                expected="a file with a packet trace",
             ),
+            Part("by", _BY, "packet|time", "by", "replay trace.csv by time"),
+            Part("offset_s", OFFSET, "T|random", "from", "replay trace.csv from random"),
+            Part("delay_share", PERCENT, "P", "share", "replay trace.csv share 50%"),
+            flag("relative", "replay trace.csv relative", "clocks_differ", True),
+            flag("once", "replay trace.csv once", "repeat", False),
         ),
-    )  # fmt: skip
+    )
     delays: ClassVar = True
     tc_missing: ClassVar = "traces of packets"
 
@@ -222,9 +224,11 @@ class Replay(FileFeature, Impairment):
         if (trace.delay_ns > LONGEST_DELAY_NS).any():
             file.wrong("has a delay of more than an hour; a replay can have none")
         update = {
-            "sent_ns": tuple(trace.sent_ns.tolist()), "delays_ns": tuple(trace.delay_ns.tolist()),
-            "file": None, "clocks_differ": False,
-        }  # fmt: skip
+            "sent_ns": tuple(trace.sent_ns.tolist()),
+            "delays_ns": tuple(trace.delay_ns.tolist()),
+            "file": None,
+            "clocks_differ": False,
+        }
         read = self.model_copy(update=update)
         require_inside(self.offset_s, read.length_ns, file)
         return read

@@ -25,7 +25,8 @@ class BernoulliLoss(CorrelatedChance, LossModel):
         Clause(
             "random",
             "loss 30%",
-            (*CHANCE, flag("keep", "loss 30% keep mansd 4", "keep", True)),
+            *CHANCE,
+            flag("keep", "loss 30% keep mansd 4", "keep", True),
             is_bare=True,
         ),
     )

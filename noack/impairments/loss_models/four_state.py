@@ -41,7 +41,7 @@ class FourStateLoss(LossModel):
         Clause(
             "state",
             "loss state 1% 10%",
-            tuple(Part((name,), PERCENT, name.upper()) for name in _NAMES),
+            *tuple(Part(name, PERCENT, name.upper()) for name in _NAMES),
             complement=True,
         ),
     )
@@ -66,12 +66,14 @@ class FourStateLoss(LossModel):
         return Stage(self.model, self.model_dump(include=set(_NAMES)))
 
     def chains(self) -> Sequence[Chain]:
-        moves = np.array([
-            [1 - self.p13 - self.p14, 0.0, self.p13, self.p14],
-            [0.0, 1 - self.p23, self.p23, 0.0],
-            [self.p31, self.p32, 1 - self.p31 - self.p32, 0.0],
-            [1.0, 0.0, 0.0, 0.0],
-        ])  # fmt: skip
+        moves = np.array(
+            [
+                [1 - self.p13 - self.p14, 0.0, self.p13, self.p14],
+                [0.0, 1 - self.p23, self.p23, 0.0],
+                [self.p31, self.p32, 1 - self.p31 - self.p32, 0.0],
+                [1.0, 0.0, 0.0, 0.0],
+            ]
+        )
         return (Chain(np.eye(4)[0], np.maximum(moves, 0.0), np.array([0.0, 0.0, 1.0, 1.0])),)
 
     def tc_text(self) -> str:

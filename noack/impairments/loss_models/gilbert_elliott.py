@@ -32,7 +32,7 @@ from noack.impairments.words import (
 from noack.settings.section import Probability
 
 _COMMON = Part(
-    ("step_s",), OWN_TIME_S, "STEP", "common", "loss gemodel 1% 10% common 20ms", {"state": "link"}
+    "step_s", OWN_TIME_S, "STEP", "common", "loss gemodel 1% 10% common 20ms", {"state": "link"}
 )
 
 
@@ -66,23 +66,19 @@ class GilbertElliottLoss(LossModel):
         Clause(
             "gemodel",
             "loss gemodel 1% 10%",
-            (
-                Part(("good_to_bad",), PERCENT, "P"),
-                Part(("bad_to_good",), PERCENT, "R"),
-                Part(("loss_in_bad",), PERCENT, "1-H"),
-                Part(("loss_in_good",), PERCENT, "1-K"),
-                _COMMON,
-            ),
+            Part("good_to_bad", PERCENT, "P"),
+            Part("bad_to_good", PERCENT, "R"),
+            Part("loss_in_bad", PERCENT, "1-H"),
+            Part("loss_in_good", PERCENT, "1-K"),
+            _COMMON,
             complement=True,
         ),
         Clause(
             "burst",
             "loss burst 5% 3",
-            (
-                Part(("mean_loss",), PERCENT, "MEAN_LOSS"),
-                Part(("mean_burst",), NUMBER, "MEAN_BURST"),
-                _COMMON,
-            ),
+            Part("mean_loss", PERCENT, "MEAN_LOSS"),
+            Part("mean_burst", NUMBER, "MEAN_BURST"),
+            _COMMON,
             least=2,
         ),
     )

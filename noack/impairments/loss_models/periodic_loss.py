@@ -38,10 +38,8 @@ class PeriodicLoss(LossModel):
         Clause(
             "periodic",
             "loss periodic 2/100",
-            (
-                Part(("burst", "period"), _SHARE, "B/N"),
-                Part(("first",), COUNT, "K", "from", "loss periodic 2/100 from 3"),
-            ),
+            Part("burst period", _SHARE, "B/N"),
+            Part("first", COUNT, "K", "from", "loss periodic 2/100 from 3"),
         ),
     )
     tc_missing: ClassVar = "losses by the packets' numbers"

@@ -33,10 +33,8 @@ class ScriptedLoss(LossModel):
         Clause(
             "script",
             "loss script 3,4,17",
-            (
-                Part(("lost",), _LOST, "N,N,..."),
-                Part(("repeat_every",), COUNT, "N", "every", "loss script 3,4 every 20"),
-            ),
+            Part("lost", _LOST, "N,N,..."),
+            Part("repeat_every", COUNT, "N", "every", "loss script 3,4 every 20"),
         ),
     )
     tc_missing: ClassVar = "losses by the packets' numbers"

@@ -28,10 +28,8 @@ class TraceLoss(FileFeature, LossModel):
         Clause(
             "trace",
             "loss trace FILE",
-            (
-                file_name("a file of zeros and ones"),
-                flag("once", "loss trace FILE once", "repeat", False),
-            ),
+            file_name("a file of zeros and ones"),
+            flag("once", "loss trace FILE once", "repeat", False),
         ),
     )
     tc_missing: ClassVar = "losses by the packets' numbers"

@@ -4,7 +4,7 @@ import hashlib
 import struct
 
 from noack.protocol.wire_format import Rejection
-from noack.runtime.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
+from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
 from tests.fuzz.choices import Choices
 
 KEY = bytes(range(32))

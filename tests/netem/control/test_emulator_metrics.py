@@ -14,8 +14,8 @@ from netem import stand_alone
 from netem.control.emulator_metrics import EmulatorMetrics, metrics
 from netem.control.emulator_statistics import CommandQueue, statistics
 from netem.stand_alone import attached
-from noack.runtime import metrics_server as servers
 from noack.runtime.address import text_of
+from noack.runtime.connections import metrics_server as servers
 from tests.netem.control.relays import FakeRelay, options
 from tests.noack.runtime.test_metrics_server import read, slow_reader
 

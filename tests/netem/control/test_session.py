@@ -1,8 +1,4 @@
-import signal
 import stat
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -35,41 +31,6 @@ def test_unfit_names_are_refused(name: str) -> None:
         pass
 
 
-HOLDER = """
-import sys
-from netem.control.control_server import published
-with published("dead"):
-    print("published", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_the_file_of_a_killed_emulator_is_recognised() -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "published\n"
-        assert running() == ["dead"]
-        holder.send_signal(signal.SIGKILL)
-    with published(LAB) as path:
-        left = [path.with_name(f"dead.{what}") for what in ("json", "sock", "sock.lock")]
-        for one in left:
-            one.touch()
-        assert running() == ["lab"]
-        assert not any(one.exists() for one in left)
-    with published("dead"):
-        assert running() == ["dead"]
-
-
-def test_a_name_is_free_again_after_its_emulator_was_killed(runtime_dir: Path) -> None:
-    with published(LAB) as path:
-        text = path.read_text()
-    path.write_text(text)  # the file is not locked
-    with published(LAB):
-        assert find("lab") == LAB
-
-
 def test_an_unknown_name_gets_the_running_names() -> None:
     with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
         find(None)
@@ -80,20 +41,3 @@ def test_an_unknown_name_gets_the_running_names() -> None:
             find(None)
         with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
             find("lba")
-
-
-def test_a_folder_open_to_others_is_refused() -> None:
-    with published(LAB) as path:
-        pass
-    path.parent.chmod(0o755)
-    for use in (running, lambda: published(LAB).__enter__()):
-        with pytest.raises(CallerError, match="closed to others"):
-            use()
-
-
-def test_a_file_replaced_by_another_emulator_is_not_removed(runtime_dir: Path) -> None:
-    with published(LAB) as path:
-        other = path.with_name("other")
-        other.write_text("mine")
-        other.replace(path)
-    assert path.read_text() == "mine"

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
-from netem.control.statistics_view import History, plain_lines, render
+from netem.control.statistics_view import History, picture_of, plain_lines, render
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
@@ -84,6 +84,18 @@ def test_the_last_minute_is_drawn() -> None:
     assert forward == "".join(sorted(forward))  # monotonically increasing
     assert forward.startswith("▁")
     assert forward.endswith("█")
+
+
+def test_totals_are_counts_without_charts() -> None:
+    relay, file = FakeRelay("up"), io.StringIO()
+    relay.counters["up", "forward"].duplicated = 12
+    Console(file=file, width=80).print(picture_of(documents(relay, 1)[0], "totals", 80))
+    lines = file.getvalue().splitlines()
+    assert lines[0].split() == ["totals", "0:01"]
+    assert "1 client (3 ever)" in lines[1]
+    assert line_of(lines, "received") == "received 0 0"
+    assert any(line.strip("│ ") == "12 duplicated" for line in lines)
+    assert not any(line.strip("│ ") == "" for line in lines)
 
 
 def test_unintended_losses_stand_out() -> None:

@@ -375,22 +375,6 @@ def test_segments_are_separate_datagrams(segment: bool) -> None:
         assert [data for data, _ in drain(server)] == expected
 
 
-def test_links_are_independent() -> None:
-    with endpoints(V4, V4, V4) as (*servers, client):
-        specs = [
-            link(name_of(server), HALF_LOST, name=name)
-            for server, name in zip(servers, ("one", "other"), strict=True)
-        ]
-        with running(specs) as one:
-            for spec in specs:
-                send_numbers(client, one.address(spec.name), 0, 200)
-            for number in range(2):
-                one.settle(200, number=number)
-            received = [numbers(drain(server)) for server in servers]
-    assert received[0] != received[1]
-    assert all(60 < len(some) < 140 for some in received)
-
-
 class CountOnly:
     """A tap that does not read payloads."""
 

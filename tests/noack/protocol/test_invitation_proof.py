@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from noack.runtime.coordinator_link import PROOF_BYTES, InvitationProof
+from noack.runtime.connections.coordinator_link import PROOF_BYTES, InvitationProof
 
 KEY = bytes(range(32))
 COORDINATOR = ("192.0.2.1", 7400)

@@ -4,7 +4,7 @@ import socket
 import struct
 from random import Random
 
-from noack.runtime.time_exchange import HostClocks
+from noack.runtime.host_clocks.time_exchange import HostClocks
 
 PS = 1000  # per ns
 

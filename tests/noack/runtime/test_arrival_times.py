@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.runtime import time_exchange
-from noack.runtime.time_exchange import (
+from noack.runtime.host_clocks import time_exchange
+from noack.runtime.host_clocks.time_exchange import (
     ArrivalSocket,
     ClockDifference,
     latest_arrival_ns,

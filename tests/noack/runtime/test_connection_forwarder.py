@@ -13,8 +13,8 @@ from typing import Literal, get_args
 import pytest
 
 from cosim.live.remote_access import KeyPair, TlsKeys, coordinator_context, new_tls_keys
-from noack.runtime import connection_gate, coordinator_link
-from noack.runtime.coordinator_link import (
+from noack.runtime.connections import connection_gate, coordinator_link
+from noack.runtime.connections.coordinator_link import (
     PROOF_BYTES,
     Answer,
     InvitationProof,

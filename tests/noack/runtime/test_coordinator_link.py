@@ -11,8 +11,8 @@ import pytest
 
 from cosim.live.remote_access import TlsKeys, coordinator_context, new_tls_keys
 from noack.core.errors import NoAnswerError, PeerError
-from noack.runtime import coordinator_link as link_module
-from noack.runtime.coordinator_link import (
+from noack.runtime.connections import coordinator_link as link_module
+from noack.runtime.connections.coordinator_link import (
     Answer,
     Destination,
     InvitationProof,

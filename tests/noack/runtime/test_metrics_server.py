@@ -16,10 +16,10 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as prometheus_families
 
 from noack.core.errors import CallerError
-from noack.runtime import connection_gate
-from noack.runtime import metrics_server as servers
 from noack.runtime.address import Address
-from noack.runtime.metrics_server import metrics_server
+from noack.runtime.connections import connection_gate
+from noack.runtime.connections import metrics_server as servers
+from noack.runtime.connections.metrics_server import metrics_server
 
 OPENMETRICS = "application/openmetrics-text; version=1.0.0"
 

@@ -15,8 +15,7 @@ from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record
 from noack.protocol.record_tables import LOST_NS
-from noack.runtime.join_ticket import new_ticket
-from noack.runtime.reference_clock import (
+from noack.runtime.host_clocks.reference_clock import (
     FOUND,
     LOST,
     LOST_AFTER_NS,
@@ -25,7 +24,8 @@ from noack.runtime.reference_clock import (
     ReferenceClock,
     reference_clock,
 )
-from noack.runtime.time_exchange import HostClocks, TimeReference, answering
+from noack.runtime.host_clocks.time_exchange import HostClocks, TimeReference, answering
+from noack.runtime.join_ticket import new_ticket
 
 KEY = bytes(range(32))
 ROOMY = ClocksSection(largest_error_us=1e6)  # a busy machine gives wide bounds

@@ -14,7 +14,7 @@ from benchmarks.hosts import DrivenClocks
 from noack.core.clock import ClockOffset, Restart, RestartCause
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
-from noack.runtime.time_exchange import (
+from noack.runtime.host_clocks.time_exchange import (
     MOST_AT_ONCE,
     TIME_BYTES,
     HostClocks,

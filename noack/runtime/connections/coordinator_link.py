@@ -6,8 +6,8 @@ TLS. It is a separate process, since a thread would keep the loop waiting for th
 lock. The coordinator's host forwards accepted connections to its own socket, on a thread.
 
 A connection begins with the proof, which is checked before anything that costs more: a flood of
-connections without it costs little (:mod:`noack.runtime.connection_gate`), and never ends those
-with one. Layout, version 1::
+connections without it costs little (see ``connection_gate.py``), and never ends those with one.
+Layout, version 1::
 
     offset  size  field
          0     4  the bytes "NJ", version 1, reserved 0
@@ -44,7 +44,7 @@ from typing import NamedTuple
 from noack.core.errors import MachineError, NoAnswerError, PeerError, why
 from noack.core.process_limits import python_command
 from noack.protocol.wire_format import KEY_BYTES, TAG_BYTES, Tagger
-from noack.runtime.connection_gate import FirstBytes, TaskLimit, accepting
+from noack.runtime.connections.connection_gate import FirstBytes, TaskLimit, accepting
 from noack.runtime.private_folder import open_private
 
 _HEAD = b"NJ\x01\x00"

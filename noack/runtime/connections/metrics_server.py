@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from noack.core.errors import CallerError, MachineError, why
 from noack.runtime.address import Address, family_of, parse_address, text_of
-from noack.runtime.connection_gate import FirstBytes, TaskLimit, accepting
+from noack.runtime.connections.connection_gate import FirstBytes, TaskLimit, accepting
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
@@ -38,7 +38,7 @@ _BUSY = b"HTTP/1.0 503 Service Unavailable\r\n\r\n"
 def require_package() -> None:
     """Raise CallerError if the package of the metrics is not installed."""
     try:
-        import prometheus_client  # noqa: F401
+        import prometheus_client  # noqa: F401 - an optional package
     except ImportError:
         raise CallerError(
             f"{OPTION} needs prometheus_client, which is not installed; pip install "
@@ -59,8 +59,8 @@ def metrics_server(where: str, collect: "Callable[[], Iterable[Metric]]") -> Ite
         MachineError: the server cannot be started.
     """
     require_package()
-    from prometheus_client import CollectorRegistry
-    from prometheus_client.exposition import make_wsgi_app
+    from prometheus_client import CollectorRegistry  # an optional package
+    from prometheus_client.exposition import make_wsgi_app  # an optional package
 
     address = parse_address(where, OPTION)
     registry = CollectorRegistry(auto_describe=False)

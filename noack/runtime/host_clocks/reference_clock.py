@@ -23,8 +23,8 @@ from noack.core.errors import PeerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import LOST_NS, clock_table
 from noack.runtime.address import Address, text_of
+from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.time_exchange import HostClocks, TimeClient
 
 LOST_AFTER_NS = 500_000_000
 """Without an answer of the reference for this time, the bound counts as lost."""
@@ -119,7 +119,7 @@ class ReferenceClock:
                     if interval is None
                     else f"known within {interval.error_ns / _NS_PER_US:.0f} µs, "
                     f"{self._largest_ns / _NS_PER_US:g} µs allowed"
-                )  # fmt: skip
+                )
                 raise PeerError(f"cannot compare this host's clock with the coordinator's: {found}")
             select.select([self._client], (), (), _POLL_S)
 
@@ -143,9 +143,9 @@ class ReferenceClock:
             # Both rates together change the error during the poll.
             rate_ppb = self._offset.rate_ppb + self.slew_ppb
             error_ns += -(-rate_ppb * (now_ns - before_ns) // _PPB) + 1
-        largest_ns = None if error_ns is None or self._error_ns is None else (
-            max(self._error_ns, error_ns)
-        )  # fmt: skip
+        largest_ns = (
+            None if error_ns is None or self._error_ns is None else (max(self._error_ns, error_ns))
+        )
         slewed.follow(now_ns)
         self._error_ns = slewed.error_ns(now_ns)
         if self._client.accepted > self._accepted:
@@ -232,9 +232,10 @@ class ClockRecord:
         if report.lost != self._lost:
             self._lost = report.lost
             level, text = (
-                (FOUND, "the bound of its clock's error is known again") if report.lost is None
+                (FOUND, "the bound of its clock's error is known again")
+                if report.lost is None
                 else (LOST, f"the bound of its clock's error is lost: {report.lost}")
-            )  # fmt: skip
+            )
             outputs.append(Notice(now_ns, level, text))
         self._largest_ns = max(self._largest_ns, report.error_ns or 0)
         return outputs
