@@ -9,33 +9,39 @@ enum { CACHE_LINE = 8 }; /* doubles */
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
+static int instructions; /* of the processor: see noack_exact_instructions() */
 
 /* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
    With ziglang, __builtin_cpu_supports() answers no to everything. */
 __attribute__((constructor)) static void ask_processor(void) {
+    const unsigned wide = bit_AVX512F | bit_AVX512VL | bit_AVX512DQ;
     unsigned a, b, c, d, kept, high;
     if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE))
         return;
     __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
-    is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
+    if ((kept & 6) != 6 || !__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & bit_AVX2))
+        return;
+    instructions = (kept & 0xe6) == 0xe6 && (b & wide) == wide ? 2 : 1;
 }
 
-static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
-                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
-static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
+static const exact_code *const of_2[] = {
+    &exact_fused_3, &exact_wide_4, &exact_wide_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const of_1[] = {
+    &exact_fused_3, &exact_fused_4, &exact_fused_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const of_0[] = {&exact_plain_3, &exact_plain_4, &exact_plain_64};
+static const exact_code *const *const codes[] = {of_0, of_1, of_2};
 #else
-enum { is_fused = 0 };
-static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
-                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
-static const exact_code *const *const fused = plain;
+enum { instructions = 0 };
+static const exact_code *const of_0[] = {
+    &exact_plain_3, &exact_plain_4, &exact_plain_8, &exact_plain_16, &exact_plain_64};
+static const exact_code *const *const codes[] = {of_0};
 #endif
 
-int64_t noack_exact_is_fused(void) { return is_fused; }
+int64_t noack_exact_instructions(void) { return instructions; }
 
 /* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
 static const exact_code *code_for(const noack_exact *exact) {
-    const exact_code *const *code = is_fused ? fused : plain;
+    const exact_code *const *code = codes[instructions];
     int64_t entries = max_of(exact->n, exact->m);
     while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
         code++;

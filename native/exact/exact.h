@@ -94,11 +94,10 @@ typedef struct {
 } exact_code;
 
 #if defined(__x86_64__)
-extern const exact_code exact_fused_2, exact_fused_3, exact_fused_4, exact_fused_8, exact_fused_16,
-    exact_fused_64;
+extern const exact_code exact_wide_4, exact_wide_8, exact_fused_3, exact_fused_4, exact_fused_8,
+    exact_fused_16, exact_fused_64;
 #endif
-extern const exact_code exact_plain_2, exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16,
-    exact_plain_64;
+extern const exact_code exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16, exact_plain_64;
 
 /* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of
  * STRIDE numbers for each of the matrix. */

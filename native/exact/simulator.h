@@ -136,7 +136,8 @@ static double first_window(exact_memory *memory, const comparison *now, int64_t 
 
 /* The time of the next event on a piece, NONE or UNRESOLVED; the integral; the next grid point. */
 static double find_event(
-    exact_memory *memory, comparison *now, int p, int64_t *point, double t_s, double window_s) {
+    exact_memory *memory, comparison *now, int p, int64_t *point, double t_s, double window_s,
+    forecast crossing) {
     const rule_phase *phase = &now->phase;
     if (memory->quadratic) {
         if (!phase->compares && !memory->dynamic)
@@ -149,7 +150,7 @@ static double find_event(
     level_search search = {level, phase->rate_per_s, window_s, 0};
     if (memory->integrates)
         return first_excess(memory->error, p, &search, &now->auxiliary);
-    return phase->compares ? first_exit(memory->error, p, &search, 0, MOST_STEPS) : NONE;
+    return phase->compares ? first_exit(memory->error, p, &search, crossing, MOST_STEPS) : NONE;
 }
 
 /* e^(rt) of the supremum; r is 0 from some time on. */
@@ -306,6 +307,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         }
         state = renewed(memory, state);
         rule_phase phase = phase_at(memory, &span, t_s);
+        forecast crossing = UNKNOWN;
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
         memory->apart = !agree || memory->renewed;
@@ -315,13 +317,15 @@ static void follow(exact_memory *memory, exact_run *run) {
                 status = NOACK_EXACT_DIVERGED;
                 break;
             }
-            window_s = least(window_s, first_window(memory, &now, point, t_s));
+            double soon_s = first_window(memory, &now, point, t_s);
+            crossing = soon_s < least(window_s, left_s) ? LIKELY : UNKNOWN;
+            window_s = least(window_s, soon_s);
             looked = 1;
         }
         window_s = least(window_s, left_s);
         int p = degree_for(memory->reach_s, window_s);
         expand(memory, state, 1.0 / now.scale, 3, p);
-        double found_s = find_event(memory, &now, p, &point, t_s, window_s);
+        double found_s = find_event(memory, &now, p, &point, t_s, window_s, crossing);
         if (found_s == UNRESOLVED)
             break;
         event = found_s != NONE;
