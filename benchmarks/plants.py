@@ -24,8 +24,9 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.config.sections import PLANTS
 from noack.core.clock import NS_PER_S
+from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import PLANT_STEP
-from noack.protocol.wire_format import Flow, Message
+from noack.protocol.wire_format import Flow
 from noack.runtime.real_time_loop import realtime
 from plant_server.plant import plants_of
 
@@ -52,9 +53,14 @@ def steps_us(scenario: Scenario, count: int) -> Iterator[float]:
     plant = plants_of((scenario,))
     for step, u in enumerate(record[PLANT_STEP]["u"]):
         t_ns = step * period_ns
-        plant.handle(Message(Flow.ACTUATION, step, t_ns, u), t_ns)
+        core.noack_process_handle(plant.core, ffi.new("noack_message *", {
+            "flow": Flow.ACTUATION, "sequence": step, "t_ns": t_ns,
+            "entries": len(u), "vector": u.tolist(),
+        }), t_ns)  # fmt: skip
         begun_ns = time.thread_time_ns()
-        plant.on_timer(t_ns)
+        while (question := core.noack_process_tick(plant.core, t_ns)) != core.NOACK_DONE:
+            plant.answer(question)
+        plant.take_rows()
         yield (time.thread_time_ns() - begun_ns) / 1e3
 
 

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import transition
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import tables
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import Sensor
-from tests.machine_parts import machine, state_of
+from tests.machine_parts import OneLoop, machine, state_of
 from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -36,7 +35,7 @@ def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
     return sent, np.array([record.row], tables(2, 1, acknowledged=True)[record.table])[0]
 
 
-def sensor(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> LoopMachines:
+def sensor(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> OneLoop:
     known = None if x0 is None else np.asarray(x0, dtype=float)
     return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
 

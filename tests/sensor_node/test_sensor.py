@@ -11,12 +11,11 @@ from scipy.linalg import expm
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import Sensor
-from tests.machine_parts import machine, sensor_of, state_of
+from tests.machine_parts import OneLoop, machine, sensor_of, state_of
 from tests.trigger_rules import decaying_rule
 
 GRID_NS = 10_000_000
@@ -36,7 +35,7 @@ def rows(outputs: Sequence[Output], n: int) -> Any:
     return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
 
 
-def feed(sensor: LoopMachines, x: Callable[[float], float], until_s: float) -> list[Output]:
+def feed(sensor: OneLoop, x: Callable[[float], float], until_s: float) -> list[Output]:
     """Measure the scalar x(t) on the grid."""
     outputs: list[Output] = []
     for k in range(round(until_s * 1e9) // GRID_NS + 1):
