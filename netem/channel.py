@@ -41,7 +41,6 @@ _PACKET_ROW = np.dtype(
 _RELEASE_ROW = dtype_of("noack_release_row")
 NO_TIME_NS = 2**63 - 1
 """Stands for a time that never comes, in the core."""
-UNKNOWN_ARRIVAL_NS = 2**62
 RUN_ID = 0
 """Run number in the datagrams of every simulated run: a record depends on the scenario alone.
 
@@ -62,8 +61,6 @@ class Datagram(NamedTuple):
 
     flow: int
     data: bytes
-    arrival_ns: int = UNKNOWN_ARRIVAL_NS
-    """Arrival at the socket, for the record; later than its handling: unknown."""
 
 
 class Channel:

@@ -15,7 +15,7 @@ LINES = {
     "noack/core": 1480,
     "noack/disturbances": 250,
     "noack/impairments": 3900,
-    "noack/machines": 450,
+    "noack/machines": 400,
     "noack/observers": 400,
     "noack/plants": 2350,
     "noack/protocol": 850,
@@ -41,7 +41,7 @@ LINES = {
     "sensor_node": 400,
     "controller_node": 400,
     "benchmarks": 5300,
-    "native": 9550,
+    "native": 9510,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

@@ -9,6 +9,9 @@ from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
 from tests.oracles.link import flipped
 
+_UNKNOWN_NS = 2**62
+"""An arrival at the socket that is later than its handling is unknown."""
+
 
 class SteppedChannel:
     """A channel with payloads."""
@@ -31,7 +34,7 @@ class SteppedChannel:
         channel, number, data = self.channel.core, self._handled, message.data
         assert 0 <= message.flow < channel.loops * len(self.channel.links)
         datagram = ffi.new("noack_datagram *", {
-            "flow": message.flow, "size_bytes": len(data), "arrival_ns": message.arrival_ns,
+            "flow": message.flow, "size_bytes": len(data), "arrival_ns": _UNKNOWN_NS,
             "bit": -1, "head": data[:PACKET_HEAD_BYTES], "message": {"sequence": number},
         })  # fmt: skip
         before = channel.heap_count

@@ -134,8 +134,8 @@ class Link:
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, self._first_number + decision.packet, min(message.arrival_ns, now_ns),
-            now_ns, message.flow, Fate(decision.fate), decision.consecutive_losses,
+            self._inputs, self._first_number + decision.packet, now_ns, now_ns,
+            message.flow, Fate(decision.fate), decision.consecutive_losses,
             decision.release_ns, decision.copy_ns, decision.bit, len(message.data), head,
         )  # fmt: skip
         self._inputs += 1
