@@ -82,7 +82,7 @@ typedef struct { /* a run, or a part of one */
     double growth;    /* e^(rt) of the supremum, at the start of a piece */
 } exact_run;
 
-/* The code for a number of states; see simulator.h. */
+/* The code for a number of states; see states.c. */
 typedef struct {
     int64_t n, stride; /* states; doubles of a vector */
     void (*share)(exact_memory *memory);
