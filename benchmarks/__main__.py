@@ -1,60 +1,103 @@
 """Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE]``.
 
-Each file of this folder that declares a ``BENCHMARK`` is one, except those that begin with an
-underscore, which are parts and programs of others. ``--list`` lists them; the name ``goals`` stands
-for all that have the figures of ``goals.py``.
+The modules of this folder declare them (:func:`benchmarks.report.benchmark`). ``--list`` lists
+them. The name ``goals`` stands for those that have the figures which the project wants to reach
+(:data:`FIGURES`); they are printed once more at the end, and ``--docs docs/benchmarks.md`` writes
+them into the page, between two marks.
 """
 
 import argparse
 import json
+import os
 import pkgutil
+import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
+
+# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from rich.console import Console
 
-from benchmarks import goals
-from benchmarks._programs import provide
-from benchmarks._report import Benchmark, Load, MeasurementError, Row, table_of
+from benchmarks.programs import provide
+from benchmarks.report import BENCHMARKS, Benchmark, Load, MeasurementError, Row, table_of
 
 GOALS = "goals"
-_TABLE_WIDTH = 130
-"""Columns of a table, if the output is not a terminal."""
+BEGIN, END = "<!-- goals: written by `python -m benchmarks goals --docs` -->", "<!-- goals: end -->"
+_HEAD = (
+    "| figure | value | alternative in the same run | ratio | goal | holds |\n" + "|---" * 6 + "|"
+)
 
 
-def all_benchmarks() -> list[Benchmark]:
-    """Return the benchmarks of this folder."""
-    names = (found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)])
-             if not (found.ispkg or found.name.startswith("_")))  # fmt: skip
-    modules = (import_module(f"benchmarks.{name}") for name in names)
-    return [module.BENCHMARK for module in modules if hasattr(module, "BENCHMARK")]
+class Figure(NamedTuple):
+    """A figure of the goals: the rows of a benchmark whose whole names match."""
+
+    benchmark: str
+    rows: str
+    """A regular expression."""
+    name: str = ""
+    """Replaces the row's name."""
 
 
-def run(every: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
+FIGURES = (
+    Figure("latency", r"event → update, .*, p(50|99)"),
+    Figure("startup", "noack run → first control step", "`noack run` to the first control step"),
+    Figure("startup", "the first run of 20 loops, .*"),
+    Figure("clone", "make demo.*"),
+    Figure("simulation", ".* of the machines in virtual time", "the demo's 20 s in virtual time"),
+    Figure("long_run", "the same, by CPU time .*", "end of a run of 10 minutes, by CPU time"),
+    Figure("long_run", "of it, the replay"),
+    Figure("simulation", "replay of .*", "replay of 10 minutes at 500 Hz, from memory"),
+    Figure("long_run", "peak memory, .*"),
+    Figure("fleet", ".*: end of the run"),
+    Figure("fleet", ".*lateness p99, worst loop"),
+    Figure("fleet", ".*: CPU time per loop and step"),
+    Figure("simulation", ".*loops × runs of .*"),
+    Figure("batch", "lane_following, .*"),
+    Figure("simulation", "sampled runs.*"),
+    Figure("relays", "ours.*: drained"),
+    Figure("relay_delay", ".*added one way, p50"),
+    Figure("relay_flows", ".*reverse direction.*: cost"),
+    Figure("fleet", ".*: private memory of .*"),
+    Figure("size", ".*"),
+)
+OF_GOALS = tuple(dict.fromkeys(figure.benchmark for figure in FIGURES))
+
+
+def all_benchmarks() -> Mapping[str, Benchmark]:
+    """Return the benchmarks of this folder by name."""
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        if not module.name.startswith("_"):
+            import_module(f"benchmarks.{module.name}")
+    return dict(sorted(BENCHMARKS.items()))
+
+
+def run(benchmarks: Mapping[str, Benchmark], arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return 0 if all could be measured."""
-    benchmarks = {benchmark.name: benchmark for benchmark in every}
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--list", action="store_true", help="list the benchmarks, and end")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
     parser.add_argument("--docs", type=Path, metavar="FILE", help="write the goals into this page")
-    names = f"of {', '.join(benchmarks)}; {GOALS}: {', '.join(goals.BENCHMARKS)}"
+    names = f"of {', '.join(benchmarks)}; {GOALS}: {', '.join(OF_GOALS)}"
     parser.add_argument("names", nargs="*", metavar="NAME", help=names)
-    for benchmark in benchmarks.values():
-        benchmark.add_arguments(parser)
+    for one in benchmarks.values():
+        for option, settings in one.options.items():
+            parser.add_argument(option, **settings)
     options = parser.parse_args(arguments)
     if options.list:
         print("\n".join(f"{one.name:<20}{one.title}" for one in benchmarks.values()))
         return 0
     asked = options.names or [*benchmarks]
-    chosen = [name for one in asked for name in (goals.BENCHMARKS if one == GOALS else (one,))]
+    chosen = [name for one in asked for name in (OF_GOALS if one == GOALS else (one,))]
     if unknown := [name for name in chosen if name not in benchmarks]:
         parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(benchmarks)}")
     console = Console()
     if not console.is_terminal:
-        console.width = _TABLE_WIDTH
+        console.width = 130
     rows, failures = list[tuple[str, Row]](), 0
     for benchmark in (benchmark for name, benchmark in benchmarks.items() if name in chosen):
         found, failed = _measured(benchmark, options, console)
@@ -63,12 +106,12 @@ def run(every: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> i
     if options.json is not None:
         content = [row.as_json() | {"benchmark": name} for name, row in rows]
         options.json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    figures = goals.rows_of_figures(rows)
+    figures = rows_of_figures(rows)
     if GOALS in asked:
         console.print(table_of("The goals", [row for _, row in figures]))
     if options.docs is not None:
         try:
-            goals.write_docs(options.docs, figures)
+            write_docs(options.docs, figures)
         except MeasurementError as error:
             print(error, file=sys.stderr)
             return 1
@@ -82,16 +125,48 @@ def _measured(
     print(f"{benchmark.name}:", file=sys.stderr)
     load, begun_s, failed = Load(), time.monotonic(), False
     try:
-        rows = benchmark.measure(options)
+        rows = [*benchmark.measure(options)]
     except MeasurementError as error:
         failed = True
         rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
     rows += load.rows()
     console.print(table_of(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows))
     for row in rows:
-        if (note := row.as_json().get("note")) is not None:
-            console.print(f"{row.name}: {note}", highlight=False, markup=False)
+        if row.notes:
+            console.print(f"{row.name}: {row.notes}", highlight=False, markup=False)
     return rows, failed
+
+
+def rows_of_figures(rows: Sequence[tuple[str, Row]]) -> list[tuple[str, Row]]:
+    """Return name and row of each figure that has a goal, from (benchmark, row), in order."""
+    return [
+        (figure.name or row.name, row)
+        for figure in FIGURES
+        for benchmark, row in rows
+        if benchmark == figure.benchmark
+        and re.fullmatch(figure.rows, row.name)
+        and (row.goal is not None or row.value is None)
+    ]
+
+
+def write_docs(page: Path, figures: Iterable[tuple[str, Row]]) -> None:
+    """Replace the table of a page.
+
+    Raises:
+        MeasurementError: the page has not the two marks.
+    """
+    before, begin, rest = page.read_text(encoding="utf-8").partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise MeasurementError(f"{page}: the marks of the table are missing")
+    lines = [_HEAD]
+    for name, row in figures:
+        _, value, *peer, ratio, goal, holds = row.cells
+        alternative = ", ".join(filter(None, peer))
+        cells = (name, "not measured" if row.value is None else value, alternative, ratio, goal)
+        lines.append(f"| {' | '.join((*cells, holds))} |")
+    table = "\n".join(lines)
+    page.write_text(f"{before}{begin}\n{table}\n{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

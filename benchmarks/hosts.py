@@ -1,32 +1,340 @@
-"""The loop across two hosts, compared with the same processes on loopback.
+"""Two hosts: the bound of the offset between their clocks, and the loop across them.
 
-The hosts are two network namespaces with a veth link. Plant, sensor and network are on the first
-host, the controller is on the second. Both sides are runs by hand, without losses, in which every
-measurement is an event.
+The hosts are network namespaces with time namespaces, which a veth link connects: their monotonic
+clocks differ by a second, exactly, and the client's has an added drift, so that the true offset is
+known at any time. ``python -m benchmarks.hosts END EXCHANGE`` is one end of an exchange of
+timestamps (:class:`Exchange`, as JSON). The reference prints its port and answers until its
+standard input closes. The client compares its clock with the reference's and prints its figures as
+JSON; errors are those after the first half second. Both ends of a bare exchange are what a plain
+NTP client and server do: no authentication, timestamps of the program, and the newest midpoint as
+the offset, without a bound (RFC 5905).
 """
 
 import argparse
 import json
 import os
+import select
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from benchmarks._report import Benchmark, Goal, MeasurementError, Rounds, Row, say
-from benchmarks._runs import FREE_PORTS
-from benchmarks._two_hosts import TwoHosts, two_hosts
+import numpy as np
+
+from benchmarks.programs import FREE_PORTS, NOACK, TwoHosts, two_hosts
+from benchmarks.report import (
+    Figures,
+    Goal,
+    MeasurementError,
+    Rounds,
+    Row,
+    benchmark,
+    say,
+)
+from noack.core.clock import ClockOffset, Restart
+from noack.runtime.address import Address
+from noack.runtime.real_time_loop import realtime
+from noack.runtime.time_exchange import HostClocks, TimeClient, TimeReference, answering
+
+
+class DrivenClocks(HostClocks):
+    """The clocks of this host, with an added offset and drift of the monotonic clock.
+
+    Kernel stamps and the real-time clock have the same drift, as the clocks of a real host have.
+    """
+
+    def __init__(self, offset_ns: int = 0, drift_ppb: int = 0) -> None:
+        self._begin_ns = super().monotonic_ns()
+        self._real_begin_ns = super().realtime_ns()
+        self._offset_ns = offset_ns
+        self._drift_ppb = drift_ppb
+
+    def added_ns(self, true_ns: int) -> int:
+        """What is added to the monotonic clock at its own reading ``true_ns``."""
+        return self._offset_ns + self._drift_ppb * (true_ns - self._begin_ns) // 10**9
+
+    def monotonic_ns(self) -> int:
+        """The monotonic clock, with offset and drift."""
+        true_ns = super().monotonic_ns()
+        return true_ns + self.added_ns(true_ns)
+
+    def realtime_ns(self) -> int:
+        """The real-time clock, with the drift."""
+        return self._drifted(super().realtime_ns())
+
+    def stamp_ns(self, stamp: bytes) -> int:
+        """The time of a kernel stamp, with the drift."""
+        return self._drifted(super().stamp_ns(stamp))
+
+    def _drifted(self, real_ns: int) -> int:
+        return real_ns + self._drift_ppb * (real_ns - self._real_begin_ns) // 10**9
+
+
+KEY = bytes(range(32))
+CHECKS_AT_ONCE = 25
+_PRIORITY = 40
+_WAKE_S = 0.001
+_START_NS = 500_000_000
+_PACKET = struct.Struct("<qqq24x")  # 48 bytes, as NTP's
+
+
+class Bare:
+    """An end of a plain NTP exchange; the client takes the newest midpoint for the offset."""
+
+    def __init__(self, at: Address, clocks: DrivenClocks | None = None) -> None:
+        self._clocks = clocks
+        self._endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.midpoint_ns: int | None = None
+        if clocks is None:  # the reference
+            self._endpoint.bind(at)
+        else:
+            self._endpoint.connect(at)
+            self._endpoint.setblocking(False)
+
+    @property
+    def address(self) -> Address:
+        """Its own address."""
+        name: Address = self._endpoint.getsockname()
+        return name
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait for."""
+        return self._endpoint.fileno()
+
+    def answer_all(self) -> None:
+        """Answer the waiting request."""
+        data, source = self._endpoint.recvfrom(100)
+        received_ns = time.monotonic_ns()
+        sent_ns = _PACKET.unpack(data)[0]
+        self._endpoint.sendto(_PACKET.pack(sent_ns, received_ns, time.monotonic_ns()), source)
+
+    def poll(self) -> list[Restart]:
+        """Take the answer, or send a request if there is none."""
+        assert self._clocks is not None
+        try:
+            data = self._endpoint.recv(100)
+        except BlockingIOError:
+            self._endpoint.send(_PACKET.pack(self._clocks.monotonic_ns(), 0, 0))
+            return []
+        now_ns = self._clocks.monotonic_ns()
+        sent_ns, there_ns, answered_ns = _PACKET.unpack(data)
+        self.midpoint_ns = (there_ns - sent_ns + answered_ns - now_ns) // 2
+        return []
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._endpoint.close()
+
+
+class Exchange(NamedTuple):
+    """What one end does; what follows the port concerns the client."""
+
+    host: str
+    """Address of the reference."""
+    bare: bool = False
+    realtime: bool = True
+    """Whether it requests the real-time settings of a run."""
+    answer_every_s: float = 0.0
+    """The reference answers so often; 0: at once."""
+    port: int = 0
+    ahead_ns: int = 0
+    """The reference's clock minus this host's."""
+    drift_ppb: int = 0
+    rate_ppb: int = ClockOffset().rate_ppb
+    period_s: float = 0.02
+    seconds: float = 2.0
+    late: bool = False
+    """Whether it reads replies once a period only."""
+
+
+def run_reference(options: Exchange) -> None:
+    """Answer until the standard input closes."""
+    listen = (options.host, 0)
+    end = Bare(listen) if options.bare else TimeReference(listen, KEY)
+    with closing(end):
+        print(end.address[1], flush=True)
+        if isinstance(end, TimeReference) and not options.answer_every_s:
+            with answering(end):
+                sys.stdin.read()
+            return
+        while not select.select([sys.stdin], (), (), options.answer_every_s)[0]:
+            while select.select([end], (), (), 0 if options.answer_every_s else 0.1)[0]:
+                end.answer_all()
+
+
+def run_client(options: Exchange) -> None:
+    """Check the bound against the true offset for a time; print the figures."""
+    clocks = DrivenClocks(0, options.drift_ppb)
+    address = (options.host, options.port)
+    offset = ClockOffset(options.rate_ppb)
+    period_ns = round(options.period_s * 1e9)
+    bare = Bare(address, clocks) if options.bare else None
+    client = bare or TimeClient(address, KEY, offset, period_ns=period_ns, clocks=clocks)
+    errors_ns, estimates_ns = list[int](), list[int]()
+    checks = outside = restarts = 0
+    steady_ns = time.monotonic_ns() + _START_NS
+    end_ns = steady_ns + round(options.seconds * 1e9)
+    due_ns, turns, cpu_ns = 0, 0, 0
+    with closing(client):
+        while (now_ns := time.monotonic_ns()) < end_ns:
+            is_due = now_ns >= due_ns
+            readable, _, _ = select.select([client], (), (), 0 if is_due else _WAKE_S)
+            if is_due or (readable and not options.late):
+                begin_ns = time.thread_time_ns()
+                restarts += len(client.poll())
+                cpu_ns += time.thread_time_ns() - begin_ns
+            if is_due:
+                due_ns, turns = max(due_ns, now_ns - period_ns) + period_ns, turns + 1
+            for _ in range(CHECKS_AT_ONCE):
+                true_ns = time.monotonic_ns()
+                added_ns = clocks.added_ns(true_ns)
+                truth_ns = options.ahead_ns - added_ns
+                found = offset.interval(true_ns + added_ns)
+                estimate_ns = bare.midpoint_ns if bare else found and found.midpoint_ns
+                if found is not None:
+                    checks += 1
+                    outside += not found.lower_ns <= truth_ns <= found.upper_ns
+                if estimate_ns is not None and true_ns > steady_ns:
+                    estimates_ns.append(abs(estimate_ns - truth_ns))
+                    if found is not None:
+                        errors_ns.append(found.error_ns)
+    figures = {
+        "checks": checks, "outside": outside, "restarts": restarts, "turns": turns,
+        "exchanges": offset.exchanges, "cpu_us": cpu_ns / 1e3 / max(turns, 1),
+    }  # fmt: skip
+    print(
+        json.dumps(figures | _quantiles("error", errors_ns) | _quantiles("estimate", estimates_ns))
+    )
+
+
+def _quantiles(name: str, values_ns: Sequence[int]) -> dict[str, float]:
+    if not values_ns:
+        return {}
+    p50, p99, most = np.quantile(np.array(values_ns), (0.5, 0.99, 1)) / 1e3
+    return {f"{name}_p50_us": p50, f"{name}_p99_us": p99, f"{name}_max_us": most}
+
+
+def main() -> None:
+    """Run one end of an exchange."""
+    _, end, options = sys.argv
+    exchange = Exchange(**json.loads(options))
+    with realtime(exchange.realtime, _PRIORITY):
+        {"reference": run_reference, "client": run_client}[end](exchange)
+
+
+OURS, BARE = "noack", "plain NTP midpoint, no bound"
+SECONDS = 6.0
+_DEFAULT_ERROR = Goal("<=", 50)
+
+
+class Case(NamedTuple):
+    """A setting of the client and of the reference, and the names of its figures."""
+
+    name: str
+    settings: Mapping[str, float] = {}
+    """Fields of :class:`Exchange`."""
+    goal: Goal | None = None
+
+
+MAIN = Case("20 ms, replies read at once", goal=_DEFAULT_ERROR)
+CASES = (
+    Case("50 ms, replies read at once", {"period_s": 0.05}),
+    Case("50 ms, replies read 50 ms later", {"period_s": 0.05, "late": True}),
+    Case(
+        "50 ms, replies read 50 ms later, ρ = 201 ppm",
+        {"period_s": 0.05, "late": True, "rate_ppb": 201_000},
+        _DEFAULT_ERROR,
+    ),
+    Case("20 ms, reference answers every 50 ms", {"answer_every_s": 0.05}),
+)
+CLOCKS = [(ahead_s, drift_ppb) for ahead_s in (1, -1) for drift_ppb in (100_000, -100_000)]
+"""Seconds by which the client's clock is ahead, and its drift."""
+
+
+def measured(
+    hosts: TwoHosts, ahead_s: int, drift_ppb: int, case: Case, *, bare: bool = False,
+    seconds: float = SECONDS, realtime: bool = True, ip: int = 4,
+) -> Figures:  # fmt: skip
+    """Run a reference and a client on two hosts; return the client's figures.
+
+    Raises:
+        MeasurementError: one of them failed.
+    """
+    own = Exchange(
+        hosts.addresses[0][ip == 6], bare, realtime, ahead_ns=-ahead_s * 10**9,
+        drift_ppb=drift_ppb, seconds=seconds,
+    )._asdict() | case.settings  # fmt: skip
+
+    def command(end: str, port: int = 0) -> list[str]:
+        program = (sys.executable, "-m", "benchmarks.hosts", end, json.dumps(own | {"port": port}))
+        is_client = end == "client"
+        return hosts.inside(is_client, *program, monotonic_s=ahead_s * is_client)
+
+    with subprocess.Popen(
+        command("reference"), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as reference:
+        assert reference.stdout is not None
+        port = reference.stdout.readline().strip()
+        if not port:
+            raise MeasurementError("the reference did not start")
+        client = subprocess.run(
+            command("client", int(port)), capture_output=True, text=True, check=False
+        )
+        reference.communicate()
+    if client.returncode:
+        raise MeasurementError(f"the client failed: {client.stderr.strip().splitlines()[-1:]}")
+    found: Figures = json.loads(client.stdout)
+    return found
+
+
+@benchmark("clock_offset_bound", "Bound of the offset between two clocks")
+def clock_offset_bound(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure both sides in turn with each clock, then the other settings.
+
+    The programs request the real-time settings of a run. The alternative is a plain NTP exchange in
+    Python: the newest midpoint, without a bound, authentication or kernel timestamps.
+    """
+    rounds, others = Rounds(), [(case, Rounds()) for case in CASES]
+    with two_hosts() as hosts:
+        for ahead_s, drift_ppb in CLOCKS:
+            say(f"client {ahead_s:+} s, {drift_ppb / 1000:+.0f} ppm")
+            rounds.add(BARE, measured(hosts, ahead_s, drift_ppb, MAIN, bare=True))
+            rounds.add(OURS, measured(hosts, ahead_s, drift_ppb, MAIN))
+        for case, found in others:
+            say(case.name)
+            found.add(OURS, measured(hosts, *CLOCKS[0], case))
+    cases = [(MAIN, rounds), *others]
+    checks, outside = (
+        sum(sum(one.of(OURS, name)) for _, one in cases) for name in ("checks", "outside")
+    )
+    yield Row("checks of the bound against the true offset", checks, "", goal=Goal(">=", 1e5))
+    yield Row("true offset outside the bound", outside, "", goal=Goal("==", 0))
+    for case, found in cases:
+        note = f"largest: {max(found.of(OURS, 'error_max_us')):.0f} µs"
+        for q in ("p50", "p99"):
+            name = f"error bound, {q}, {case.name}"
+            yield found.row(name, "µs", f"error_{q}_us", OURS, goal=case.goal, note=note)
+    for quantity, name in (
+        ("estimate_p50_us", "error of the estimate, p50"),
+        ("estimate_p99_us", "error of the estimate, p99"),
+        ("cpu_us", "client's CPU per 20 ms"),
+    ):
+        yield rounds.row(name, "µs", quantity, OURS, BARE)
+
 
 ROUNDS = 3
-ACROSS, LOOPBACK = "noack across a veth link", "noack on loopback"
+ACROSS, ON_LOOPBACK = "noack across a veth link", "noack on loopback"
 _PATIENCE_S = 120.0
 _SETTINGS = (
     *FREE_PORTS, "--set", "horizon_s=10", "--set", "trigger.beta=1e-9",
     "--set", 'network.loss={model="lossless"}', "--no-report",
 )  # fmt: skip
-_AT_HOME, _AWAY = ("plant", "sensor", "netem"), ("controller",)
 
 
 def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
@@ -39,7 +347,7 @@ def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
         folder = Path(name)
 
         def start(host: int, *arguments: str) -> subprocess.Popen[str]:
-            command = [sys.executable, "-m", "cosim.cli", *arguments]
+            command = [*NOACK, *arguments]
             if hosts is not None:
                 command = hosts.inside(host, *command)
             process = subprocess.Popen(
@@ -53,8 +361,8 @@ def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
         listen = () if hosts is None else ("--listen", hosts.addresses[0][0])
         invited = () if hosts is None else ("--invitation", "invitation.json")
         recording = start(0, "record", "lane_following", "--json", *listen, *_SETTINGS)
-        joining = [start(0, role) for role in _AT_HOME]
-        joining += [start(1, role, *invited) for role in _AWAY]
+        joining = [start(0, role) for role in ("plant", "sensor", "netem")]
+        joining.append(start(1, "controller", *invited))
         stdout, stderr = recording.communicate(timeout=_PATIENCE_S)
         for process in joining:
             stderr += process.communicate(timeout=_PATIENCE_S)[1]
@@ -64,23 +372,26 @@ def run_by_hand(hosts: TwoHosts | None) -> dict[str, Any]:
         return summary
 
 
-def measure(_: argparse.Namespace) -> list[Row]:
-    """Measure both sides in turn."""
+@benchmark("hosts", "The loop across two hosts")
+def across_hosts(options: argparse.Namespace) -> Iterator[Row]:
+    """Compare the loop across two hosts with the same processes on loopback.
+
+    Plant, sensor and network are on the first host, the controller is on the second. Both sides are
+    runs by hand, without losses, in which every measurement is an event.
+    """
     rounds = Rounds()
     with two_hosts() as hosts:
         for number in range(ROUNDS):
             say(f"round {number + 1} of {ROUNDS}")
-            for side, place in ((LOOPBACK, None), (ACROSS, hosts)):
-                found = run_by_hand(place)["latency_us"]
-                rounds.add(side, {key: found[key] for key in ("p50", "p99", "updates")})
-    updates = sum(rounds.of(ACROSS, "updates"))
-    return [
-        rounds.row(
-            f"event → update, {quantile}", "µs", quantile, ACROSS, LOOPBACK, Goal("<=", 1.5),
-            note=f"{updates:.0f} updates", paired=True,
-        )
-        for quantile in ("p50", "p99")
-    ]  # fmt: skip
+            for side, place in ((ON_LOOPBACK, None), (ACROSS, hosts)):
+                (loop,) = run_by_hand(place)["loops"]
+                keys = ("p50", "p99", "updates")
+                rounds.add(side, {key: loop["latency_us"][key] for key in keys})
+    note = f"{sum(rounds.of(ACROSS, 'updates')):.0f} updates"
+    for quantile in ("p50", "p99"):
+        yield rounds.row(f"event → update, {quantile}", "µs", quantile, ACROSS, ON_LOOPBACK,
+                         Goal("<=", 1.5), note=note, paired=True)  # fmt: skip
 
 
-BENCHMARK = Benchmark("hosts", "The loop across two hosts", measure)
+if __name__ == "__main__":
+    main()

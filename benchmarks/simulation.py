@@ -1,58 +1,140 @@
-"""The simulators beside scipy's integrator, live runs and earlier versions; certificates.
+"""The simulators beside scipy's integrator, live runs and earlier versions; plants; campaigns.
 
-The exact simulator and the integrator run the paper's example in continuous time with the same
-packet fates. The integrator's accuracy is set so that its event times agree to 1e-8 s.
+The exact simulators and the integrator run the paper's example in continuous time with the same
+packet fates. The event times of both are compared: figures of an integrator that does not agree
+count for nothing.
 """
 
 import argparse
-import os
-
-# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
-os.environ["OPENBLAS_NUM_THREADS"] = "1"
+import contextlib
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
-from benchmarks._report import Benchmark, Goal, Peer, Row, compared, cpu_ms, per_cpu_s
-from benchmarks.batch import apart_s, integrated
+from benchmarks.bare_programs import PRIORITY
+from benchmarks.programs import NOACK
+from benchmarks.report import (
+    Goal,
+    MeasurementError,
+    Peer,
+    Row,
+    Side,
+    benchmark,
+    compared,
+    cpu_ms,
+    median,
+    per_cpu_s,
+    say,
+)
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
-from cosim.simulation.batch import Population, setting_of
+from cosim.shipped_files import find_shipped
+from cosim.simulation.batch import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
+from cosim.studies.campaign import campaign_file
+from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.campaign_workers import local
+from cosim.studies.campaign.chunk_store import Store, run_campaign
+from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
+from noack.config.sections import PLANTS, POLICIES
+from noack.core.clock import NS_PER_S
+from noack.core.core_library import core, ffi
+from noack.core.linear_systems import Vector
+from noack.protocol.record_tables import PLANT_STEP
+from noack.protocol.wire_format import Flow
+from noack.runtime.real_time_loop import realtime
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
+from plant_server.plant import plants_of
 
-_RTOL, _AGREEMENT_S = 1e-10, 1e-8
+
+def integrated(
+    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: str,
+    rtol: float = 1e-8,
+) -> list[float]:  # fmt: skip
+    """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
+    A, B, x = draw.A[0], draw.B[0], draw.x0[0]
+    n, trigger = len(x), setting.trigger
+    field = np.zeros((3 * n, 3 * n))
+    field[:n, :n], field[:n, 2 * n :] = A, B @ setting.K
+    field[n : 2 * n, n : 2 * n] = field[2 * n :, 2 * n :] = setting.H
+
+    def excess(t_s: float, z: Vector) -> float:
+        error = float(np.linalg.norm(z[n : 2 * n] - z[:n]))
+        return error - trigger.level * float(np.exp(-trigger.rate_per_s * t_s))
+
+    excess.terminal, excess.direction = True, 1.0  # type: ignore[attr-defined]
+    t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
+    while True:
+        solution = solve_ivp(
+            lambda _, z: field @ z, (t_s, setting.horizon_s), z,
+            method=method, events=excess, rtol=rtol, atol=1e-2 * rtol,
+        )  # fmt: skip
+        if not len(solution.t_events[0]):
+            return found
+        t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
+        z[n : 2 * n] = z[:n]
+        if delivered[len(found)]:
+            z[2 * n :] = z[:n]
+        found.append(t_s)
+
+
+def beside_scipy(
+    name: str, unit: str, ours: Side, peer: tuple[str, Side], error_s: float, agreement_s: float,
+    goal: Goal | None,
+) -> Row:  # fmt: skip
+    """Compare a simulator with the integrator, whose event times differ by at most ``error_s``."""
+    return compared(
+        name, unit, ours, (f"solve_ivp, {peer[0]}", peer[1]), goal,
+        note=f"event times differ by {error_s:.1g} s from those of {peer[0]}",
+        unjudged=None if error_s <= agreement_s else "the two do not agree",
+    )  # fmt: skip
+
+
+def apart_s(found: Vector, expected: list[float]) -> float:
+    """Return the largest difference of event times; infinite if their numbers differ."""
+    same = len(found) == len(expected)
+    return float(np.abs(np.subtract(found, expected)).max()) if same else np.inf
+
+
 _LOOPS, _LOOPS_HZ, _LOOPS_S = 50, 50.0, 10.0
 _REPLAYED_S = 600.0
 _SAMPLED_RUNS, _PYTHON_MACHINES_S = 20, 0.71
 
 
 def continuous_row(scenario: Scenario) -> Row:
-    """A run in continuous time."""
+    """A run in continuous time; the integrator's accuracy is such that event times agree."""
     system, fate = continuous_loop_of(scenario), network_fates(scenario)
     fates, loop = [fate(i) for i in range(1000)], system.loop
     draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.zeros(1, np.uint64))
-    setting, horizon_s = setting_of(scenario), scenario.horizon_s
+    setting, horizon_s, rtol = setting_of(scenario), scenario.horizon_s, 1e-10
 
-    def ours() -> np.ndarray:
+    def ours() -> Vector:
         run = simulate_continuous(system, horizon_s=horizon_s, delivered=fates, known_start=False)
         return run.event_s
 
     def theirs() -> list[float]:
-        return integrated(setting, draw, np.array(fates), "DOP853", _RTOL)
+        return integrated(setting, draw, np.array(fates), "DOP853", rtol)
 
-    found, error_s = ours(), apart_s(ours(), theirs())
-    return compared(
+    return beside_scipy(
         f"{horizon_s:g} s in continuous time", "ms", cpu_ms(ours),
-        (f"solve_ivp, DOP853, rtol {_RTOL:g}", cpu_ms(theirs)), Goal("<=", 0.1),
-        note=f"{len(found)} events; event times differ by {error_s:.1g} s at most",
-        unjudged=None if error_s <= _AGREEMENT_S else "the two do not agree",
+        (f"DOP853, rtol {rtol:g}", cpu_ms(theirs)), apart_s(ours(), theirs()), 1e-8,
+        Goal("<=", 0.1),
     )  # fmt: skip
 
 
@@ -76,40 +158,256 @@ def sampled_runs(loop: SampledLoop) -> None:
         loop.update(runs, runs.is_event)
 
 
-def replay_row(scenario: Scenario) -> Row:
-    """The replay of a long run, in memory."""
-    record = simulate(scenario.model_copy(update={"horizon_s": _REPLAYED_S}))
-    found = replay(record)
-    return compared(
-        f"replay of {_REPLAYED_S:g} s, {found.inputs:,} inputs", "× real time",
-        per_cpu_s(_REPLAYED_S, lambda: replay(record)), goal=Goal(">=", 2000), rounds=3,
-        unjudged=None if found.bit_exact else "the replay is not bit-exact",
-    )  # fmt: skip
-
-
-def measure(options: argparse.Namespace) -> list[Row]:
-    """Measure the paper's example."""
+@benchmark("simulation", "Simulation and certificates")
+def simulation(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure the simulators, a replay and a certificate with the paper's example."""
     lane = resolve(load(find_scenario("lane_following"), ()))
     horizon_s, many, loop = lane.horizon_s, many_loops(lane), SampledLoop(lane)
     conditions = ideal_conditions(lane)
     work = SampledWork(in_virtual_time(lane), 0, None, None, 0.05, 10**6)
     live = Peer("the live run", 1e3 * horizon_s / lane.speed)
     earlier = Peer("the Python machines of b3991367 in virtual time", 1 / _PYTHON_MACHINES_S)
-    return [
-        continuous_row(lane),
-        compared(f"{horizon_s:g} s of the machines in virtual time", "ms",
-                 cpu_ms(lambda: simulate(lane)), live, Goal("<=", 1e-3)),
-        compared(
-            f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU",
-            "/s", per_cpu_s(_LOOPS, lambda: simulate_loops(many)), goal=Goal(">=", 3000)),
-        compared(f"sampled runs of {horizon_s:g} s on one core", "/s",
-                 per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)), earlier, Goal(">=", 100),
-                 note="the alternative was measured with that version, not in this run"),
-        compared("draws of a campaign in sampled time", "runs/s",
-                 per_cpu_s(4, lambda: work.run(range(4)))),
-        replay_row(lane),
-        compared("certificate", "ms", cpu_ms(lambda: certify(lane, conditions))),
-    ]  # fmt: skip
+    yield continuous_row(lane)
+    machines = cpu_ms(lambda: simulate(lane))
+    name = f"{horizon_s:g} s of the machines in virtual time"
+    yield compared(name, "ms", machines, live, Goal("<=", 1e-3))
+    yield compared(
+        f"{_LOOPS} loops at {_LOOPS_HZ:g} Hz: loops × runs of {_LOOPS_S:g} s per second of CPU",
+        "/s",
+        per_cpu_s(_LOOPS, lambda: simulate_loops(many)),
+        goal=Goal(">=", 3000),
+    )
+    yield compared(
+        f"sampled runs of {horizon_s:g} s on one core", "/s",
+        per_cpu_s(_SAMPLED_RUNS, lambda: sampled_runs(loop)), earlier, Goal(">=", 100),
+        note="the alternative was measured with that version, not in this run",
+    )  # fmt: skip
+    draws = per_cpu_s(4, lambda: work.run(range(4)))
+    yield compared("draws of a campaign in sampled time", "runs/s", draws)
+    record = simulate(lane.model_copy(update={"horizon_s": _REPLAYED_S}))
+    replayed = replay(record)
+    yield compared(
+        f"replay of {_REPLAYED_S:g} s, {replayed.inputs:,} inputs", "× real time",
+        per_cpu_s(_REPLAYED_S, lambda: replay(record)), goal=Goal(">=", 2000), rounds=3,
+        unjudged=None if replayed.bit_exact else "the replay is not bit-exact",
+    )  # fmt: skip
+    yield compared("certificate", "ms", cpu_ms(lambda: certify(lane, conditions)))
 
 
-BENCHMARK = Benchmark("simulation", "Simulation and certificates", measure)
+DRAWS = 200
+"""Number of different plants and losses; a batch repeats them."""
+ENGINE = {"model": 40, "zoh": 8}
+"""Repetitions of the draws in a batch."""
+INTEGRATED = {"model": 20, "zoh": 3}
+"""Runs of the integrator in a round."""
+_FASTEST = {"model": 20_000.0, "zoh": 3_000.0}
+_AGREEMENT_S = 1e-4
+"""Accumulated effect of the integrator's errors of 1e-8 over hundreds of events."""
+
+
+def drawn(mode: str, trigger: Mapping[str, Any] | None = None) -> tuple[Setting, Population]:
+    """Return draws of the lane example, by default with the paper's trigger."""
+    content = load(find_scenario("lane_following"), ()).model_dump(mode="json", exclude_none=True)
+    changes = {"mode": mode} | ({} if trigger is None else {"trigger": trigger})
+    scenario = validate(content | changes, "lane_following")
+    return setting_of(resolve(scenario)), box_of(scenario).population(0, range(DRAWS))
+
+
+def batch_rows(mode: str) -> list[Row]:
+    """Return the rows of a mode: the engine beside the integrator's default, and its fastest."""
+    setting, population = drawn(mode)
+    rows, events = run_with_events(setting, population)
+    draws = [Population(*(part[i : i + 1] for part in population)) for i in range(DRAWS)]
+    batch = Population(*(np.concatenate([part] * ENGINE[mode]) for part in population))
+    few = range(INTEGRATED[mode])
+    engine = per_cpu_s(len(batch.A), lambda: run_batch(setting, batch))
+    name, found = f"lane_following, {setting.horizon_s:g} s, {mode}", list[Row]()
+    for method, goal in (("RK45", Goal(">=", 1000)), ("DOP853", None)):
+
+        def integrate(method: str = method) -> list[list[float]]:
+            # The last event has no fate that matters.
+            fates = [np.append(events[i].delivered, False) for i in few]
+            return [integrated(setting, draws[i], fates[i], method) for i in few]
+
+        error_s = max(map(apart_s, (events[i].event_s for i in few), integrate()))
+        peer = f"{method}, rtol 1e-8", per_cpu_s(len(few), integrate)
+        found.append(beside_scipy(name, "runs/s", engine, peer, error_s, _AGREEMENT_S, goal))
+    value = median(row.value for row in found if row.value is not None)
+    note = f"{rows['transmissions'].mean():.0f} events a run"
+    return [Row(name, value, "runs/s", goal=Goal(">=", _FASTEST[mode]), note=note), *found]
+
+
+@benchmark("batch", "Exact runs of a batch, one core")
+def batches(options: argparse.Namespace) -> Iterator[Row]:
+    """Compare the batch engine with what a user would write, in runs per second on one core.
+
+    Both sides use the same draws of the lane example: the engine, and scipy's integrator with an
+    event function, at rtol 1e-8. The engine also measures each run (cost, settling time, supremum
+    of the error); the integrator only finds the events. Then each policy but the paper's (model
+    mode) is compared with the paper's; one with which the events may accumulate is only measured
+    with a dwell time.
+    """
+    yield from batch_rows("model")
+    yield from batch_rows("zoh")
+    paper = drawn("model")
+    for name, settings in POLICIES.items():
+        example = settings.example(4)
+        if name == "decaying" or example is None or example.events_may_accumulate:
+            continue
+        trigger = example.model_dump(mode="json", exclude_none=True)
+        whole = f"{name} of {trigger['rule']['policy']}" if "rule" in trigger else name
+        other = drawn("model", trigger)
+        side, peer = (per_cpu_s(DRAWS, lambda run=run: run_batch(*run)) for run in (other, paper))
+        yield compared(f"model, {whole}", "runs/s", side, ("decaying", peer))
+
+
+STEPS = 7500
+"""Maximum number: the whole scenario of the vehicles, whose slow steps are at its end."""
+_PACE_NS = 2_000_000
+_LINEAR = "lane_following"
+
+
+def plant_cases() -> Iterator[tuple[str, Scenario]]:
+    """Yield name and resolved scenario of each kind of plant, except the linear one."""
+    for kind, settings in PLANTS.items():
+        for variant in settings.variants if settings.scenario not in (None, _LINEAR) else ():
+            changes = [f"plant.system.{key}={value}" for key, value in variant.items()]
+            scenario = resolve(load(find_scenario(settings.scenario or ""), changes))
+            yield ", ".join((kind, *map(str, variant.values()))), scenario
+
+
+def steps_us(scenario: Scenario, count: int) -> Iterator[float]:
+    """Make the steps of a simulated run one by one; yield the CPU time of each, µs."""
+    period_ns = scenario.timing.plant_period_ns
+    horizon_s = min(scenario.horizon_s, count * period_ns / NS_PER_S)
+    record = simulate(scenario.model_copy(update={"horizon_s": horizon_s}))
+    plant = plants_of((scenario,))
+    for step, u in enumerate(record[PLANT_STEP]["u"]):
+        t_ns = step * period_ns
+        core.noack_process_handle(plant.core, ffi.new("noack_message *", {
+            "flow": Flow.ACTUATION, "sequence": step, "t_ns": t_ns,
+            "entries": len(u), "vector": u.tolist(),
+        }), t_ns)  # fmt: skip
+        begun_ns = time.thread_time_ns()
+        while (question := core.noack_process_tick(plant.core, t_ns)) != core.NOACK_DONE:
+            plant.answer(question)
+        plant.take_rows()
+        yield (time.thread_time_ns() - begun_ns) / 1e3
+
+
+def timed_steps(
+    scenario: Scenario, count: int = STEPS, pace_ns: int = _PACE_NS, *, asked: bool = True
+) -> list[tuple[float, ...]]:
+    """Make steps of a scenario and of a linear plant in turn; return the µs of both."""
+    sides = steps_us(scenario, count), steps_us(resolve(load(find_scenario(_LINEAR))), count)
+    found = []
+    with realtime(asked, PRIORITY):
+        due_ns = time.monotonic_ns()
+        for pair in zip(*sides, strict=False):
+            found.append(pair)
+            due_ns += pace_ns
+            time.sleep(max(due_ns - time.monotonic_ns(), 0) / NS_PER_S)
+    return found[1:]  # the first step has length 0
+
+
+def plant_rows(name: str, scenario: Scenario, found: Sequence[tuple[float, ...]]) -> Iterator[Row]:
+    """Yield the rows of a case: median, p99, and p99 as a share of the period in wall time."""
+    period_us = scenario.timing.plant_period_ns / scenario.speed / 1e3
+    p50, p99 = np.quantile(np.array(found), (0.5, 0.99), axis=0).tolist()
+    yield Row(f"{name}: p50", p50[0], "µs/step", Peer("linear plant", p50[1]))
+    yield Row(f"{name}: p99", p99[0], "µs/step", Peer("linear plant", p99[1]))
+    yield Row(f"{name}: p99, of {period_us / 1e3:g} ms", 100 * p99[0] / period_us, "%",
+              goal=Goal("<", 20.0))  # fmt: skip
+
+
+@benchmark("plants", "Cost per step of the plants")
+def plants(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure the cost per step of each plant in its loop, beside a linear plant and its period.
+
+    The inputs are those of a simulated run of its scenario. Plant and linear plant take turns, a
+    pair every 2 ms and with the real-time settings, so that the processor's caches are as in a run.
+    Figures are the thread's CPU time, which excludes other load of the machine.
+    """
+    for name, scenario in plant_cases():
+        say(name)
+        yield from plant_rows(name, scenario, timed_steps(scenario, STEPS))
+
+
+CAMPAIGN = "mb_vs_zoh"
+SHARED_DRAWS = 40_000
+"""Draws per grid point of the rounds; enough to make the start of processes negligible."""
+_LOOK_EVERY_S = 0.5
+
+
+def runs_per_s(workers: int) -> float:
+    """Return the throughput of the campaign with this number of workers."""
+    path = find_shipped(CAMPAIGN, "campaigns")
+    plan = campaign_file.load(path)
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(Path(folder), grid(plan, path), SHARED_DRAWS, plan.chunk)
+        begun_s = time.perf_counter()
+        with local(workers) as runner:
+            made = run_campaign(store, runner)
+        return made / (time.perf_counter() - begun_s)
+
+
+def whole_campaign(draws: int) -> tuple[float, float]:
+    """Return seconds and peak MiB of the command; shared pages count once.
+
+    Raises:
+        MeasurementError: it failed.
+    """
+    peak_mib, ended = 0.0, threading.Event()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [*NOACK, "campaign", CAMPAIGN, "--json", "--draws", str(draws), "--out", folder]
+        begun_s = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+
+        def follow() -> None:
+            nonlocal peak_mib
+            first = psutil.Process(process.pid)
+            while not ended.wait(_LOOK_EVERY_S):
+                used = 0
+                with contextlib.suppress(psutil.Error):
+                    for one in (first, *first.children(recursive=True)):
+                        with contextlib.suppress(psutil.Error):
+                            used += one.memory_full_info().pss
+                peak_mib = max(peak_mib, used / 2**20)
+
+        follower = threading.Thread(target=follow, daemon=True)
+        follower.start()
+        said = process.communicate()[1]
+        spent_s = time.perf_counter() - begun_s
+        ended.set()
+        follower.join()
+    if process.returncode != 0:
+        raise MeasurementError(f"noack campaign {CAMPAIGN}: {said.strip().splitlines()[-1:]}")
+    return spent_s, peak_mib
+
+
+@benchmark(
+    "campaign", "A million runs",
+    {"--campaign-draws": {
+        "type": int, "default": 100_000, "metavar": "N",
+        "help": "draws of the whole campaign at each of its grid points (100000: a million runs)",
+    }},
+)  # fmt: skip
+def campaign(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure the speed-up of a shipped campaign by a second worker, then a million runs.
+
+    In a round, one and then two workers run the same draws, timed from the start of the first
+    process to the last written file. The million runs are the user's command, with summary and
+    page.
+    """
+    yield compared(
+        f"{CAMPAIGN}, two workers", "runs/s", lambda: runs_per_s(2),
+        ("one worker", lambda: runs_per_s(1)), Goal(">=", 1.8), rounds=3,
+    )  # fmt: skip
+    path, draws = find_shipped(CAMPAIGN, "campaigns"), options.campaign_draws
+    runs = f"{len(grid(campaign_file.load(path), path)) * draws:,} runs"
+    say(runs)
+    spent_s, peak_mib = whole_campaign(draws)
+    yield Row(f"noack campaign {CAMPAIGN} --draws {draws}", spent_s, "s", note=runs)
+    yield Row("the same: peak memory of all its processes", peak_mib, "MiB", goal=Goal("<=", 1024))

@@ -32,7 +32,7 @@ from noack.config.scenario import Scenario
 from noack.config.sections import PlantSection
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_memory import CoreMemory, Structure, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
@@ -95,8 +95,10 @@ class MeasurementModel:
 INPUT_NAMES = {"hold": "held", "zero": "0", "model": "the model's"}
 """The input that each policy applies, in words."""
 _POLICIES = {
-    "hold": core.NOACK_HOLD, "zero": core.NOACK_ZERO, "model": core.NOACK_PREDICT,
-}  # fmt: skip
+    "hold": core.NOACK_HOLD,
+    "zero": core.NOACK_ZERO,
+    "model": core.NOACK_PREDICT,
+}
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ class Watchdog:
         """Whether actuations carry the controller's model state."""
         return self.policy == "model"
 
-    def fill(self, plant: Any, memory: CoreMemory, period_ns: int) -> None:
+    def fill(self, plant: Structure, memory: CoreMemory, period_ns: int) -> None:
         """Fill the watchdog of a ``noack_plant`` with this step."""
         memory.fill(plant, {
             "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
@@ -130,7 +132,7 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
     return t_ns - newest_ns > timeout_ns
 
 
-def watchdog_notice(watchdog: Watchdog, note: Any) -> Notice:
+def watchdog_notice(watchdog: Watchdog, note: Structure) -> Notice:
     """Return the line for the log of a ``noack_note``."""
     t_ns, since_ns, newest_ns = (int(note[name]) for name in ("t_ns", "since_ns", "newest_ns"))
     if since_ns >= 0:
@@ -192,7 +194,7 @@ class Plant:
             disturbed_input=d > 0, disturbed_state=w > 0,
         )  # fmt: skip
 
-    def fill(self, plant: Any, memory: CoreMemory) -> None:
+    def fill(self, plant: Structure, memory: CoreMemory) -> None:
         """Fill a ``noack_plant`` at time 0."""
         n, m, shape = len(self.system.x), self.inputs, self.shape
         set_machine(
@@ -222,13 +224,15 @@ class Plant:
         widths = (0, 0) if self.disturbance is None else self.disturbance.widths
         noisy = self.measuring is not None and self.measuring.is_noisy
         for name, width in (
-            ("at_input", widths[0]), ("at_state", widths[1]), ("noise", plant.p * noisy),
-        ):  # fmt: skip
+            ("at_input", widths[0]),
+            ("at_state", widths[1]),
+            ("noise", plant.p * noisy),
+        ):
             signal = getattr(plant, name)
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
 
-    def redraw(self, plant: Any, memory: CoreMemory) -> None:
+    def redraw(self, plant: Structure, memory: CoreMemory) -> None:
         """Set the state, and the matrices of a linear system."""
         n, system = plant.machine.n, self.system
         reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
@@ -236,7 +240,7 @@ class Plant:
             Ad, Bd = discretise(system.A, system.B, self.period_ns)
             reals_at(plant.Ad, n, n)[:], reals_at(plant.Bd, n, plant.sources)[:] = Ad, Bd
 
-    def answer(self, question: int, plant: Any) -> Sequence[Notice]:
+    def answer(self, question: int, plant: Structure) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""
         if question == core.NOACK_ASK_SIGNALS:
             self._set_signals(plant)
@@ -260,11 +264,11 @@ class Plant:
         """Received actuations need no line in the log."""
         return ()
 
-    def note(self, plant: Any, note: Any) -> Notice:
+    def note(self, plant: Structure, note: Structure) -> Notice:
         """Return the line about actuations that are missing, or arrive again."""
         return watchdog_notice(self.watchdog, note)
 
-    def _set_signals(self, plant: Any) -> None:
+    def _set_signals(self, plant: Structure) -> None:
         step = plant.machine.step
         first = step - step % BLOCK
         if self.disturbance is not None:
@@ -312,9 +316,11 @@ def _redrawn(plant: Plant, resolved: Scenario) -> Plant:
     if is_repeated and plant.disturbance is None and plant.measuring is None:
         return plant
     return replace(
-        plant, system=system_of(resolved), disturbance=disturbance_of(resolved),
+        plant,
+        system=system_of(resolved),
+        disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
-    )  # fmt: skip
+    )
 
 
 def system_of(resolved: Scenario) -> PlantSystem:
@@ -361,13 +367,8 @@ def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
     settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
     if settings.selects_all(n) and not settings.is_noisy:
         return None
-    p = resolved.message_sizes.outputs
-    std, bound = (
-        np.zeros(p) if given is None else np.array(given)
-        for given in (settings.noise_std, settings.noise_bound)
-    )
     C = None if settings.selects_all(n) else np.array(settings.C)
-    return MeasurementModel(C, std, bound, resolved.seeds.noise)
+    return MeasurementModel(C, *settings.noise(n), resolved.seeds.noise)
 
 
 def watchdog_of(resolved: Scenario) -> Watchdog:

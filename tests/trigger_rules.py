@@ -1,32 +1,116 @@
 """Trigger rules of n states by numbers, which tests need without a model."""
 
-from typing import Any
+import json
 
 import numpy as np
 
 from noack.config.sections import POLICIES
 from noack.core.linear_systems import Matrix
-from noack.trigger.deadline import with_deadline as with_deadline
-from noack.trigger.dwell import with_dwell_time as with_dwell_time
-from noack.trigger.dynamic import DynamicSettings
-from noack.trigger.dynamic import dynamic_rule as given_dynamic_rule
-from noack.trigger.lyapunov import lyapunov_rule as given_lyapunov_rule
+from noack.settings.section import Table
 from noack.trigger.mixed import mixed_rule as given_mixed_rule
+from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import (
     NEVER_NS,
     Forecast,
+    QuadraticForm,
     TriggerRule,
+    empty_map,
     error_form,
     no_form,
     quadratic_form,
+    require_rule,
+    state_map,
 )
 
-EXAMPLES: dict[str, dict[str, Any]] = {
+EXAMPLES: dict[str, Table] = {
     name: example.model_dump(mode="json", exclude_none=True)
     for name, made in POLICIES.items()
     if (example := made.example(2)) is not None
 }
 """The table of each policy that is a rule, for two states."""
+
+
+DECAYING = {"policy": "decaying", "beta": 0.2, "alpha_per_s": 0.5, "floor": (0.0, 0.1, 1.0)}
+MIXED = {"policy": "mixed", "sigma": 0.05, "epsilon": (0.003, 0.02, 0.05)}
+AREA = {"policy": "send_on_area", "delta_s": 0.01}
+LYAPUNOV = {"policy": "lyapunov", "rate_per_s": 1.2}
+DYNAMIC = {
+    "policy": "dynamic", "sigma": 0.1, "theta_s": (0.01, 0.5), "decay_per_s": (0.0, 1.0, 30.0),
+    "eta_0": (0.0, 0.05),
+}  # fmt: skip
+QUADRATIC = {
+    "policy": "quadratic", "period_s": (0.1, 0.007, 0.033), "epsilon": (0.0, 1e-4),
+    "heartbeat": (0, 6),
+}  # fmt: skip
+SELF_TRIGGERED = {
+    "policy": "self_triggered", "beta": 0.3, "alpha_per_s": 0.5, "floor": 0.01,
+    "growth_per_s": (0.0, 2.0), "mismatch_per_s": 1.0, "disturbance_per_s": 0.1,
+    "shortest_s": 0.01, "longest_s": 1.0,
+}  # fmt: skip
+
+
+def dwell(rule: Table, interval_s: float) -> Table:
+    return {"policy": "dwell", "interval_s": interval_s, "rule": rule}
+
+
+def deadline(rule: Table, interval_s: float) -> Table:
+    return {"policy": "deadline", "interval_s": interval_s, "rule": rule}
+
+
+TABLES: dict[str, Table] = {
+    "decaying": DECAYING,
+    "absolute": {"policy": "absolute", "delta": 0.01},
+    "relative": {"policy": "relative", "sigma": (0.01, 0.03, 0.05)},
+    "mixed": MIXED,
+    "send_on_area": AREA,
+    "dwell of send_on_area": dwell(AREA, 0.12),
+    "lyapunov": LYAPUNOV,
+    "dynamic": DYNAMIC,
+    "quadratic": QUADRATIC,
+    "periodic": {"policy": "periodic", "period_s": 0.1},
+    "self_triggered": SELF_TRIGGERED,
+    "deadline of decaying": deadline(DECAYING, 0.3),
+    "deadline of mixed": deadline(MIXED, 0.3),
+    "dwell of decaying": dwell(DECAYING, 0.1),
+    "dwell of lyapunov": dwell(LYAPUNOV, 0.1),
+    "dwell of dynamic": dwell(DYNAMIC, 0.1),
+    "dwell of quadratic": dwell(QUADRATIC, 0.015000003),
+    "dwell of deadline of self_triggered": dwell(deadline(SELF_TRIGGERED, 0.2), 0.05),
+    "deadline within a dwell": deadline(dwell(DYNAMIC, 0.3), 0.1),
+}
+"""Tables of all policies that are rules, and of combinations; one of several values is drawn."""
+
+
+def drawn(
+    table: Table, rng: np.random.Generator, n: int = 2, weight: Matrix | None = None
+) -> Table:
+    """A table for n states; "quadratic" gets a random matrix."""
+    found = {
+        key: rng.choice(value).item() if isinstance(value, tuple) else value
+        for key, value in table.items()
+    }
+    if "rule" in found:
+        return found | {"rule": drawn(found["rule"], rng, n, weight)}
+    if found["policy"] == "quadratic":
+        apart = 0.05 * rng.uniform(-1, 1, (2 * n, 2 * n))
+        found["Q"] = (np.diag([-0.02] * n + [1.0] * n) + apart + apart.T).tolist()
+    return found if weight is None else found | {"weight": weight.tolist()}
+
+
+def rule_from(table: Table, model: ModelMatrices) -> TriggerRule:
+    """The rule of a scenario's table."""
+    settings = POLICIES[table["policy"]].model_validate_json(json.dumps(table))
+    return require_rule(settings.trigger_policy(model))
+
+
+def random_rule(
+    name: str, rng: np.random.Generator, n: int, weight: Matrix | None = None
+) -> TriggerRule:
+    """A rule of a table, with the matrices of a random model of n states."""
+    BK = 3 * rng.uniform(-1, 1, (n, n))
+    closed = 0.3 * rng.uniform(-1, 1, (n, n)) - np.eye(n)
+    table = drawn(TABLES[name], rng, n, weight)
+    return rule_from(table, ModelMatrices(closed - BK, BK, np.eye(n)))
 
 
 def decaying_rule(
@@ -49,16 +133,6 @@ def mixed_rule(
     sigma: float, epsilon: float = 0.0, weight: Matrix | None = None, n: int = 2
 ) -> TriggerRule:
     return given_mixed_rule(n if weight is None else len(weight), sigma, epsilon, weight)
-
-
-def dynamic_rule(
-    sigma: float, theta_s: float, decay_per_s: float, P: Matrix, Q: Matrix, BK: Matrix,
-    eta_0: float = 0.0, weight: Matrix | None = None,
-) -> TriggerRule:  # fmt: skip
-    settings = DynamicSettings(
-        policy="dynamic", sigma=sigma, theta_s=theta_s, decay_per_s=decay_per_s, eta_0=eta_0
-    )
-    return given_dynamic_rule(settings, P, Q, BK)._replace(weight=weight)
 
 
 def quadratic_rule(
@@ -85,4 +159,6 @@ def self_triggered_rule(
 
 
 def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:
-    return given_lyapunov_rule(factor, rate_per_s, weight)
+    n = len(factor)
+    form = QuadraticForm(state_map(n, factor), empty_map(n))
+    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

@@ -30,14 +30,13 @@ from cosim.analysis.value_reduction import QuantileSketch
 from cosim.record.align import (
     AlignedPart,
     AlignedRun,
-    IdentityResidual,
     Reals,
     SizeStatistics,
-    aligned_parts,
+    bounded_parts,
     expected_rms,
+    identity_residual,
     in_common,
 )
-from cosim.record.record_source import joined, with_columns
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
@@ -377,11 +376,10 @@ class SignalStatistics:
         self._scale, self._read = 0.0, 0
         self._half = record.count(SENSOR_MEASUREMENT) // 2
         facts = SampleFactsReader(record.scenario)
-        residual = IdentityResidual(record.scenario)
-        for part in aligned_parts(record):
+        for part, bounds in bounded_parts(record):
             self._add(part)
             facts.take(part.aligned)
-            left = residual.take(part)
+            left = identity_residual(record.scenario, part.aligned, bounds.missed)
             self._residual = _larger(self._residual, left[~np.isnan(left)])
             self._estimation_error(part)
             self._read += len(part.rows)
@@ -471,16 +469,15 @@ def watchdog_actions(record: RunRecord) -> WatchdogPart:
     """Return the watchdog's actions (the newest actuation was too old) from the recorded steps."""
     timing = record.scenario.timing
     names = ("now_ns", "sequence", "t_ns", "actuation")
-    received = np.zeros(0, with_columns(record.tables[PLANT_ACTUATION], names))
+    known, known_ns = np.zeros(0, np.int64), np.zeros(0, np.int64)
     trips, steps_old, first_s, was_old = 0, 0, None, False
     for part in record.slices(PLANT_STEP, PLANT_ACTUATION, columns=names):
         steps = part[PLANT_STEP]
-        received = joined([received, part[PLANT_ACTUATION]], received.dtype)
-        found = np.searchsorted(received["sequence"], steps["actuation"])
-        there = np.append(received["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
-        newest_ns = np.where(
-            steps["actuation"] != NO_SEQUENCE, np.append(received["t_ns"], 0)[found], 0
-        )
+        known = np.append(known, part[PLANT_ACTUATION]["sequence"])
+        known_ns = np.append(known_ns, part[PLANT_ACTUATION]["t_ns"])
+        found = np.searchsorted(known, steps["actuation"])
+        there = np.append(known, NO_SEQUENCE)[found] == steps["actuation"]
+        newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(known_ns, 0)[found], 0)
         # If an actuation is not recorded, its age is unknown.
         old = there & too_old(steps["t_ns"], newest_ns, timing.actuation_timeout_ns)
         begun = np.flatnonzero(old & ~np.append(was_old, old[:-1])[: len(old)])
@@ -488,7 +485,8 @@ def watchdog_actions(record: RunRecord) -> WatchdogPart:
             first_s = float(steps["t_ns"][begun[0]]) * 1e-9
         trips, steps_old = trips + len(begun), steps_old + int(old.sum())
         if len(steps):  # a later step has the newest of these actuations, or a later one
-            was_old, received = bool(old[-1]), received[int(found[-1]) :]
+            was_old, used = bool(old[-1]), int(found[-1])
+            known, known_ns = known[used:], known_ns[used:]
     return WatchdogPart(
         policy=record.scenario.plant.watchdog.policy,
         timeout_s=timing.actuation_timeout_ns * 1e-9,

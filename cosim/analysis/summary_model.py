@@ -351,10 +351,6 @@ class LoopSummary(SummaryPart):
             raise ValueError("a live run has a latency")
         return self
 
-    def with_results(self, **results: Any) -> "LoopSummary":
-        """Return the summary with more of its fields set."""
-        return LoopSummary.model_validate(dict(self) | results)
-
     def to_json(self) -> dict[str, Any]:
         """The summary as JSON."""
         return self.model_dump(mode="json")

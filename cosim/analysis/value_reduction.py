@@ -61,7 +61,7 @@ class QuantileSketch:
         if not self.count:
             return [None] * len(shares)
         if self._values is not None:
-            return list(np.quantile(np.concatenate(self._values), shares).tolist())
+            return list(_quantiles(np.concatenate(self._values), np.array(shares)).tolist())
         ranks = self.count - np.array(shares) * (self.count - 1)
         return list(self.largest(ranks).tolist())
 
@@ -76,6 +76,15 @@ class QuantileSketch:
         values = _middle(places[at.clip(max=len(places) - 1)])
         values = np.where(np.asarray(ranks) <= 1, self._high, values)
         return np.asarray(np.clip(values, self._low, self._high))
+
+
+def _quantiles(values: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the same as ``np.quantile``, which takes several times as long for few values."""
+    ordered, places = np.sort(values), shares * (len(values) - 1)
+    before = np.floor(places).astype(np.intp)
+    low, high = ordered[before], ordered[np.minimum(before + 1, len(values) - 1)]
+    part, apart = places - before, high - low
+    return np.where(part < 0.5, low + apart * part, high - apart * (1 - part))
 
 
 def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:

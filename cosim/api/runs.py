@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from cosim.analysis.summary_model import Claim, RunSummary
     from cosim.output.figure_description import FigureDescription
     from cosim.record.run_record import RecordedRun, RunRecord
+    from cosim.studies.run_archive import Repetition
     from cosim.studies.run_comparison import RunComparison
-    from cosim.studies.run_repetition import Repetition
 
 Folder = str | PathLike[str]
 
@@ -289,7 +289,7 @@ class Run:
 
     def _figures(self, *, bounded: bool) -> "Mapping[str, Callable[[], FigureDescription]]":
         """Return functions that describe the figures, by name; ``bounded`` with their bounds."""
-        from cosim.output.run_figures import page_figures
+        from cosim.output.network_figures import page_figures
 
         return page_figures(self._run, lambda: self.summary, self._loop, bounded=bounded)
 
@@ -418,7 +418,7 @@ def reproduce(path: Folder, *, run_code: bool = False, long: bool = False) -> "R
         NoackError: the file is not such an archive, is damaged, or contains code without
             ``run_code`` or a long run without ``long``.
     """
-    from cosim.studies.run_repetition import repeat_archive
+    from cosim.studies.run_archive import repeat_archive
 
     return repeat_archive(Path(path), run_code=run_code, long=long)
 

@@ -88,7 +88,7 @@ class Measurement(NetworkMeasurement):
             NoackError: the name has another ending, or the file cannot be written.
         """
         # Here: it imports matplotlib, which a measurement without a page does not need.
-        from cosim.measurement.measurement_page import write_page
+        from cosim.measurement.measurement_outputs import write_page
 
         write_page(self, None, Path(path))
 
@@ -136,7 +136,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
-    from cosim.studies.campaign.finished_campaign import FinishedCampaign
+    from cosim.studies.campaign.campaign_report import FinishedCampaign
 
 _TABLE = Path("campaign")
 """Stands for the file of a campaign that is given as a table."""
@@ -300,8 +300,8 @@ def campaign(
         NoackError: one line per mistake in the campaign; or it was interrupted.
     """
     from cosim.studies.campaign.campaign_file import Campaign, load
+    from cosim.studies.campaign.campaign_report import finish_campaign
     from cosim.studies.campaign.campaign_workers import local
-    from cosim.studies.campaign.finished_campaign import finish_campaign
     from noack.config import toml_file
 
     if isinstance(source, Mapping):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cosim.output.figure_format import FigureFiles
     from cosim.record.run_directory import RunEnding
     from cosim.studies.campaign.campaign_file import Campaign
-    from cosim.studies.campaign.finished_campaign import FinishedCampaign
+    from cosim.studies.campaign.campaign_report import FinishedCampaign
     from noack.config.scenario import Scenario
 
 _PER_CORE = 4
@@ -212,7 +212,7 @@ def execute_campaign(
         figure_files: write each figure as a file, too.
     """
     from cosim.live.progress import runs_bar
-    from cosim.studies.campaign.finished_campaign import finish_campaign
+    from cosim.studies.campaign.campaign_report import finish_campaign
 
     def say(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)

@@ -1,10 +1,10 @@
 """The figure of an explored run: a state with its two models, errors, ‖x‖, and transmissions.
 
-All items always exist, perhaps without points, so that the lab page can replace their data only.
 :class:`DraftResults` computes what the figure shows, when it is first asked for.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -36,7 +36,6 @@ _SMALLEST = 1e-6
 _DECADES = 7
 """Below and above the largest value on a logarithmic axis; a bound may be far above the run."""
 _HEIGHTS_IN = (1.96, 1.96, 1.4, 1.68)
-_NOTHING = np.empty(0)
 
 
 class Shown(NamedTuple):
@@ -52,34 +51,27 @@ class Shown(NamedTuple):
 
 
 def exploration_figure(shown: Shown) -> FigureDescription:
-    """Describe the four panels of a run with all that is known of it."""
-    panels = [_state(shown), _errors(shown), _norm(shown), _events(shown)]
-    return FigureDescription(
-        name="exploration",
-        rows=[
-            Row(panels=[panel], height_in=height_in)
-            for panel, height_in in zip(_with_legends(panels, shown), _HEIGHTS_IN, strict=True)
-        ],
-        description="; ".join(title for title, _, _ in panels),
-    )
+    """Describe the four panels of a run with all that is known of it.
+
+    A name that several panels show is in the legend of the first.
+    """
+    known, rows = {"‖x‖"}, list[Row]()
+    parts = [_state(shown), _errors(shown), _norm(shown), _events(shown)]
+    horizon_s = np.array([0.0, shown.run.scenario.horizon_s])
+    for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
+        drawn = [item for item in items if _has_points(item)]
+        names = [*dict.fromkeys(item.label for item in drawn)]
+        legend = [name for name in names if name not in known]
+        known |= {*names}
+        x = time_axis(horizon_s, numbers=len(rows) == len(parts) - 1)
+        panel = Panel(title=title, items=drawn, x=x, y=y, legend=legend)
+        rows.append(Row(panels=[panel], height_in=height_in))
+    description = "; ".join(title for title, _, _ in parts)
+    return FigureDescription(name="exploration", rows=rows, description=description)
 
 
 _Part = tuple[str, Sequence[Band | Line | Marks], Axis]
 """Title, items and vertical axis of a panel."""
-
-
-def _with_legends(parts: Sequence[_Part], shown: Shown) -> list[Panel]:
-    """Return the panels; a name that several of them show is in the legend of the first."""
-    drawn = {item.label for _, items, _ in parts for item in items if _has_points(item)}
-    known, panels = {"‖x‖"}, []
-    horizon_s = np.array([0.0, shown.run.scenario.horizon_s])
-    for i, (title, items, y) in enumerate(parts):
-        names = [*dict.fromkeys(item.label for item in items)]
-        legend = [name for name in names if name in drawn - known]
-        known |= {*names}
-        x = time_axis(horizon_s, numbers=i == len(parts) - 1)
-        panels.append(Panel(title=title, items=items, x=x, y=y, legend=legend))
-    return panels
 
 
 def _has_points(item: Band | Line | Marks) -> bool:
@@ -87,95 +79,86 @@ def _has_points(item: Band | Line | Marks) -> bool:
 
 
 def _state(shown: Shown) -> _Part:
-    run, i, reference = shown.run, shown.state, shown.reference
+    run, i, draws, other = shown.run, shown.state, shown.ensemble, shown.reference
     x, x_s = run.x[:, i], run.x_s[:, i]
     x_c = np.where(run.controller_knows, run.x_c[:, i], np.nan)
-    band_t_s, band = _NOTHING, None
-    if shown.ensemble is not None and i < len(shown.ensemble.states):
-        band_t_s, band = shown.ensemble.t_s, shown.ensemble.states[i]
-    kept_t_s = kept = _NOTHING
-    if reference is not None and i < reference.x.shape[1]:
-        kept_t_s, kept = reference.t_s, reference.x[:, i]
     items: list[Band | Line | Marks] = [
-        Band(x=band_t_s, low=_NOTHING if band is None else band.low, label=BAND, colour=PLANT,
-             high=_NOTHING if band is None else band.high, opacity=0.22),
         Line(x=run.t_s, y=x, label="plant x", colour=PLANT, width=2.25),
         Line(x=run.t_s, y=x_s, label="sensor x_s", colour=SENSOR),
         Line(x=run.t_s, y=x_c, label="controller x_c", colour=CONTROLLER),
-        Line(x=kept_t_s, y=kept, label=KEPT, colour=FORCED, width=0.9, dash=DASHED),
-    ]  # fmt: skip
-    about = np.concatenate([x, x_s, x_c, kept])
+    ]
+    about = np.concatenate([x, x_s, x_c])
+    if draws is not None and i < len(draws.states):
+        low, high = draws.states[i].low, draws.states[i].high
+        band = Band(x=draws.t_s, low=low, high=high, label=BAND, colour=PLANT, opacity=0.22)
+        items.insert(0, band)
+    if other is not None and i < other.x.shape[1]:
+        items.append(_kept(other, other.x[:, i]))
+        about = np.concatenate([about, other.x[:, i]])
     return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
 
 
 def _errors(shown: Shown) -> _Part:
-    run, guarantee, reference = shown.run, shown.guarantee, shown.reference
-    floor, known = _floor(run), run.controller_knows
-    threshold = np.full(len(run.t_s), np.nan) if run.threshold is None else run.threshold
-    e_s = _positive(run.e_s_norm, floor)
-    e_c = np.where(known, _positive(run.e_c_norm, floor), np.nan)
-    kept = _NOTHING
-    if reference is not None:
-        kept = np.where(reference.controller_knows, _positive(reference.e_c_norm, floor), np.nan)
-    high = _NOTHING if shown.ensemble is None else _positive(shown.ensemble.e_c_norm.high, floor)
+    run, draws, other = shown.run, shown.ensemble, shown.reference
+    floor, guarantee = _floor(run), shown.guarantee
+    e_s, e_c = _positive(run.e_s_norm, floor), _known_error(run, floor)
     items = [
-        Line(x=run.t_s, y=threshold, label="threshold", colour=THRESHOLD, width=0.9, dash=DASHED),
         Line(x=run.t_s, y=e_s, label="‖e_s‖", colour=SENSOR),
         Line(x=run.t_s, y=e_c, label="‖e_c‖", colour=CONTROLLER),
-        _certified(guarantee, None if guarantee is None else guarantee.e_c),
-        _edge(shown.ensemble, high),
-        _kept(reference, kept),
     ]
-    about = np.concatenate([threshold, e_s, e_c])
+    about = np.concatenate([e_s, e_c])
+    if (level := run.threshold) is not None:
+        threshold = Line(x=run.t_s, y=level, label="threshold", colour=THRESHOLD, width=0.9)
+        items.insert(0, replace(threshold, dash=DASHED))
+        about = np.concatenate([about, level])
+    if guarantee is not None:
+        items.append(_certified(guarantee, guarantee.e_c))
+    if draws is not None:
+        items.append(_edge(draws, _positive(draws.e_c_norm.high, floor)))
+    if other is not None:
+        items.append(_kept(other, _known_error(other, floor)))
     y = Axis(logarithmic=True, about=about, decades=_DECADES)
     return "errors of the models (logarithmic)", items, y
 
 
 def _norm(shown: Shown) -> _Part:
-    run, guarantee, ensemble = shown.run, shown.guarantee, shown.ensemble
-    low = _NOTHING if ensemble is None else _positive(ensemble.x_norm.low, 0.0)
-    high = _NOTHING if ensemble is None else _positive(ensemble.x_norm.high, 0.0)
+    run, draws, other, guarantee = shown.run, shown.ensemble, shown.reference, shown.guarantee
     norm = _positive(run.x_norm, _SMALLEST * _largest(run.x_norm))
-    reference = shown.reference
-    kept = _NOTHING
-    if reference is not None:
-        kept = _positive(reference.x_norm, _SMALLEST * _largest(reference.x_norm))
-    items = [
-        Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25),
-        _certified(guarantee, None if guarantee is None else guarantee.x),
-        _edge(ensemble, low),
-        _edge(ensemble, high),
-        _kept(reference, kept),
-    ]
+    items = [Line(x=run.t_s, y=norm, label="‖x‖", colour=PLANT, width=2.25)]
+    if guarantee is not None:
+        items.append(_certified(guarantee, guarantee.x))
+    if draws is not None:
+        edges = (draws.x_norm.low, draws.x_norm.high)
+        items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
+    if other is not None:
+        items.append(_kept(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
     return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
 
 
 def _events(shown: Shown) -> _Part:
-    run = shown.run
-    since_s, delivered = np.diff(run.event_s, prepend=0.0), run.delivered
-    items = [
-        Marks(x=run.event_s[delivered], y=since_s[delivered], label="delivered",
-              colour=CONTROLLER),
-        Marks(x=run.event_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST,
-              marker="x", stroke=1.6),
-    ]  # fmt: skip
+    t_s, delivered = shown.run.event_s, shown.run.delivered
+    since_s = np.diff(t_s, prepend=0.0)
+    dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
+    crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
+    items = [dots, replace(crosses, marker="x", stroke=1.6)]
     return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
 
 
-def _certified(guarantee: Guarantee | None, values: Vector | None) -> Line:
-    t_s = _NOTHING if guarantee is None else guarantee.t_s
-    y = _NOTHING if values is None else values
-    return Line(x=t_s, y=y, label="certified bound", colour=CERTIFIED)
+def _certified(guarantee: Guarantee, values: Vector) -> Line:
+    return Line(x=guarantee.t_s, y=values, label="certified bound", colour=CERTIFIED)
 
 
-def _edge(ensemble: Ensemble | None, values: Vector) -> Line:
-    t_s = _NOTHING if ensemble is None else ensemble.t_s
-    return Line(x=t_s, y=values, label=BAND, colour=PLANT, width=0.75, dash=DOTTED)
+def _edge(ensemble: Ensemble, values: Vector) -> Line:
+    return Line(x=ensemble.t_s, y=values, label=BAND, colour=PLANT, width=0.75, dash=DOTTED)
 
 
-def _kept(reference: Exploration | None, values: Vector) -> Line:
-    t_s = _NOTHING if reference is None else reference.t_s
-    return Line(x=t_s, y=values, label=KEPT, colour=FORCED, width=0.9, dash=DASHED)
+def _kept(reference: Exploration, values: Vector) -> Line:
+    return Line(x=reference.t_s, y=values, label=KEPT, colour=FORCED, width=0.9, dash=DASHED)
+
+
+def _known_error(run: Exploration, floor: float) -> Vector:
+    """Return ‖e_c‖ for a logarithmic axis, NaN before the controller's first update."""
+    return np.where(run.controller_knows, _positive(run.e_c_norm, floor), np.nan)
 
 
 def _floor(run: Exploration) -> float:

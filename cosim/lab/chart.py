@@ -1,10 +1,8 @@
 """Draws a figure by the chart library ECharts: plain data, drawn by the browser.
 
-Items with the same points in time share a data set. All items always exist, perhaps without points,
-so that a redraw replaces their data.
+Items with the same points in time share a data set.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,8 @@ from cosim.output.figure_description import (
 from noack.core.linear_systems import Vector
 
 Options = dict[str, Any]
+Numbers = list[float | None]
+"""Values of a column; None is a gap."""
 
 HEIGHT = 860
 """Height of the figure in pixels."""
@@ -44,8 +44,7 @@ def figure_options(figure: FigureDescription, *, dark: bool) -> Options:
     """Return the options of a figure with one panel in each row."""
     ink, lines = ("#d5d9e0", "#3a3f47") if dark else ("#30363d", "#dfe3e8")
     panels, changing = _panels(figure), data_options(figure)
-    legends = _with_legends(panels)
-    heads = [_TITLE + _LEGEND * has_legend for has_legend in legends]
+    heads = [_TITLE + _LEGEND * bool(panel.legend) for panel in panels]
     room = HEIGHT - sum(heads) - _TIMES * (len(panels) - 1) - _BOTTOM
     whole_in = sum(row.height_in for row in figure.rows)
     bottom, grids = float(-_TIMES), []
@@ -53,7 +52,7 @@ def figure_options(figure: FigureDescription, *, dark: bool) -> Options:
         top, height = bottom + _TIMES + head, room * row.height_in / whole_in
         bottom = top + height
         grids.append({"left": 58, "right": 16, "top": round(top), "height": round(height)})
-    with_legend = [grid for grid, has_legend in zip(grids, legends, strict=True) if has_legend]
+    with_legend = [grid for grid, panel in zip(grids, panels, strict=True) if panel.legend]
     text = {"color": ink, "fontSize": _FONT_PX}
     axis = {"axisLine": {"lineStyle": {"color": ink}}, "axisLabel": text,
             "splitLine": {"lineStyle": {"color": lines}}}  # fmt: skip
@@ -87,43 +86,27 @@ def figure_options(figure: FigureDescription, *, dark: bool) -> Options:
 
 def data_options(figure: FigureDescription) -> Options:
     """Return the data, the series and their names, which change with each redraw."""
-    panels, series = _panels(figure), list[Options]()
-    sets: dict[tuple[int, str], dict[str, list[float | None]]] = {}
+    panels, series, sets = _panels(figure), list[Options](), dict[int, dict[str, Numbers]]()
     for number, panel in enumerate(panels):
         for i, item in enumerate(panel.items):
             assert isinstance(item, Line | Band | Marks)
-            # Points without a time of their own are another set: the number of sets is constant.
-            key = (id(item.x), "") if len(item.x) else (number, str(i))
-            columns = sets.setdefault(key, {"t": _rounded(item.x)})
-            series += _series(item, f"{number}-{i}", columns, number, [*sets].index(key))
+            columns = sets.setdefault(id(item.x), {"t": _rounded(item.x)})
+            series += _series(item, f"{number}-{i}", columns, number, [*sets].index(id(item.x)))
     legends = [
-        {"data": [_legend_entry(name, panel) for name in panel.legend or ()]}
-        for panel, has_legend in zip(panels, _with_legends(panels), strict=True)
-        if has_legend
+        {"data": [_legend_entry(name, panel) for name in panel.legend]}
+        for panel in panels
+        if panel.legend
     ]
-    return {"dataset": [{"source": one} for one in sets.values()], "series": series,
-            "legend": legends}  # fmt: skip
+    datasets = [{"source": one} for one in sets.values()]
+    return {"dataset": datasets, "series": series, "legend": legends}
 
 
 def _panels(figure: FigureDescription) -> list[Panel]:
     return [row.panels[0] for row in figure.rows]
 
 
-def _with_legends(panels: Sequence[Panel]) -> list[bool]:
-    """Return which panels have a place for a legend: those with names that none above has.
-
-    A name that begins the title needs no legend.
-    """
-    known, places = set[str](), []
-    for panel in panels:
-        names = {getattr(item, "label", "") for item in panel.items} - known
-        places.append(bool(names - {panel.title.partition(" ")[0]}))
-        known |= names
-    return places
-
-
 def _series(
-    item: Line | Band | Marks, name: str, columns: dict[str, Any], panel: int, dataset: int
+    item: Line | Band | Marks, name: str, columns: dict[str, Numbers], panel: int, dataset: int
 ) -> list[Options]:
     """Add an item's values to its data set; return its series.
 
@@ -157,7 +140,7 @@ def _legend_entry(name: str, panel: Panel) -> Options:
     return {"name": name} | (faint if is_band else {})
 
 
-def _rounded(values: Vector) -> list[float | None]:
+def _rounded(values: Vector) -> Numbers:
     """Return values with a few significant digits; what is not finite is a gap."""
     with np.errstate(all="ignore"):
         size = np.floor(np.log10(np.abs(values)))

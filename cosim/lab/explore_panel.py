@@ -67,8 +67,8 @@ class ExplorePanel:
 
     async def _show_figure(self, shown: Shown, *, dark: bool) -> None:
         run, figure = shown.run, exploration_figure(shown)
-        shape = (shown.state, run.state_names, run.scenario.horizon_s, dark,
-                 shown.reference is None)  # fmt: skip
+        legends = tuple(bool(row.panels[0].legend) for row in figure.rows)
+        shape = (shown.state, run.state_names, run.scenario.horizon_s, dark, legends)
         if self._chart is None or shape != self._shape:
             self._shape = shape
             self._area.clear()
@@ -79,7 +79,8 @@ class ExplorePanel:
             return
         try:
             # Awaited, so that a slow browser is not sent more than it draws.
-            await self._chart.run_chart_method("setOption", data_options(figure), timeout=_DRAWN_S)
+            options, replaced = data_options(figure), {"replaceMerge": ["dataset", "series"]}
+            await self._chart.run_chart_method("setOption", options, replaced, timeout=_DRAWN_S)
         except TimeoutError:
             self._shape = ()
 

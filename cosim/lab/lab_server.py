@@ -123,7 +123,7 @@ def _listener(port: int) -> socket.socket:
 _SECRET_BYTES = 32
 _HEADERS = {
     "referrer-policy": "no-referrer",
-    "x-frame-options": "DENY",
+    "x-frame-options": "SAMEORIGIN",
     "x-content-type-options": "nosniff",
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
@@ -134,8 +134,8 @@ _HEADERS = {
     "content-security-policy":
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
-    "connect-src 'self'; worker-src 'self' blob:; frame-src http://127.0.0.1:* "
-    "http://localhost:*; frame-ancestors 'none'; base-uri 'self'; form-action 'self'",
+    "connect-src 'self'; worker-src 'self' blob:; frame-src 'self' http://127.0.0.1:* "
+    "http://localhost:*; frame-ancestors 'self'; base-uri 'self'; form-action 'self'",
 }  # fmt: skip
 _UNKNOWN = (
     "noack lab: this is not the address of the page. Each start of noack lab has another address:"

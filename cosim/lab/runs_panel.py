@@ -1,61 +1,20 @@
-"""Recorded runs: verdict, key numbers, claims and figures; replay and fidelity on request.
+"""Recorded runs: their reports, in a frame; replay and fidelity on request.
 
-The full report of a run is served below the page's address.
+The report of a run is served below the page's address.
 """
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import ui
 
-from cosim.lab.explore_panel import Rows
-from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls
-from cosim.output.figure_format import SCREEN_IN
+from cosim.lab.lab_services import LabServices, PageCalls
 from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, NEUTRAL
 from noack.core.errors import NoackError
-
-_COLUMN_IN = 3.5
-"""Width for which figures are laid out on a small screen."""
-_FIGURES = ("network", "loops", "map", "states", "errors", "state-norm", "input", "inter-event")
-
-
-NARROW_PX = 800
-"""Widest window whose settings are below the figure."""
-
-
-class Opened(NamedTuple):
-    """What is shown of a run."""
-
-    verdict: list[tuple[str, str]]
-    """Lines, each with its style."""
-    facts: list[tuple[str, str]]
-    claims: list[tuple[str, str]]
-    """Verdict and claim."""
-    figures: list[str]
-    """As HTML."""
-
-
-def opened(directory: Path, width_in: float) -> Opened:
-    """Read a run and draw figures of a width; called in the worker process."""
-    import noack
-    from cosim.output.figure_files import inline
-    from cosim.output.figure_style import figure_width
-    from cosim.output.run_figures import page_figures
-    from cosim.output.run_tables import run_facts
-    from cosim.output.run_verdict import verdict
-    from cosim.record.run_record import load_run
-
-    run = noack.open_run(directory)
-    known = page_figures(load_run(directory), lambda: run.summary)
-    with figure_width(width_in):
-        figures = [inline(known[name]()) for name in _FIGURES if name in known]
-    claims = [(str(one.verdict), f"{one.what} ({one.source})") for one in run.claims]
-    lines = [(line.text, line.style) for line in verdict(run.summary)]
-    return Opened(lines, run_facts(run.summary, run.directory), claims, figures)
 
 
 def replayed(directory: Path) -> str:
@@ -113,45 +72,19 @@ class RunsPanel:
         self.refresh()
         self._select.set_value(name)
 
-    async def _open(self, event: Any) -> None:
+    def _open(self, event: Any) -> None:
         if not event.value:
             return
         directory = self._services.runs / event.value
         self._content.clear()
-        with self._content, ui.row().classes("items-center gap-2"):
-            ui.spinner(size="lg")
-            ui.label("reading the run and drawing its figures, which takes some seconds")
-        found: Opened | str
-        try:
-            is_narrow = await ui.run_javascript(f"innerWidth <= {NARROW_PX}", timeout=ANSWER_S)
-            found = await self._calls.compute(
-                opened, directory, _COLUMN_IN if is_narrow else SCREEN_IN
-            )
-        except NoackError as error:
-            found = str(error)
-        if self._select.value != event.value:
-            return  # another run was chosen meanwhile
-        self._content.clear()
         with self._content:
-            if isinstance(found, str):
-                ui.label(found).classes("text-negative")
-            else:
-                self._show(found, directory)
-
-    def _show(self, found: Opened, directory: Path) -> None:
-        show_verdict(found.verdict, directory.name)
-        Rows("lab-rows", found.facts)
-        with ui.expansion(f"{len(found.claims)} claims").classes("w-full"):
-            for verdict, claim in found.claims:
-                ui.label(f"{verdict}: {claim}")
-        with ui.row().classes("items-center gap-2"):
-            for words, function in (
-                ("replay", replayed),
-                ("compare with the ideal loop", compared),
-            ):
-                self._on_request(words, function, directory)
-        for figure in found.figures:
-            ui.html(figure, sanitize=False).classes("w-full lab-figure")
+            with ui.row().classes("items-center gap-2"):
+                self._on_request("replay", replayed, directory)
+                self._on_request("compare with the ideal loop", compared, directory)
+            waiting = ui.label("A report that is not written yet takes some seconds.")
+            report = ui.element("iframe").classes("w-full lab-report")
+            report.props(f'src="{_address(directory.name)}" title="report of the run"')
+            report.on("load", lambda: waiting.set_visibility(False))
 
     def _on_request(self, words: str, function: Any, directory: Path) -> None:
         answer = ui.label()
@@ -178,9 +111,11 @@ def show_verdict(lines: Iterable[tuple[str, str]], name: str) -> None:
     with ui.card().classes("w-full gap-1").props('role=region aria-label="verdict"'):
         for text, style in lines:
             ui.label(text).classes(f"text-base {_TONES[style]}")
-        ui.link(
-            "report of this run (all figures and tables)", f"report/{quote(name)}", new_tab=True
-        )
+        ui.link("report of this run (all figures and tables)", _address(name), new_tab=True)
+
+
+def _address(name: str) -> str:
+    return f"report/{quote(name)}"
 
 
 def serve_reports(application: FastAPI, services: LabServices) -> None:

@@ -1,9 +1,13 @@
 """The end of a run: its record completed, its summary, report and recording written."""
 
+import gc
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +18,11 @@ from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
 from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
-from cosim.analysis.replay import replay
+from cosim.analysis.replay.machine_replay import SharedMachines
+from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
 from cosim.analysis.summary_model import (
+    ConditionsPart,
     ExitPart,
     LoopSummary,
     ReplayPart,
@@ -25,7 +31,6 @@ from cosim.analysis.summary_model import (
 )
 from cosim.live.process_pool import interrupts_held, processes
 from cosim.live.progress import work_bar
-from cosim.live.replay_process import ReplayProcess
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -51,8 +56,8 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
-_LOOPS_AT_ONCE = 64
-"""Loops whose certificates are computed together."""
+_LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
+"""Loops that are judged together, and rows of one of their tables."""
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
@@ -142,18 +147,41 @@ def _judged(
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
-    with _judged_loops(run, ending) as found, work_bar(f"claims of {loops} loops") as show:
-        if run.kind == "live" and loops > 1:
-            replayed = _replay(run.network)
-        judged: list[_Judged] = []
-        for loop in found:
-            judged.append(loop)
-            show(len(judged) / loops)
+    blocks = deque(_blocks(run))
+    found: dict[range, list[_Judged]] = {}
+    with _helpers(run) as pool, work_bar(f"claims of {loops} loops") as show:
+
+        def judge_next(judge: Callable[[range], list[_Judged]]) -> None:
+            """Judge blocks of loops until none is left."""
+            with suppress(IndexError):
+                while True:
+                    block = blocks.popleft()
+                    found[block] = judge(block)
+                    show(sum(map(len, found)) / loops)
+
+        beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
+        others = [] if pool is None or loops == 1 else [partial(_judged_by, pool, ending)]
+        others *= cores() - 1
+        gc.freeze()  # what is there stays: it need not be searched again and again
+        with ThreadPoolExecutor(max(len(others), 1)) as threads:
+            waiting = [threads.submit(judge_next, judge) for judge in others]
+            try:
+                if run.kind == "live" and loops > 1:
+                    replayed = _replay(run.network)
+                judge_next(partial(_judged_loops, run, ending, beside))
+            finally:
+                blocks.clear()  # an interrupted run waits for one block at most
+                gc.unfreeze()
+        for helper in waiting:
+            helper.result()
+    judged = [loop for block in sorted(found, key=min) for loop in found[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:
         network = summary.network.model_copy(update={"replay": replayed})
-        end = _exit_after_replay(summary.exit, replayed)
-        summary = summary.model_copy(update={"network": network, "exit": end})
+        summary = summary.model_copy(update={"network": network})
+        if replayed.error is not None:
+            end = _exit_after_replay(summary.exit, replayed)
+            summary = summary.model_copy(update={"exit": end})
     over_time = [loop.over_time for loop in judged if loop.over_time is not None]
     return summary, over_time if len(over_time) == loops else None
 
@@ -163,44 +191,71 @@ def _summary(run: RecordedRun, ending: RunEnding, loops: Sequence[LoopSummary]) 
     return summarise_run(run.network, loops, end, ending.startup_s)
 
 
+def _steps(run: RecordedRun) -> int:
+    """Return the steps of the plant of a loop."""
+    timing = run.scenario.timing
+    return max(timing.horizon_ns // timing.plant_period_ns, 1)
+
+
+def _blocks(run: RecordedRun) -> Iterator[range]:
+    """Yield the loops that are judged together: as many as fit into memory, at the end fewer."""
+    loops, first = len(run.loops), 0
+    most = min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1))
+    while first < loops:
+        width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), most, loops - first)
+        yield range(first, first + width)
+        first += width
+
+
 @contextmanager
-def _judged_loops(run: RecordedRun, ending: RunEnding) -> Iterator[Iterable[_Judged]]:
-    """Yield the results of the loops; those of a long run come from a process for each core."""
-    timing, loops = run.scenario.timing, len(run.loops)
-    workers = min(cores(), loops)
-    if workers < 2 or loops * timing.horizon_ns // timing.plant_period_ns < _MANY_STEPS:
-        records = list(run.loops)
-        plain = [_loop_summary(run, record, ending) for record in records]
-        # Written again with the results, so that none of them can cost the summary.
-        _write_summary(ending.run_dir, _summary(run, ending, plain))
-        certificates = _certificates([record.scenario for record in records])
-        yield (
-            _with_results(run, ending.run_dir, *each)
-            for each in zip(records, plain, certificates, strict=True)
-        )
+def _helpers(run: RecordedRun) -> Iterator[ProcessPoolExecutor | None]:
+    """Start processes that help with the end of a long run, on all cores but this process's."""
+    if cores() < 2 or len(run.loops) * _steps(run) < _MANY_STEPS:
+        yield None
         return
-    with processes(workers) as pool:
-        # Consecutive loops share parts of the files.
-        width = min(max(loops // (4 * workers), 1), _LOOPS_AT_ONCE)
-        blocks = (range(first, min(first + width, loops)) for first in range(0, loops, width))
+    with processes(cores() - 1) as pool:
+        yield pool
+
+
+def _judged_by(pool: ProcessPoolExecutor, ending: RunEnding, block: range) -> list[_Judged]:
+    """Let a process of a pool judge loops; do it here if the process is killed."""
+    try:
         with interrupts_held():
-            found = [pool.submit(_judged_stored_loops, ending, block) for block in blocks]
-        yield (loop for block in found for loop in block.result())
+            judged = pool.submit(_judged_stored, ending, block)
+        return judged.result()
+    except BrokenProcessPool:
+        return _judged_stored(ending, block)
+
+
+@cache
+def _stored_run(run_dir: Path) -> RecordedRun:
+    """Return the run of a helper, whose objects then live as long as the process."""
+    run = load_run(run_dir)
+    gc.freeze()
+    return run
 
 
 @np.errstate(all="ignore")
-def _judged_stored_loops(ending: RunEnding, numbers: range) -> list[_Judged]:
-    run, judged = _stored_run(ending.run_dir), []
-    certificates = _certificates([run.scenarios[number] for number in numbers])
-    for number, own in zip(numbers, certificates, strict=True):
-        record = run.loops[number]
-        summary = _loop_summary(run, record, ending)
-        judged.append(_with_results(run, ending.run_dir, record, summary, own))
+def _judged_stored(ending: RunEnding, block: range) -> list[_Judged]:
+    return _judged_loops(_stored_run(ending.run_dir), ending, None, block)
+
+
+def _judged_loops(
+    run: RecordedRun, ending: RunEnding, beside: "ReplayBeside | None", block: range
+) -> list[_Judged]:
+    """Judge some loops; ``beside`` replays the only one."""
+    records = run.together(block)
+    certificates = _certificates([record.scenario for record in records])
+    shared = SharedMachines(records if len(block) > 1 else ())
+    judged = []
+    for record, own in zip(records, certificates, strict=True):
+        phase_ns = run.phases_ns[record.number]
+        summary = summarise(record, int(ending.status), ending.reason, phase_ns)
+        if len(run.loops) == 1:
+            # Written again with the results, so that none of them can cost the summary.
+            _write_summary(ending.run_dir, _summary(run, ending, [summary]))
+        judged.append(_with_results(run, record, summary, own, shared, beside))
     return judged
-
-
-_stored_run = cache(load_run)
-"""The run of a worker process."""
 
 
 def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
@@ -211,38 +266,47 @@ def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertif
         return [None] * len(scenarios)
 
 
-def _loop_summary(run: RecordedRun, record: RunRecord, ending: RunEnding) -> LoopSummary:
-    phase_ns = run.phases_ns[record.number]
-    return summarise(record, int(ending.status), ending.reason, phase_ns)
+class ReplayBeside:
+    """The replay of the only loop of a run by another process."""
+
+    def __init__(self, pool: ProcessPoolExecutor, run_dir: Path) -> None:
+        with interrupts_held():
+            self._verdict = pool.submit(stored_verdict, run_dir)
+
+    def part(self) -> ReplayPart | None:
+        """Wait for the result; None if the process could not replay the run."""
+        try:
+            return self._verdict.result()
+        except Exception:  # this process then finds the reason
+            return None
 
 
 def _with_results(
     run: RecordedRun,
-    run_dir: Path,
     record: RunRecord,
     summary: LoopSummary,
     certificates: Sequence[ScenarioCertificate] | None,
+    shared: SharedMachines,
+    beside: ReplayBeside | None,
 ) -> _Judged:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
-    with ReplayProcess(record, run_dir) as replaying:
-        results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
-        try:
-            results["linearisation"] = linearisation(record.scenario)
-        except Exception as error:  # likewise
-            print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
-        try:
-            results |= _claim_results(record, summary, certificates)
-        except Exception as error:  # likewise
-            print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
-        if record.kind == "live":
-            verdict = replaying.verdict()
-            replayed = _replay(record) if verdict is None else ReplayPart(**verdict)
-            results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
+    results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
+    try:
+        results["linearisation"] = linearisation(record.scenario)
+    except Exception as error:  # likewise
+        print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
+    try:
+        results |= _claim_results(record, summary, certificates)
+    except Exception as error:  # likewise
+        print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+    if record.kind == "live":
+        replayed = (beside and beside.part()) or _replay(record, shared)
+        results |= {"replay": replayed, "exit": _exit_after_replay(summary.exit, replayed)}
     over_time = None
     with suppress(Exception):  # the recording reports it
         if len(run.loops) > 1:
             over_time = loop_over_time(record, run.phases_ns[record.number])
-    return _Judged(summary.with_results(**results), over_time)
+    return _Judged(summary.model_copy(update=results), over_time)
 
 
 def _claim_results(
@@ -256,7 +320,7 @@ def _claim_results(
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
     return {
-        "conditions": claims.conditions,
+        "conditions": ConditionsPart(**claims.conditions),
         "claims": claims.judge(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(
@@ -266,9 +330,9 @@ def _claim_results(
     }
 
 
-def _replay(record: RunRecord) -> ReplayPart:
+def _replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayPart:
     try:
-        return ReplayPart(**replay(record).verdict())
+        return replay(record, shared).verdict()
     except Exception as error:  # the run itself did not fail
         return ReplayPart(bit_exact=None, error=repr(error))
 

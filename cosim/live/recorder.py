@@ -50,9 +50,8 @@ from noack.runtime.telemetry import first_row
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding
     from cosim.output.viewer.live_viewer import LiveView
-    from cosim.output.viewer.recording import RunView
-    from cosim.output.viewer.run_feed import LoopFeed, NetworkFeed
-    from cosim.output.viewer.run_recording import NetworkRecording
+    from cosim.output.viewer.run_feed import RunFeed
+    from cosim.output.viewer.run_recording import RunRecording
 
 _DISCOVERY_S = 5.0
 """By then a restarted recorder has received the tokens of all running processes."""
@@ -170,7 +169,7 @@ class Recorder:
         self._plane = plane
         self.store = TelemetryStore(scenario, run_dir, plane.instance, start)
         self._scenario = scenario
-        self._feed: LoopFeed | NetworkFeed | None = None
+        self._feed: RunFeed | None = None
         self.lost: MachineError | None = None
         """Why some stored rows are no longer on disk; known at the end."""
         self._blind_reported = self.is_stopping = False
@@ -212,11 +211,11 @@ class Recorder:
         reported = {report["process"] for report in self._reports.values()}
         return [role for role in LOOP_ROLES if role not in reported]
 
-    def show_in(self, view: "RunView | NetworkRecording") -> None:
+    def show_in(self, view: "RunRecording") -> None:
         """Show the telemetry in a view, from the first batch that is handled afterwards."""
-        from cosim.output.viewer.run_feed import feed_of
+        from cosim.output.viewer.run_feed import RunFeed
 
-        self._feed = feed_of(self._scenario, view, self._progress.add_warning)
+        self._feed = RunFeed(self._scenario, view, self._progress.add_warning)
 
     def poll(self) -> bool:
         """Handle messages that have arrived; return whether there may be more.
@@ -436,11 +435,11 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
         raise recorder.lost
 
 
-def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunView | NetworkRecording":
+def _open_view(process: RunProcess, live_view: "LiveView | None") -> "RunRecording":
     scenario, run_id, run_dir = process.scenario, process.ticket.run_id, process.ticket.run_dir
-    from cosim.output.viewer.run_recording import open_view
+    from cosim.output.viewer.run_recording import open_recording
 
-    return open_view(scenario, Path(run_dir), run_id, live_view)
+    return open_recording(scenario, Path(run_dir), run_id, live_view)
 
 
 def _poll_to_the_end(process: RunProcess, recorder: Recorder) -> bool:

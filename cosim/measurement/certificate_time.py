@@ -18,7 +18,6 @@ happened before.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +76,7 @@ class CertificateTime:
         """When a condition was first violated, None if never: a claim is void from then on."""
         return min((one.first_s for one in self.causes), default=None)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
         return asdict(self) | {"first_s": self.first_s}
 

@@ -1,27 +1,46 @@
-"""All outputs of a measurement: tables, page, JSON, and a ``[network]`` section.
+"""All outputs of a measurement: tables, figures, page, JSON, and a ``[network]`` section.
 
-The section reproduces the measured network, as a trace or as a model.
+The section reproduces the measured network, as a trace or as a model. Tables, figures (bursts,
+delays, correlation and (m, K)) and the page with both are at the end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
 from cosim.live.progress import error_console
+from cosim.measurement.certificate_time import CertificateTime
 from cosim.measurement.chain_fits import ChainFit
-from cosim.measurement.measurement_page import print_measurement, write_page
+from cosim.measurement.loss_bursts import LEVEL, Estimate, histogram, most_losses
 from cosim.measurement.network_measurement import Measurement
+from cosim.output import palette
+from cosim.output.figure_description import (
+    Axis,
+    Bars,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Rule,
+    Spans,
+    one_panel,
+    time_axis,
+)
 from cosim.output.figure_format import FigureFiles
+from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
 from noack.config import toml_file
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import toml_text
 from noack.config.sections import NetworkSection
 from noack.core.errors import CallerError, printable
 from noack.core.file_access import require_suffix, write_whole
+from noack.core.number_format import NONE, duration, number, percent
 from noack.impairments.loss_prediction import read_files
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 
@@ -130,25 +149,25 @@ def _comment(found: Measurement, form: Form) -> str:
     return "".join(f"# {line}\n" for line in lines)
 
 
-def _trace_section(found: Measurement, name: str) -> Mapping[str, Any]:
+def _trace_section(found: Measurement, name: str) -> Mapping[str, object]:
     # The network would deliver the first packet.
     known = {} if found.outcomes.effective[0] else {"initial_sync": "known_state"}
     replay = {"kind": "replay", "file": name, "by": "time"}
     return known | {"loss": {"model": "lossless"}, "impairments": [replay]}
 
 
-def _model_section(found: Measurement) -> Mapping[str, Any]:
+def _model_section(found: Measurement) -> Mapping[str, object]:
     loss = _loss(found.chosen.fit) if found.models else {"model": "lossless"}
     return {"loss": loss, "impairments": [*_outage_chain(found), *_delay(found)]}
 
 
-def _loss(fit: ChainFit) -> Mapping[str, Any]:
+def _loss(fit: ChainFit) -> Mapping[str, object]:
     if fit.model == "bernoulli":
         return {"model": "bernoulli", "probability": fit.rates.loss_in_bad}
     return {"model": "gilbert_elliott", **fit.rates._asdict()}
 
 
-def _outage_chain(found: Measurement) -> list[Mapping[str, Any]]:
+def _outage_chain(found: Measurement) -> list[Mapping[str, object]]:
     """Return the outages as a chain of their own, by packets."""
     lengths = found.bursts.length[found.is_outage]
     if not len(lengths):
@@ -162,7 +181,7 @@ def _outage_chain(found: Measurement) -> list[Mapping[str, Any]]:
     return [{"kind": "loss", "loss": chain}]
 
 
-def _delay(found: Measurement) -> list[Mapping[str, Any]]:
+def _delay(found: Measurement) -> list[Mapping[str, object]]:
     """Return the delays of the effective packets; the others are lost in the model."""
     delays_ns = found.trace.delay_ns[found.outcomes.effective]
     if not len(delays_ns) or not delays_ns.any():
@@ -176,3 +195,311 @@ def _delay(found: Measurement) -> list[Mapping[str, Any]]:
         "samples_s": np.round(samples_s, 9).tolist(),
         "correlation": round(min(max(correlation, 0.0), _MOST_CORRELATION), 4),
     }]  # fmt: skip
+
+
+_MODELS = {
+    "bernoulli": "independent losses",
+    "gilbert": "Gilbert",
+    "gilbert_elliott": "Gilbert–Elliott",
+}
+_PARAMETERS = {
+    "probability": "loss probability",
+    "good_to_bad": "p, good to bad",
+    "bad_to_good": "r, bad to good",
+    "loss_in_good": "loss in the good state",
+    "loss_in_bad": "loss in the bad state",
+}
+_SHOWN_DELAYS = {0.5: "p50", 0.9: "p90", 0.99: "p99", 0.999: "p99.9", 1.0: "max"}
+_MOST_LISTED = 12
+_MOST_OUTAGES = 5
+
+
+def measurement_tables(
+    found: Measurement, void: CertificateTime | None = None
+) -> Iterator[ResultTable]:
+    """Yield the tables of a measurement, and that of a scenario's certificate."""
+    without = ", without the outages" if found.is_outage.any() else ""
+    estimates = ("estimate", "95 % interval")
+    heads: tuple[str, ...]
+    yield ResultTable("numbers", "losses and delays", KEY_VALUE, [*_numbers(found, without)])
+    rows = [
+        (f"{100 * one.share:.6g} %", str(one.bursts), str(one.bursts_confident or "too few bursts"),
+         str(one.packets))
+        for one in found.quantiles
+    ]  # fmt: skip
+    heads = ("share", "of the bursts", "with 95 % confidence", "of the packets")
+    yield ResultTable("m", f"M: at most M − 1 consecutive losses{without}", heads, rows)
+    if found.windows:
+        columns = 3 if without else 2
+        windows = [
+            (str(window), str(every), NONE if usual is None else str(usual))[:columns]
+            for window, (every, usual) in found.windows.items()
+        ]
+        heads = ("K", "m", "m in windows without an outage")
+        what = "(m, K): most losses m in any K consecutive packets"
+        yield ResultTable("windows", what, heads[:columns], windows)
+    if found.models:
+        heads = ("model and parameter", *estimates)
+        yield ResultTable("models", f"loss models{without}", heads, [*_model_rows(found)])
+    heads = ("parameter", *estimates)
+    yield ResultTable("outages", "model of the outages", heads, [*_outage_rows(found)])
+    if void is not None:
+        what = f"{void.scenario}: when the network violates a condition of its certificates"
+        heads = ("condition", "share of the time", "first", "worst")
+        yield ResultTable("certificate", what, heads, [*_void_rows(void)])
+
+
+def print_measurement(
+    console: Console, found: Measurement, void: CertificateTime | None = None
+) -> None:
+    """Print the tables and the remarks."""
+    console.print(found.name, markup=False, highlight=False, soft_wrap=True)
+    for table in measurement_tables(found, void):
+        console.print(f"\n[bold]{escape(table.caption)}[/]", highlight=False)
+        console.print(terminal_table(table._replace(caption="")))
+    for line in (*found.remarks, *void_remarks(void)):
+        console.print(line, markup=False, highlight=False)
+
+
+def _numbers(found: Measurement, without: str) -> Iterator[tuple[str, str]]:
+    count, deadline_s = len(found.trace), found.options.deadline_s
+    yield "packets", f"{count} in {found.observed_s:.1f} s"
+    yield "lost", _share(int(found.outcomes.lost.sum()), count)
+    yield "out of order (stale)", _share(int(found.outcomes.out_of_order.sum()), count)
+    if deadline_s is not None:
+        name = f"later than the deadline of {duration(deadline_s)}"
+        yield name, _share(int(found.outcomes.late.sum()), count)
+    yield "effective losses (all of these)", _share(found.bursts.losses, count)
+    bursts = found.bursts
+    if len(bursts.length):
+        listed = [f"{count} × {length}" for length, count in histogram(bursts).items()]
+        if len(listed) > _MOST_LISTED:
+            listed[_MOST_LISTED // 2 : -_MOST_LISTED // 2] = ["…"]
+        yield "loss bursts (number × length)", ", ".join(listed)
+        yield "longest loss burst", _burst(found, int(np.argmax(bursts.length)))
+        outages = np.flatnonzero(found.is_outage).tolist()
+        yield "outages", str(len(outages)) if outages else f"none: {found.outage_rule.reason}"
+        for place in outages[:_MOST_OUTAGES]:
+            yield "  outage", _burst(found, place)
+        if outages:
+            yield "  rule", found.outage_rule.reason
+    longest = found.longest_loss_burst
+    yield f"M{without}", f"{longest + 1} (maximum consecutive losses M − 1: {longest})"
+    if (fewest := found.fewest_deliveries) is not None:
+        yield "fewest deliveries between two bursts", str(fewest)
+    delays = found.delays
+    if delays.received:
+        values = (duration(delays.quantiles_s[share]) for share in _SHOWN_DELAYS)
+        yield f"delay {' / '.join(_SHOWN_DELAYS.values())}", " / ".join(values)
+    if delays.correlation:
+        yield "correlation of successive delays", f"{delays.correlation[0]:.2f}"
+
+
+def _share(part: int, of: int) -> str:
+    return f"{part} ({percent(part / of)})" if part else "0"
+
+
+def _burst(found: Measurement, place: int) -> str:
+    one = found.burst_json(place)
+    return f"{one['losses']} packets, {one['duration_s']:.3g} s, from {one['begin_s']:.3f} s"
+
+
+def _model_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
+    for name, model in found.models.items():
+        chosen = " (preferred)" if name == found.chosen.fit.model else ""
+        yield f"{_MODELS[name]}{chosen}", "", ""
+        for parameter, estimate in model.fit.estimates.items():
+            yield f"  {_PARAMETERS[parameter]}", *_estimate(estimate)
+        yield "  mean loss rate", number(model.fit.rates.loss_rate), ""
+        yield "  fit", model.test.verdict, model.test.figures
+
+
+def _estimate(estimate: Estimate | None, digits: int = 3) -> tuple[str, str]:
+    if estimate is None:
+        return "not determined", ""
+    low, high = number(estimate.low, digits), number(estimate.high, digits)
+    return number(estimate.value, digits), f"{low} to {high}"
+
+
+def _outage_rows(found: Measurement) -> Iterator[tuple[str, str, str]]:
+    fit = found.outage_fit
+    per_hour = fit.rate_per_s and Estimate(*(3600 * value for value in fit.rate_per_s))
+    yield "outages per hour", *_estimate(per_hour)
+    if fit.count:
+        yield "mean duration in s", *_estimate(fit.duration_s)
+        yield "fit", fit.text, ""
+
+
+def _void_rows(void: CertificateTime) -> Iterator[tuple[str, str, str, str]]:
+    for one in void.causes:
+        yield one.cause, percent(one.share), f"{one.first_s:.3f} s", one.text
+    for cause, text in void.kept.items():
+        yield cause, percent(0.0), NONE, text
+    first = NONE if void.first_s is None else f"{void.first_s:.3f} s"
+    yield "any of them", percent(void.share), first, ""
+
+
+def void_remarks(void: CertificateTime | None) -> Iterator[str]:
+    """Yield the remarks about a scenario's certificate."""
+    if void is None:
+        return
+    for scope, reason in void.certificates.items():
+        if reason is not None:
+            yield f"no certificate for {scope}: {reason}"
+    yield (
+        f"each packet counts as an update of {void.scenario}; a claim about a run is void from the "
+        "first violation on"
+    )
+
+
+def write_page(
+    found: Measurement,
+    void: CertificateTime | None,
+    path: Path,
+    figure_files: FigureFiles | None = None,
+) -> list[Path]:
+    """Write the page, in which all text is escaped, and its figures; return the files.
+
+    Raises:
+        CallerError: the name does not end in .html.
+        MachineError: the page cannot be written.
+    """
+    from cosim.output.figure_files import save_figures  # they import matplotlib
+    from cosim.output.page_kit import templates
+
+    require_suffix(path, "--out", ".html")
+    template = templates(Path(__file__).parent).get_template("measurement.html.jinja")
+    figures = list(measurement_figures(found))
+    html = template.render(
+        found=found,
+        remarks=[*found.remarks, *void_remarks(void)],
+        tables=list(measurement_tables(found, void)),
+        figures=figures,
+    )
+    return [write_whole(path, html), *save_figures(figures, path, figure_files)]
+
+
+_BURSTS, _OUTAGES, _DELAYS = palette.SENSOR, palette.CONTROLLER, palette.PLANT
+_LOST, _LIMIT = palette.LOST, palette.CERTIFIED
+_HEIGHT_IN = 2.4
+_WINDOWS = 40
+_LONGEST_WINDOW = 1000
+
+
+def measurement_figures(found: Measurement) -> Iterator[FigureDescription]:
+    """Yield the figures of a measurement."""
+    deadline_s = found.options.deadline_s
+    limit = "" if deadline_s is None else f" Dashed: the deadline of {duration(deadline_s)}."
+    yield one_panel("bursts", _histogram(found), _HEIGHT_IN).captioned(
+        "Number of loss bursts by length. A burst is a number of consecutive effective "
+        "losses: packets that were lost, out of order, or later than the deadline.",
+        f"Bars: {len(found.bursts.length)} loss bursts, the longest of "
+        f"{found.bursts.longest} packets.",
+    )
+    yield one_panel("delays", _delays(found), _HEIGHT_IN).captioned(
+        "Delay of each received packet, at its sending time; crosses at the top: lost "
+        f"packets. Shaded: outages.{limit}",
+        f"Points: the delays of {found.delays.received} packets over {found.observed_s:.1f} s.",
+    )
+    yield one_panel("correlation", _correlation(found), _HEIGHT_IN).captioned(
+        "Correlation of the delays (of their normal scores) and of the effective losses of "
+        f"two packets, by their distance. Within the dashed lines: {100 * LEVEL:.0f} % of the "
+        "correlations of independent delays.",
+        "Curves: correlation of delays and of losses over the distance in packets.",
+    )
+    yield one_panel("windows", _windows(found), _HEIGHT_IN).captioned(
+        "(m, K): the largest number m of effective losses in any K consecutive packets. "
+        "Dashed: all K packets lost.",
+        "Curve: most losses over the length of the window.",
+    )
+
+
+def _histogram(found: Measurement) -> Panel:
+    outages = found.is_outage
+    longest = found.bursts.longest
+    # Bins of one length, or, if the lengths differ much, of a constant ratio.
+    wide = longest > _WINDOWS
+    edges = np.arange(1.0, longest + 2)
+    if wide:
+        edges = np.unique(np.geomspace(1, longest + 1, _WINDOWS).round())
+    items = []
+    for label, bursts, colour in (
+        ("loss bursts", found.bursts.only(~outages), _BURSTS),
+        ("outages", found.bursts.only(outages), _OUTAGES),
+    ):
+        counts = np.histogram(bursts.length, edges)[0].astype(np.float64)
+        items.append(
+            Bars(edges=edges - 0.5, heights=counts, label=label, colour=colour, opacity=0.85)
+        )
+    return Panel(
+        title="Loss bursts",
+        items=items,
+        x=Axis(label="consecutive effective losses", logarithmic=wide, whole=not wide),
+        y=Axis(label="bursts", whole=True),
+        legend=None if outages.any() else (),
+    )
+
+
+def _delays(found: Measurement) -> Panel:
+    trace = found.trace
+    sent_s, lost = np.asarray(trace.sent_ns * 1e-9), trace.lost
+    values = np.asarray(np.where(lost, np.nan, np.maximum(trace.delay_ns, 1)) * 1e-9)
+    begin_s, duration_s = found.bursts.only(found.is_outage).times_s(trace)
+    items: list[Item] = [
+        Line(x=sent_s, y=values, colour=_DELAYS, width=0.8, marker=".", size=2.5),
+        Spans(begin=begin_s, end=begin_s + duration_s, colour=_OUTAGES),
+        Marks(x=sent_s[lost], y=np.zeros(int(lost.sum())), marker="x", size=3.5, colour=_LOST,
+              at_top=True, reduced=False),
+    ]  # fmt: skip
+    if found.options.deadline_s is not None:
+        items.append(Rule(at=found.options.deadline_s, colour=_LIMIT))
+    return Panel(
+        title="Delay over time",
+        items=items,
+        x=time_axis(sent_s, label="sending time [s]"),
+        y=Axis(label="delay [s]", logarithmic=bool((~lost).any())),
+    )
+
+
+def _correlation(found: Measurement) -> Panel:
+    delays, (lags, losses) = found.delays, found.loss_correlation
+    items = [
+        _curve(x, y, label, colour)
+        for x, y, label, colour in (
+            (delays.lags, delays.correlation, "delays", _BURSTS),
+            (lags, losses, "effective losses", _LOST),
+        )
+        if x
+    ]
+    limits = [Rule(at=at, colour=_LIMIT, width=1.0) for at in (delays.white, -delays.white)]
+    return Panel(
+        title="Correlation",
+        items=[*items, *limits],
+        x=Axis(label="distance in packets", logarithmic=bool(items)),
+        y=Axis(label="correlation"),
+    )
+
+
+def _windows(found: Measurement) -> Panel:
+    longest = max(min(_LONGEST_WINDOW, len(found.trace)), 1)
+    windows = np.unique(np.geomspace(1, longest, _WINDOWS).round().astype(int)).tolist()
+    every = most_losses(found.bursts, windows)
+    items = [_curve([*every], [*every.values()], "all packets", _OUTAGES)]
+    if found.is_outage.any():
+        usual = most_losses(found.bursts, windows, found.is_outage)
+        items.append(_curve([*usual], [*usual.values()], "without outages", _BURSTS))
+    all_lost = np.array(windows, np.float64)
+    most = max(every.values())
+    ends = (0.8, 1.4 * most) if most else (None, None)
+    return Panel(
+        title="Most losses in a window",
+        items=[*items, Line(x=all_lost, y=all_lost, colour=_LIMIT, dash=(6, 2.5))],
+        x=Axis(label="window K in packets", logarithmic=True),
+        y=Axis(label="losses m", logarithmic=most > 0, ends=ends),
+        legend=None if found.is_outage.any() else (),
+    )
+
+
+def _curve(x: Sequence[float], y: Sequence[float], label: str, colour: palette.Colour) -> Line:
+    return Line(x=np.asarray(x, np.float64), y=np.asarray(y, np.float64), label=label,
+                colour=colour, marker=".", size=4)  # fmt: skip

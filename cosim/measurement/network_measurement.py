@@ -3,14 +3,24 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from cosim.measurement.certificate_time import CertificateTime, certificate_time
-from cosim.measurement.chain_fits import MOST_FITTED, ChainFit, ChainFits, FitTest
+from cosim.measurement.chain_fits import (
+    MOST_FITTED,
+    ChainFit,
+    ChainFits,
+    FitTest,
+    OutageFit,
+    OutageRule,
+    find_outages,
+    fit_outages,
+    outages_longer_than,
+)
 from cosim.measurement.loss_bursts import (
     LEVEL,
     WINDOWS,
@@ -24,13 +34,6 @@ from cosim.measurement.loss_bursts import (
     most_losses,
     outcomes,
     quantile_m,
-)
-from cosim.measurement.outages import (
-    OutageFit,
-    OutageRule,
-    find_outages,
-    fit_outages,
-    outages_longer_than,
 )
 from noack.config.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
@@ -128,7 +131,7 @@ class FittedModel(NamedTuple):
     fit: ChainFit
     test: FitTest
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the fit for JSON."""
         return {
             "model": self.fit.model,
@@ -257,7 +260,7 @@ class Measurement:
                 )
         return found
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all results for JSON."""
         lengths, outages = self.bursts.length, self.outage_fit
         return {
@@ -302,7 +305,7 @@ class Measurement:
         between = self.bursts.deliveries()[1:-1]
         return int(between.min()) if len(between) else None
 
-    def burst_json(self, place: int) -> Mapping[str, Any]:
+    def burst_json(self, place: int) -> Mapping[str, float]:
         """Return a burst for JSON: losses, begin and duration."""
         begin_s, duration_s = self.bursts.times_s(self.trace)
         return {

@@ -64,9 +64,11 @@ class SourceOptions:
 
 
 FILE_OPTIONS = {
-    "clocks_differ": "--clocks", "flow": "--flow", "sequence_at": "--sequence-at",
+    "clocks_differ": "--clocks",
+    "flow": "--flow",
+    "sequence_at": "--sequence-at",
     "period_ns": "--rate",
-}  # fmt: skip
+}
 """Options of the command line, by field of :class:`SourceOptions`."""
 
 
@@ -138,9 +140,7 @@ def _from_captures(paths: Sequence[Path], options: SourceOptions) -> PacketTrace
 
 
 _FLOW = ("link", "direction", "flow")
-_COLUMNS = (
-    *_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit",
-)  # fmt: skip
+_COLUMNS = (*_FLOW, "packet", "arrival_ns", "fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
 _LATEST_NS = 2**61
 
 
@@ -193,10 +193,12 @@ def _received(
         raise CallerError(f"{path}: has a time that is too large")
     never = np.iinfo(np.int64).max
     dropped = np.isin(rows["fate"], [Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT])
-    delay_ns = np.minimum(*(
-        np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never)
-        for delay, bit in (("delay_ns", "bit"), ("copy_delay_ns", "copy_bit"))
-    ))  # fmt: skip
+    delay_ns = np.minimum(
+        *(
+            np.where((rows[delay] >= 0) & (rows[bit] < 0) & ~dropped, rows[delay], never)
+            for delay, bit in (("delay_ns", "bit"), ("copy_delay_ns", "copy_bit"))
+        )
+    )
     lost = delay_ns == never
     return np.where(lost, LOST_NS, rows["arrival_ns"] + np.where(lost, 0, delay_ns)), lost
 

@@ -14,6 +14,7 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
+from noack.config.resolution import policy_of
 from noack.core.number_format import duration, number
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
@@ -99,7 +100,7 @@ def certificate_tables(found: Certificates) -> Iterator[ResultTable]:
     rows = [
         (label, *values, *([of_theorem] if printed else []))
         for label, values, of_theorem in constant_rows(
-            certificates, found.theorem_2, trigger.threshold_decay_per_s
+            certificates, found.theorem_2, policy_of(found.scenario).fading_per_s
         )
     ]
     yield ResultTable("certificates", title, headings, rows)

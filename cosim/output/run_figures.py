@@ -1,46 +1,52 @@
-"""The figures of a run, from its record: those of one loop, and those of loops on one network.
+"""The figures of one loop, from its record.
 
-:func:`page_figures` returns the figures of a run's page; :func:`run_figures` those of one loop,
-:func:`network_figures` those of all loops together.
+Records may have any length, including 0, and values that are not finite. Norms are those of the
+run's trigger, ‖v‖ = ‖W v‖₂. In every figure, grey is the plant, blue the sensor, orange the
+controller; dashed curves are certified bounds.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.fidelity import Fidelity
 from cosim.analysis.loop_statistics import latency_us, lateness_parts
-from cosim.analysis.network_summary import LoopsOverTime, loops_over_time, quantiles
-from cosim.analysis.summary_model import InFlightPart, RunSummary
 from cosim.analysis.value_reduction import QuantileSketch, decimate_all
-from cosim.output import palette, signal_figures
+from cosim.output import palette
 from cosim.output.figure_description import (
+    DASHES,
+    TIME,
     Axis,
-    Band,
+    Bars,
     BoundKind,
-    ColourScale,
     FigureDescription,
-    Heat,
     Item,
     Line,
+    Marks,
     Panel,
     Row,
+    Rule,
     bound_lines,
+    finite,
+    histogram,
+    one_panel,
     plain,
+    series_colour,
     time_axis,
 )
-from cosim.output.signal_figures import ClockErrors, LossPanel
+from cosim.output.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD, Colour
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.run_events import packet_outcomes
-from cosim.record.run_record import RecordedRun, RunRecord
+from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms
-from noack.core.number_format import number
 from noack.impairments.loss_guarantee import LossesInWindow
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -54,21 +60,28 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Flow
 
+Flags = NDArray[np.bool_]
 Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
 """A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
-
 BOUNDED = ("errors", "state-norm", "inter-event")
 """The figures that show certified bounds."""
+_STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
+_MOST_STATES = 16
+_LONGEST_TITLE = 40
+_DECADES = 6
+_RANKS = 120
+_SHORTEST_US = 0.1  # a logarithmic axis has no zero
+_MOST_LABELS = 12
 
 
 def run_figures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
 ) -> dict[str, Callable[[], FigureDescription]]:
-    """Return functions that describe the figures of a run, by name.
+    """Return functions that describe the figures of a loop, by name.
 
     Args:
-        record: the run's record, of any length, including 0.
+        record: the loop's record, of any length, including 0.
         envelopes: certified bounds, drawn with the quantities that they bound.
         timed: whether to show lateness, which does not exist in virtual time.
     """
@@ -78,12 +91,16 @@ def run_figures(
         with np.errstate(all="ignore"):  # a diverged run has figures, too
             return _thinned(record)
 
+    def bounds(quantity: str) -> list[Line]:
+        found = (one for one in envelopes if one[1] == quantity)
+        return bound_lines((label, t_s, values, kind) for label, _, t_s, values, kind in found)
+
     described = {
         "states": lambda: _states(record, aligned()),
-        "errors": lambda: _errors(record, aligned().run, _bounding(envelopes, "e_c")),
-        "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
+        "errors": lambda: _errors(record.scenario, aligned().run, bounds("e_c")),
+        "state-norm": lambda: _state_norm(record, bounds("x")),
         "input": lambda: _input(record),
-        "inter-event": lambda: _inter_event(record, _bounding(envelopes, "inter_event")),
+        "inter-event": lambda: _inter_event(record, bounds("inter_event")),
         "losses": lambda: _losses(record),
     }
     if record.kind == "live" if timed is None else timed:
@@ -99,14 +116,6 @@ def envelopes(record: RunRecord) -> Sequence[Envelope]:
         return claims_of(record).envelopes()
     except Exception:  # the figures are useful without them
         return []
-
-
-def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Line]:
-    return bound_lines(
-        (label, t_s, values, kind)
-        for label, what, t_s, values, kind in envelopes
-        if what == quantity
-    )
 
 
 class _Thinned(NamedTuple):
@@ -154,35 +163,151 @@ def _reduced(
     return np.concatenate(t_s), np.concatenate(values)
 
 
+# States, and times of transmissions and deliveries
+
+
+class Trajectory(NamedTuple):
+    """The states of a loop at k times."""
+
+    names: Sequence[str]
+    """Of the n states."""
+    t_s: Reals
+    x: Reals
+    """(k, n) of the plant."""
+    x_s: Reals
+    """(k, n) of the sensor's model."""
+    x_c: Reals
+    """(k, n) of the controller's model; NaN where unknown."""
+    x_hat: Reals | None = None
+    """(k, n) the sensor's estimate of x; None if it measures x exactly."""
+
+    def items(self, i: int) -> list[Item]:
+        """Describe state i; curves in front are thinner, so that equal curves stay visible."""
+
+        def line(x: Reals, label: str, colour: Colour, width: float, order: float) -> Line:
+            return Line(x=self.t_s, y=x[:, i], label=label, colour=colour, width=width, order=order)
+
+        items = [
+            line(self.x, "$x$ plant", PLANT, 4.2, 2.0),
+            line(self.x_s, "$x_s$ sensor", SENSOR, 1.3, 2.2),
+            line(self.x_c, "$x_c$ controller", CONTROLLER, 2.4, 2.1),
+        ]
+        if self.x_hat is not None:
+            estimate = line(self.x_hat, r"$\hat{x}$ sensor", SENSOR, 1.0, 2.3)
+            items.insert(1, replace(estimate, dash=(1, 1)))
+        return [*items]
+
+
+class Transmissions(NamedTuple):
+    """The transmissions of a loop, and which of them arrived."""
+
+    sent_s: Reals
+    """(e,) times t_i of all transmissions."""
+    lost: Flags
+    """(e,) whether the network lost the transmission."""
+    received_s: Reals
+    """(d,) times t_i* of the transmissions that the controller received."""
+    forced: Flags
+    """(d,) whether the guarantee forced the delivery."""
+
+
+def states_figure(
+    mode: Literal["model", "zoh"], title: str, states: Trajectory, sent: Transmissions
+) -> FigureDescription:
+    """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
+
+    Args:
+        mode: ``model`` is the paper's MB-ET (Fig. 2), ``zoh`` its ZOH-ET (Fig. 3).
+        title: shown after "MB-ET" or "ZOH-ET".
+        states: the first 16 states are drawn.
+        sent: what was sent and received.
+    """
+    n, t_s = len(states.names), states.t_s
+    drawn = min(n, _MOST_STATES)
+    panels = [
+        Panel(
+            items=states.items(i),
+            x=time_axis(t_s),
+            y=Axis(label=plain(states.names[i])),
+            legend=() if i else None,
+        )
+        for i in range(drawn)
+    ]
+    columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
+    between = [np.diff(one, prepend=np.nan) for one in (sent.sent_s, sent.received_s)]
+    highest = 1.05 * max(np.nanmax(np.append(finite(one), 0.0)) for one in between) or None
+    y = Axis(label="interval [s]", ends=(0.0, highest))
+    intervals = [
+        Panel(
+            title="Broadcasting intervals",
+            items=_broadcasts(sent, between[0]),
+            x=time_axis(t_s, numbers=False),
+            y=y,
+        ),
+        Panel(
+            title="Receiving intervals",
+            items=_receptions(sent, between[1]),
+            x=time_axis(t_s),
+            y=y,
+        ),
+    ]
+    head = "MB-ET" if mode == "model" else "ZOH-ET"
+    note = f" ({drawn} of {n} states)" if drawn < n else ""
+    of_states = Row(
+        panels=panels,
+        height_in=1.45 if drawn <= 2 * columns else 1.15,
+        columns=columns,
+        common="x",
+        narrowest_in=_STATES_NARROWEST_IN,
+    )
+    return FigureDescription(
+        name="states",
+        heading=": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + note,
+        rows=[of_states, *(Row(panels=[panel], height_in=1.2) for panel in intervals)],
+    )
+
+
+def _broadcasts(sent: Transmissions, interval_s: Reals) -> list[Item]:
+    t_s, lost = sent.sent_s, sent.lost
+    arrived = Marks(x=t_s[~lost], y=interval_s[~lost], label="sent", colour=SENSOR, stems=SENSOR)
+    crosses = Marks(x=t_s[lost], y=interval_s[lost], label="sent, lost", colour=LOST, stems=SENSOR)
+    return [arrived, replace(crosses, marker="x", size=6.5, stroke=1.8)]
+
+
+def _receptions(sent: Transmissions, interval_s: Reals) -> list[Item]:
+    t_s, forced, lost_s = sent.received_s, sent.forced, sent.sent_s[sent.lost]
+    dots = Marks(x=t_s[~forced], y=interval_s[~forced], label="received", colour=CONTROLLER)
+    diamonds = Marks(x=t_s[forced], y=interval_s[forced], label="received, forced", colour=FORCED)
+    crosses = Marks(x=lost_s, y=np.zeros(len(lost_s)), label="lost", colour=LOST, marker="x")
+    return [
+        replace(dots, stems=CONTROLLER),
+        replace(diamonds, marker="D", size=6.0, stems=CONTROLLER),
+        replace(crosses, order=3),
+    ]
+
+
 def _states(record: RunRecord, aligned: _Thinned) -> FigureDescription:
-    crossed, joined = packet_outcomes(record), aligned.run
-    events = record.events()
+    outcomes, run, events = packet_outcomes(record), aligned.run, record.events()
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "sequence")
-    dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
-    forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.fate == Fate.FORCED])
+    sent = Transmissions(
+        _seconds(events["t_ns"]),
+        np.isin(events["event"], outcomes.sequence[outcomes.lost]),
+        _seconds(deliveries["t_ns"]),
+        np.isin(deliveries["sequence"], outcomes.sequence[outcomes.fate == Fate.FORCED]),
+    )
     scenario, names = record.scenario, record.loop.state_names
+    x, x_hat = (run.x, None) if aligned.true_x is None else (aligned.true_x, run.x)
+    states = Trajectory(names, _seconds(run.t_ns), x, run.x_s, run.x_c, x_hat)
     known = "x" if scenario.coverage.knows_state else "x̂"
-    return signal_figures.states_figure(
-        mode=scenario.mode,
-        t_s=_seconds(joined.t_ns),
-        x=joined.x if aligned.true_x is None else aligned.true_x,
-        x_hat=None if aligned.true_x is None else joined.x,
-        x_s=joined.x_s,
-        x_c=joined.x_c,
-        state_names=names,
-        broadcast_s=_seconds(events["t_ns"]),
-        dropped=dropped,
-        received_s=_seconds(deliveries["t_ns"]),
-        forced=forced,
-        title=scenario.name,
-    ).captioned(
+    return states_figure(scenario.mode, scenario.name, states, sent).captioned(
         "States, and the times between transmissions and between deliveries. "
         + scenario.protocol.states_caption.format(known=known)
         + _known(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. "
-        f"Below, stems for {len(events)} transmissions, of which {int(dropped.sum())} were "
-        f"lost, and for {len(deliveries)} deliveries, of which {int(forced.sum())} were forced.",
+        f"Below, stems for {len(events)} transmissions, of which {int(sent.lost.sum())} were "
+        f"lost, and for {len(deliveries)} deliveries, of which {int(sent.forced.sum())} were "
+        "forced.",
     )
 
 
@@ -192,116 +317,259 @@ def _known(scenario: Scenario) -> str:
         return ""
     if scenario.observer is None:
         return "x̂ is the measurement, x with noise. "
-    outputs = (
-        "1 output"
-        if scenario.message_sizes.outputs == 1
-        else f"{scenario.message_sizes.outputs} outputs"
-    )
-    return f"x̂ is the estimate of the observer, from {outputs}. "
+    outputs = scenario.message_sizes.outputs
+    return f"x̂ is the estimate of the observer, from {outputs} output{'s' * (outputs != 1)}. "
 
 
-def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Line]) -> FigureDescription:
-    t_s = _seconds(joined.t_ns)
-    return signal_figures.error_figure(
-        t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
-    ).captioned(
-        record.scenario.protocol.error_caption
-        + (
-            ""
-            if record.scenario.coverage.knows_state
-            else " Both are relative to x̂, the sensor's estimate of x."
-        )
+# Norms with their bounds, and inputs
+
+
+def _norms(
+    name: str, title: str, lines: Sequence[Line], height_in: float, bounds: Sequence[Line] = ()
+) -> FigureDescription:
+    """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
+    measured = np.concatenate([line.y for line in lines])
+    y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
+    panel = Panel(title=title, items=[*lines, *bounds], x=time_axis(lines[0].x), y=y)
+    return one_panel(name, panel, height_in)
+
+
+def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
+    t_s, e_s, e_c = _seconds(run.t_ns), run.e_s_norm, run.e_c_norm
+    lines = [
+        Line(x=t_s, y=e_c, label=r"$\|e_c\|$ controller", colour=CONTROLLER, width=2.6),
+        Line(x=t_s, y=e_s, label=r"$\|e_s\|$ sensor", colour=SENSOR, width=1.1),
+        Line(x=t_s, y=run.threshold, label="threshold", colour=THRESHOLD, width=1.8),
+    ]
+    relative = " Both are relative to x̂, the sensor's estimate of x."
+    return _norms("errors", "Error norms", lines, 2.7, bounds).captioned(
+        scenario.protocol.error_caption
+        + ("" if scenario.coverage.knows_state else relative)
         + _dashed(bounds),
         "Error norms over time on a logarithmic axis: "
-        f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
+        f"‖e_s‖ up to {_largest(e_s)}, ‖e_c‖ up to {_largest(e_c)}.",
     )
 
 
 def _state_norm(record: RunRecord, bounds: list[Line]) -> FigureDescription:
-    t_s, x_norm = _reduced(record, PLANT_STEP, "x", row_norms)
-    return signal_figures.state_norm_figure(t_s, x_norm, bounds).captioned(
+    t_s, norm = _reduced(record, PLANT_STEP, "x", row_norms)
+    line = Line(x=t_s, y=norm, label=r"$\|x\|$ plant", colour=PLANT, width=2.4)
+    ends = f", from {norm[0]:.3g} to {norm[-1]:.3g}" if len(norm) else ""
+    return _norms("state-norm", "Norm of the state", [line], 2.1, bounds).captioned(
         "Norm of the plant's state." + _dashed(bounds),
-        "Norm of the state over time on a logarithmic axis"
-        + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
+        f"Norm of the state over time on a logarithmic axis{ends}.",
     )
 
 
+def fidelity_figure(fidelity: Fidelity) -> FigureDescription:
+    """Change of x by each effect, over time: ‖x_(with the effect) − x_(without)‖."""
+    t_s, stages = fidelity.t_s, zip(fidelity.stages, fidelity.stage_norms, strict=True)
+    lines = [
+        Line(x=t_s, y=y, label=one.name, colour=series_colour(i), dash=DASHES[i], width=1.6)
+        for i, (one, y) in enumerate(stages)
+    ]
+    title = f"{plain(fidelity.scenario, _LONGEST_TITLE)}: effects on x"
+    return _norms("fidelity", title, lines, 2.7)
+
+
 def _input(record: RunRecord) -> FigureDescription:
+    """Describe the inputs, each of which is held until the next."""
     names, table = record.loop.input_names, CONTROLLER_STEP
     title, caption = "Control input $u = K x_c$", "Control input u = K x_c, held between ticks."
     if record.scenario.network.actuation is not None:
         table, title = PLANT_STEP, "Applied input"
         caption = "Input that the plant applied, also while actuations were missing."
     t_s, u = _reduced(record, table, "u")
-    return signal_figures.input_figure(t_s, u, names, title).captioned(
+    m, colours = len(names), len(palette.SERIES)
+    lines = [
+        Line(
+            x=t_s,
+            y=u[:, i],
+            label=plain(name) or f"u_{i + 1}",
+            colour=series_colour(i),
+            dash=DASHES[i // colours % len(DASHES)],
+            steps="post",
+            # Inputs often coincide: the first ones are wider, and stay visible under the last.
+            width=1.3 + 2.6 * (m - 1 - i) / m,
+        )
+        for i, name in enumerate(names)
+    ]
+    panel = Panel(title=title, items=lines, x=time_axis(t_s), y=Axis(label="input"))
+    return one_panel("input", panel, 1.7).captioned(
         f"{caption} Equal inputs are drawn one inside the other.",
         f"Control inputs {', '.join(names)} over time.",
     )
 
 
-def _inter_event(record: RunRecord, lower_bounds: list[Line]) -> FigureDescription:
-    event_s = _seconds(record.events()["t_ns"])
-    return signal_figures.inter_event_figure(
-        event_s, lower_bounds, record.scenario.horizon_s
-    ).captioned(
-        "Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
-        "Inter-event times on a logarithmic axis"
-        + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
+def _dashed(curves: Sequence[Line]) -> str:
+    return " Dashed: claimed bounds." if curves else ""
+
+
+def _largest(values: Reals) -> str:
+    values = values[np.isfinite(values)]
+    return f"{values.max():.3g}" if len(values) else "unknown"
+
+
+def _seconds(t_ns: NDArray[np.int64]) -> Reals:
+    return np.asarray(t_ns / NS_PER_S, dtype=np.float64)
+
+
+# Times of events, with histograms
+
+
+def _over_time(
+    name: str, title: str, dots: Marks, label: str, until_s: float, bounds: Sequence[Line] = ()
+) -> FigureDescription:
+    """Describe values over time, and their histogram on the same logarithmic axis."""
+    edges, counts = histogram(dots.y)
+    bars = Bars(edges=edges, heights=counts, colour=dots.colour, share=0.9, horizontal=True)
+    least = [
+        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash)
+        for line in bounds
+        if len(line.y)
+    ]
+    counted = Axis(label="count", whole=True)
+    panel = Panel(
+        title=title,
+        items=[*bounds, dots],
+        x=Axis(label=TIME, ends=(0.0, float(dots.x.max(initial=until_s)))),
+        y=Axis(label=label, logarithmic=True),
+        beside=Panel(items=[bars, *least], x=counted, y=Axis(logarithmic=True)),
     )
+    return one_panel(name, panel, 2.1)
 
 
-def _losses(record: RunRecord) -> FigureDescription:
-    outcomes, network = packet_outcomes(record), record.scenario.network
-    bursts = outcomes.loss_bursts()
-    kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
-    panels = [
-        LossPanel("Consecutive losses", "consecutive losses", "bursts", bursts,
-                  network.longest_burst)
-    ]  # fmt: skip
-    panels += [
-        LossPanel(f"Losses in {rule.window} updates", f"losses in {rule.window} consecutive "
-                  "updates", "positions", outcomes.losses_in(rule.window), rule.limit)
-        for rule in network.guarantee.rules[:3] if isinstance(rule, LossesInWindow)
-    ]  # fmt: skip
-    longest, both = int(bursts.max(initial=0)), ""
-    if (actuation := network.actuation) is not None:
-        lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
-        limit, both = actuation.link.longest_burst, " Last panel: the same of actuations."
-        panels.append(
-            LossPanel("Of actuations", "consecutive lost actuations", "bursts", lost, limit)
-        )
-    return signal_figures.loss_figure(panels).captioned(
-        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
-        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
-        f"{len(bursts)} bursts of losses, the longest of {longest}; at most "
-        f"{network.longest_burst} consecutive losses are allowed.",
-    )
-
-
-def _lateness(record: RunRecord) -> FigureDescription:
-    scenario = record.scenario
-    period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
-    late_us = {role: QuantileSketch.of(lateness_parts(record, role)) for role in LOOP_ROLES}
-    maxima = {role: sketch.quantiles(1.0)[0] for role, sketch in late_us.items()}
-    longest = ", ".join(
-        f"{role} {'unknown' if most is None else f'{most:.3g}'} µs" for role, most in maxima.items()
-    )
-    return signal_figures.lateness_figure(late_us, period_us).captioned(
-        "Share of a process's steps with at least this lateness. Lateness is measured "
-        "from the deadline (plant, controller), the time of the measurement (sensor), or the "
-        "arrival of the datagram at the socket (network).",
-        f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
+def _inter_event(record: RunRecord, bounds: list[Line]) -> FigureDescription:
+    event_s, horizon_s = _seconds(record.events()["t_ns"]), record.scenario.horizon_s
+    interval_s, title = np.diff(event_s), "Inter-event times"
+    dots = Marks(x=event_s[1:], y=interval_s, colour=SENSOR, framed=True)
+    shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
+    label = "inter-event time [s]"
+    return _over_time("inter-event", title, dots, label, horizon_s, bounds).captioned(
+        "Inter-event times, over time and as a histogram." + _dashed(bounds),
+        f"Inter-event times on a logarithmic axis{shortest}.",
     )
 
 
 def _latency(record: RunRecord) -> FigureDescription:
     event_ns, taken_us = latency_us(record)
-    return signal_figures.latency_figure(
-        _seconds(event_ns), taken_us, record.scenario.horizon_s
-    ).captioned(
+    dots = Marks(x=_seconds(event_ns), y=taken_us, colour=CONTROLLER, framed=True)
+    title, horizon_s = "Sensor-to-controller latency", record.scenario.horizon_s
+    return _over_time("latency", title, dots, "latency [wall µs]", horizon_s).captioned(
         "Sensor-to-controller latency: wall time from the event to the controller's update.",
         f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
     )
+
+
+# Losses, lateness, clocks
+
+
+def _losses(record: RunRecord) -> FigureDescription:
+    """Describe the losses that occurred, beside what the guarantee allows."""
+    outcomes, network = packet_outcomes(record), record.scenario.network
+    bursts, most = outcomes.loss_bursts(), network.longest_burst
+    title, consecutive, both = "Consecutive losses", "consecutive losses", ""
+    panels = [_loss_panel(title, consecutive, "bursts", bursts, most)]
+    for rule in network.guarantee.rules[:3]:
+        if isinstance(rule, LossesInWindow):
+            title = f"Losses in {rule.window} updates"
+            what = f"losses in {rule.window} consecutive updates"
+            found = outcomes.losses_in(rule.window)
+            panels.append(_loss_panel(title, what, "positions", found, rule.limit))
+    if (actuation := network.actuation) is not None:
+        lost = packet_outcomes(record, Flow.ACTUATION).loss_bursts()
+        limit, what = actuation.link.longest_burst, "consecutive lost actuations"
+        panels.append(_loss_panel("Of actuations", what, "bursts", lost, limit))
+        both = " Last panel: the same of actuations."
+    narrowest_in, widest_in = _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN
+    row = Row(panels=panels, height_in=1.9, narrowest_in=narrowest_in, widest_in=widest_in)
+    kept = "the guarantee" if network.enforce_mansd else "the assumption (not enforced)"
+    return FigureDescription(name="losses", rows=[row]).captioned(
+        "Effective losses of updates: dropped, corrupted, or delivered out of order. "
+        f"Dashed: the largest number that {kept} allows: {network.guarantee.meaning}.{both}",
+        f"{len(bursts)} bursts of losses, the longest of {int(bursts.max(initial=0))}; at most "
+        f"{most} consecutive losses are allowed.",
+    )
+
+
+def _loss_panel(
+    title: str, what: str, counted: str, values: NDArray[np.int64], limit: int | None
+) -> Panel:
+    """Describe a histogram of whole numbers (k,), and the largest number that is allowed."""
+    counts = Counter(values.tolist())
+    low, high = min([1, *counts]), max([1 if limit is None else limit, *counts])
+    bars = Bars(
+        edges=np.arange(low, high + 2) - 0.5,
+        heights=np.array([counts[number] for number in range(low, high + 1)], np.float64),
+        colour=LOST,
+        share=0.8,
+        numbers=len(counts) <= _MOST_LABELS,
+    )
+    items: list[Item] = [bars]
+    if limit is not None:
+        items.append(Rule(at=limit + 0.5, colour=palette.CERTIFIED, vertical=True))
+    x = Axis(label=what, ends=(low - 0.6, high + 0.9), whole=True, grid=False)
+    y = Axis(label=counted, whole=True)
+    return Panel(title=title, items=items, x=x, y=y, empty="no loss")
+
+
+def _lateness(record: RunRecord) -> FigureDescription:
+    """Describe the share of each process's steps with at least a given lateness."""
+    scenario, items, longest = record.scenario, list[Item](), list[str]()
+    for i, role in enumerate(LOOP_ROLES):
+        late_us = QuantileSketch.of(lateness_parts(record, role))
+        most = late_us.quantiles(1.0)[0]
+        longest.append(f"{role} {'unknown' if most is None else f'{most:.3g}'} µs")
+        x, y = later_than(late_us)
+        colour, dash = palette.PROCESSES[role], DASHES[i % len(DASHES)]
+        items.append(Line(x=x, y=y, label=role, colour=colour, steps="pre", width=1.8, dash=dash))
+    period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
+    period = Rule(at=period_us, colour=THRESHOLD, label="one period", vertical=True, width=1.2)
+    panel = Panel(
+        title="Lateness",
+        items=[*items, replace(period, dash=(4, 3))],
+        x=Axis(label="lateness [wall µs]", logarithmic=True),
+        y=Axis(label="share of steps at least as late", logarithmic=True),
+    )
+    return one_panel("lateness", panel, 2.5).captioned(
+        "Share of a process's steps with at least this lateness. Lateness is measured "
+        "from the deadline (plant, controller), the time of the measurement (sensor), or the "
+        "arrival of the datagram at the socket (network).",
+        "Complementary distribution of lateness on logarithmic axes; maximum: "
+        f"{', '.join(longest)}.",
+    )
+
+
+def later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
+    """Return values in ascending order, and for each the share of values at least as large."""
+    k = values.count
+    if not k:
+        return np.zeros(0), np.zeros(0)
+    # k values are at least as large as the k-th largest. The same number of points in each decade
+    # of shares, and linearly spaced ones, which resolve the median.
+    rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
+    rank = np.unique(rank.round().astype(np.intp))[::-1]
+    return np.maximum(finite(values.largest(rank)), _SHORTEST_US), rank / k
+
+
+class ClockErrors(NamedTuple):
+    """Bounds of the error of a process's clock: k comparisons with the recorder's clock."""
+
+    t_s: Reals
+    """(k,)"""
+    error_us: Reals
+    """(k,) wall µs; NaN: the bound was lost."""
+
+    @property
+    def lost(self) -> Flags:
+        """(k,) whether the bound was lost."""
+        return np.isnan(self.error_us)
+
+    @property
+    def largest_us(self) -> float | None:
+        """The largest known bound; None without one."""
+        known = self.error_us[~self.lost]
+        return float(known.max()) if len(known) else None
 
 
 def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
@@ -318,213 +586,37 @@ def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
 
 
 def _clocks(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDescription:
+    """Describe the bound of each process's clock; it has a gap, and a cross, where it was lost."""
     assert scenario.clocks is not None  # else the record has no tables of clocks
-    largest = ", ".join(
-        f"{process} " + ("never known" if one.largest_us is None else f"{one.largest_us:.3g} µs")
-        for process, one in errors.items()
+    allowed_us, last_s = scenario.clocks.largest_error_us, scenario.horizon_s
+    lines, crosses, texts = list[Item](), list[Item](), list[str]()
+    for i, (process, one) in enumerate(errors.items()):
+        most, colour, order = one.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
+        texts.append(f"{process} " + ("never known" if most is None else f"{most:.3g} µs"))
+        keep = one.t_s <= last_s
+        t_s, error_us, lost = one.t_s[keep], one.error_us[keep], one.lost[keep]
+        # The curves often coincide: the first ones are wider, and stay visible under the last.
+        width = 1.3 + 1.2 * (len(errors) - 1 - i)
+        curve = Line(x=t_s, y=error_us, label=process, colour=colour, width=width)
+        lines.append(replace(curve, order=order))
+        began_s = t_s[lost & ~np.append(False, lost[:-1])]
+        at = np.full(len(began_s), allowed_us)
+        cross = Marks(x=began_s, y=at, colour=colour, marker="x", size=9.0, stroke=2.0)
+        crosses.append(replace(cross, order=order))
+    limit = Rule(at=allowed_us, colour=THRESHOLD, label="allowed", width=1.2, dash=(4, 3))
+    unknown = all(one.largest_us is None for one in errors.values())
+    ends = (allowed_us / 10, allowed_us * 10) if unknown else (None, None)
+    panel = Panel(
+        title="Clocks",
+        items=[*lines, *crosses, limit],
+        x=time_axis(np.array([0.0, last_s])),
+        y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
     )
-    lost = [process for process, one in errors.items() if one.lost.any()]
-    return signal_figures.clock_figure(
-        errors, scenario.clocks.largest_error_us, scenario.horizon_s
-    ).captioned(
+    largest, gone = ", ".join(texts), [name for name, one in errors.items() if one.lost.any()]
+    return one_panel("clocks", panel, 1.9).captioned(
         "Bound of the difference between a process's time and the recorder's, for the "
         f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
         "which claims hold."
-        + (f" Cross: from here on, the bound was lost ({', '.join(lost)})." if lost else ""),
+        + (f" Cross: from here on, the bound was lost ({', '.join(gone)})." if gone else ""),
         f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
     )
-
-
-def _dashed(curves: Sequence[Line]) -> str:
-    return " Dashed: claimed bounds." if curves else ""
-
-
-def _largest(values: Reals) -> str:
-    values = values[np.isfinite(values)]
-    return f"{values.max():.3g}" if len(values) else "unknown"
-
-
-def _seconds(t_ns: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Reals:
-    return np.asarray(t_ns / NS_PER_S, dtype=np.float64)
-
-
-Bools = NDArray[np.bool_]
-
-NAMED = len(palette.SERIES)
-"""Up to so many loops have a curve each, in a colour of its own; more are drawn as bands."""
-_PANEL_IN = 1.7
-_ROW_IN, _LOWEST_IN, _HIGHEST_IN = 0.22, 1.2, 4.5
-_MAP_DECADES = 5
-_MOST_ROWS = 24
-"""Up to so many rows of the map have the names of their loops."""
-_BANDS = ((0, 4, 0.25, "5 to 95 % of the loops"), (1, 3, 0.45, "25 to 75 %"))
-_MEDIAN, _LARGEST = 2, 5
-
-
-def page_figures(
-    run: RecordedRun,
-    summary: Callable[[], RunSummary],
-    loop: str | None = None,
-    *,
-    bounded: bool = True,
-) -> Mapping[str, Callable[[], FigureDescription]]:
-    """Return functions that describe the figures of a run's page, or of a loop's, by name.
-
-    Args:
-        run: the record.
-        summary: returns the summary, which the figures of a network need.
-        loop: name of the loop; None for the run.
-        bounded: whether certified bounds are drawn, which are slow to compute.
-    """
-    if loop is None and run.names[1:]:
-        figures = {figure.name: figure for figure in network_figures(run, summary())}
-        return {name: partial(figures.__getitem__, name) for name in figures}
-    record = run.loop(loop)
-    return run_figures(record, envelopes(record) if bounded else ())
-
-
-def network_figures(run: RecordedRun, summary: RunSummary) -> list[FigureDescription]:
-    """Describe the figures of all loops.
-
-    Raises:
-        CallerError: a table of the record is damaged.
-    """
-    over_time = loops_over_time(run)
-    names = [plain(loop.name) for loop in summary.loops]
-    stayed = np.array([loop.diverged_at_s is None for loop in summary.loops])
-    in_flight = summary.network.in_flight
-    curves = "Each loop has a curve."
-    if len(names) > NAMED:
-        curves = "Bands: quantiles over the loops; dashed: the largest value."
-    diverged = "" if stayed.all() else " A loop that diverged leaves the range of the axis."
-    order = "" if len(names) <= _MOST_ROWS else " Loops are numbered from 0, as in the scenario."
-    largest = over_time.errors[np.isfinite(over_time.errors)].max(initial=0.0)
-    return [
-        FigureDescription(
-            name="network",
-            rows=_link_rows(over_time, names, in_flight),
-            caption="Above: datagrams that wait, are sent or are delayed in the network. Below: "
-            f"each loop's share of the bytes that the network forwarded. {curves}",
-            description=f"Above, the number of datagrams in the network over time, up to "
-            f"{in_flight.max}. Below, the shares of {len(names)} loops in the bytes that the "
-            "network forwarded.",
-        ),
-        norms_figure(over_time, names, stayed).captioned(
-            "Largest error ‖e_c‖ of the controller's model, and largest norm ‖x‖ of the plant's "
-            f"state, in each of {len(over_time.middles_s)} intervals. {curves}{diverged}",
-            f"Norms of {len(names)} loops over time on logarithmic axes; ‖e_c‖ is at most "
-            f"{number(largest)}.",
-        ),
-        error_map(over_time, names, stayed).captioned(
-            "Largest ‖e_c‖ of each loop in each interval; no colour before its first "
-            f"delivery.{order}",
-            f"A row of colours for each of {len(names)} loops: ‖e_c‖ over time.",
-        ),
-    ]  # fmt: skip
-
-
-def _link_rows(
-    over_time: LoopsOverTime, names: Sequence[str], in_flight: InFlightPart
-) -> list[Row]:
-    """Describe the number of datagrams in the network, and the share of each loop of the bytes."""
-    most = np.asarray(in_flight.max_by_interval, np.float64)
-    mean = np.asarray(in_flight.mean_by_interval, np.float64)
-    t_s = np.asarray((np.arange(len(mean)) + 0.5) * in_flight.width_s, np.float64)
-    queue: list[Item] = [
-        Band(x=t_s, low=np.zeros(len(t_s)), high=most, label="largest of an interval",
-             colour=palette.NETWORK, opacity=0.3, steps="mid"),
-        Line(x=t_s, y=mean, label="mean", colour=palette.NETWORK),
-    ]  # fmt: skip
-    ends_s, shares = over_time.shares()
-    return _rows(
-        over_time,
-        ("Datagrams in the network", queue, Axis(label="datagrams", ends=(0.0, None))),
-        ("Share of the link", _curves(ends_s - ends_s[0] / 2, 100 * shares, names),
-         Axis(label="%", ends=(0.0, None))),
-    )  # fmt: skip
-
-
-def norms_figure(
-    over_time: LoopsOverTime, names: Sequence[str], stayed: Bools
-) -> FigureDescription:
-    """Describe ‖e_c‖ and ‖x‖ of all loops; the range of the axes is for those that stayed."""
-    panels = []
-    for title, values in (
-        (r"$\|e_c\|$ controller", over_time.errors), (r"$\|x\|$ plant", over_time.states),
-    ):  # fmt: skip
-        about = _not_diverged(values, stayed).ravel()
-        axis = Axis(label="norm", logarithmic=True, about=about, decades=_MAP_DECADES)
-        panels.append((title, _curves(over_time.middles_s, values, names), axis))
-    return FigureDescription(name="loops", rows=_rows(over_time, *panels))
-
-
-def _rows(over_time: LoopsOverTime, *panels: tuple[str, Sequence[Item], Axis]) -> list[Row]:
-    """Return panels, one above the other, with the time axis of the run."""
-    return [
-        Row(height_in=_PANEL_IN, panels=[
-            Panel(title=title, items=items, y=y,
-                  x=time_axis(over_time.edges_s, numbers=i == len(panels) - 1))
-        ])
-        for i, (title, items, y) in enumerate(panels)
-    ]  # fmt: skip
-
-
-def _curves(t_s: Reals, values: Reals, names: Sequence[str]) -> list[Item]:
-    """Describe a curve for each of a few loops, (L, k) over (k,), or quantiles over many."""
-    if len(names) <= NAMED:
-        return [
-            Line(x=t_s, y=curve, label=name, colour=colour)
-            for name, colour, curve in zip(names, palette.SERIES, values, strict=False)
-        ]
-    levels = quantiles(values)
-    return [
-        *(
-            Band(x=t_s, low=levels[low], high=levels[high], label=label, opacity=opacity,
-                 colour=palette.CONTROLLER)
-            for low, high, opacity, label in _BANDS
-        ),
-        Line(x=t_s, y=levels[_MEDIAN], label="median", colour=palette.CONTROLLER),
-        Line(x=t_s, y=levels[_LARGEST], label="largest", colour=palette.LOST, width=1.0,
-             dash=(3, 1.5)),
-    ]  # fmt: skip
-
-
-def error_map(over_time: LoopsOverTime, names: Sequence[str], stayed: Bools) -> FigureDescription:
-    """Describe ‖e_c‖ of each loop, a row, over time, as colours.
-
-    Args:
-        over_time: the errors.
-        names: of the loops.
-        stayed: (L,) the loops that did not diverge, to which the colours are scaled.
-    """
-    count, values = len(names), np.where(over_time.errors > 0, over_time.errors, np.nan)
-    scale = None
-    if np.isfinite(values).any():
-        measured = _not_diverged(values, stayed)
-        most = float(np.nanmax(measured))
-        least = max(float(np.nanmin(measured)), most / 10**_MAP_DECADES)
-        values[over_time.errors == 0] = least  # just after an update
-        scale = ColourScale(
-            low=least, high=most if most > least else 2 * least, logarithmic=True,
-            exceeded=float(np.nanmax(values)) > most,
-        )  # fmt: skip
-    heat = Heat(values=values, x_ends=(0.0, float(over_time.edges_s[-1])), downwards=True)
-    are_named = count <= _MOST_ROWS
-    panel = Panel(
-        title=r"$\|e_c\|$ of each loop",
-        items=[] if scale is None else [heat],
-        x=replace(time_axis(over_time.edges_s), grid=False),
-        y=Axis(
-            label="" if are_named else "number of the loop", grid=False,
-            ticks=dict(enumerate(names)) if are_named else None,
-        ),
-    )  # fmt: skip
-    height_in = min(max(count * _ROW_IN, _LOWEST_IN), _HIGHEST_IN)
-    rows = [Row(panels=[panel], height_in=height_in)]
-    return FigureDescription(name="map", rows=rows, scale=scale)
-
-
-def _not_diverged(values: Reals, stayed: Bools) -> Reals:
-    """Return the values of the loops that did not diverge; if none is known, of all."""
-    measured = values[stayed]
-    return measured if np.isfinite(measured).any() else values

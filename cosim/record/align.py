@@ -6,7 +6,7 @@ At each measurement time t:
   measured or estimated by the sensor. With noise or an observer it is not the plant's state
   (:func:`true_states`), and e_c is the controller's error relative to this x;
 * x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')};
-* :class:`IdentityResidual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
+* :func:`identity_residual` compares x_c − x_s with (I1), and :class:`EventFollower` has what is
   known at the newest event.
 
 If a controller dies, there is no x_c until the restarted controller has its first update.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import LoopMatrices, loop_of, steady_state
+from noack.config.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import ModelFlow, Propagator, row_norms
 from noack.protocol.machine_interface import GENERATION
@@ -33,7 +33,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.paper.error_bounds import MissedEvents, missed_sum
+from noack.theory.paper.error_bounds import ErrorBounds, ErrorMonitor
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
@@ -272,28 +272,33 @@ def align_tables(record: RunRecord) -> AlignedRun:
     )
 
 
-class IdentityResidual:
-    """Computes max |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at the measurements of a run, in order.
+def bounded_parts(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]]:
+    """Yield the aligned parts with bounds of the controller's error, and (I1)'s right-hand side.
 
-    This is the residual of (I1). It is zero up to rounding on every run, for all losses.
+    Summary and claims use those of a short run in turn.
     """
+    yield from _short_bounds(record) if record.is_short else _bounded(record)
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        period_ns = scenario.timing.measurement_period_ns
-        self._missed = MissedEvents(loop_of(scenario).H, period_ns)
 
-    @np.errstate(over="ignore", invalid="ignore")
-    def take(self, part: AlignedPart) -> Reals:
-        """Return the residuals at the next k measurements, (k,)."""
+@lru_cache(maxsize=1)
+def _short_bounds(record: RunRecord) -> Sequence[tuple[AlignedPart, ErrorBounds]]:
+    return tuple(_bounded(record))
+
+
+def _bounded(record: RunRecord) -> Iterator[tuple[AlignedPart, ErrorBounds]]:
+    scenario = record.scenario
+    period_ns = scenario.timing.measurement_period_ns
+    monitor = ErrorMonitor(record.loop.H, policy_of(scenario), period_ns)
+    for part in aligned_parts(record):
         rows, e_s = part.rows, part.rows["x_s"] - part.rows["x"]
-        missed = self._missed.take(rows["t_ns"], e_s, rows["event"], part.aligned.received)
-        return identity_residual(self._scenario, part.aligned, missed_sum(missed, *e_s.shape))
+        yield part, monitor.take(rows["t_ns"], e_s, rows["event"], part.aligned.received)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def identity_residual(scenario: Scenario, aligned: AlignedRun, missed: Reals) -> Reals:
-    """Return max |x_c − x_s − missed| at k measurements, (k,).
+    """Return max |x_c − x_s − missed| at k measurements, (k,): the residual of (I1).
+
+    It is zero up to rounding on every run, for all losses.
 
     It is NaN if x_c is not recorded, and before the first delivery unless x(0) is known. In a run
     with acknowledgements all are NaN, since (I1) assumes that x_s is reset at every event.

@@ -26,9 +26,11 @@ from noack.runtime.control_messages import ProcessReport, parse_message
 from noack.runtime.spool import KEPT_REPORT, SPOOL, read_chunks
 
 _EARLIER = "earlier"
+Report = dict[str, Any]
+"""A process's final report: the fields of :class:`ProcessReport`, with ``process``."""
 
 
-def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
+def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> Report:
     """Return a process's final report from its JSON.
 
     Raises:
@@ -40,7 +42,7 @@ def report_of(role: str, text: bytes | str, tables: Iterable[str]) -> dict[str, 
     return report
 
 
-def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
+def write_reports(run_dir: Path, reports: Iterable[Report]) -> None:
     """Write the final reports of all processes; each has the key ``process``.
 
     Raises:
@@ -103,9 +105,7 @@ def entries_of_loop(
     return found
 
 
-def _of_loop(
-    report: dict[str, Any], number: int, others: Callable[[int, str, int], int]
-) -> dict[str, Any]:
+def _of_loop(report: Report, number: int, others: Callable[[int, str, int], int]) -> Report:
     written = dict(report["rows"])
     for table, by_loop in report.get("rows_by_loop", {}).items():
         written[table] = by_loop[number] if number < len(by_loop) else 0
@@ -128,10 +128,10 @@ def _of_loop(
 
 
 def joint_reports(
-    network: Mapping[str, dict[str, Any]], loops: Sequence[Mapping[str, dict[str, Any]]]
-) -> dict[str, Any]:
+    network: Mapping[str, Report], loops: Sequence[Mapping[str, Report]]
+) -> dict[str, Report]:
     """Return the reports of a run from those of its loops; the emulator's are of all loops."""
-    found: dict[str, Any] = {}
+    found: dict[str, Report] = {}
     if "netem" in network:
         own = loops[0].get("netem", network["netem"])["rows"]  # also those of its clock
         found["netem"] = network["netem"] | {"rows": own | network["netem"]["rows"]}
@@ -149,13 +149,13 @@ def joint_reports(
 
 def valid_reports(
     entries: Entries, source: RecordSource, tables: Iterable[str]
-) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
+) -> tuple[dict[str, Report], list[Report]]:
     """Return the reports of the last process of each role, and those of earlier processes.
 
     They have the numbers of rows of all ``tables`` that the process fills.
     """
-    reports: dict[str, dict[str, Any]] = {}
-    earlier: list[dict[str, Any]] = []
+    reports: dict[str, Report] = {}
+    earlier: list[Report] = []
     for role, entry in entries:
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
@@ -178,7 +178,7 @@ class Life(NamedTuple):
     generation: int
     rows: Mapping[str, int]
     """Number of recorded rows by table."""
-    report: Mapping[str, Any] | None
+    report: Report | None
     """The final report; None if it wrote none."""
     first_ns: int | None = None
     """Time of the first row; None without rows."""
@@ -263,7 +263,7 @@ def lives_of(
     parts: Iterable[Slice],
     tables: Sequence[str],
     begun: Sequence[int],
-    reports: Mapping[int, Mapping[str, Any]],
+    reports: Mapping[int, Report],
 ) -> list[Life]:
     """Return the generations of one process from the parts of its tables, with ``LIFE_COLUMNS``.
 

@@ -59,6 +59,10 @@ class RecordSource(ABC):
             self._whole[table] = joined([*self._read(table, ())], self.types[table])
         return self._whole[table]
 
+    def keep(self, table: str, rows: Rows) -> None:
+        """Use these rows of a table, which have been read with those of other loops."""
+        self._whole[table] = rows
+
     @abstractmethod
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
@@ -69,13 +73,11 @@ class RecordSource(ABC):
         return int(max(highest, default=-1))
 
     def batches(self, table: str, columns: Sequence[str] = ()) -> Iterator[Rows]:
-        """Yield the rows of a table in order, with all columns or only some."""
+        """Yield the rows of a table in order, with all columns or at least some."""
         if table not in self._whole and self.count(table) > BATCH_ROWS:
             yield from self._read(table, columns)
             return
         rows = self.whole(table)
-        if columns:
-            rows = rows[[name for name in rows.dtype.names or () if name in columns]]
         for first in range(0, len(rows), BATCH_ROWS):
             yield rows[first : first + BATCH_ROWS]
 
@@ -346,6 +348,8 @@ class LoopTables(RecordSource):
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
+        if table in self._whole:
+            return len(self._whole[table])
         if table not in self._counts:
             source = self._network.count if is_of_network(table) else self._stored.count_of_loop
             self._counts[table] = source(table, self._number)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_of
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -77,6 +77,7 @@ class RecordedChange(NamedTuple):
         return not is_of_loss_alone(self.change.settings)
 
 
+@lru_cache(maxsize=1)
 def changes_of(record: RunRecord) -> list[RecordedChange]:
     """Return the changes of a run, in the order in which they came into force.
 
@@ -190,8 +191,8 @@ class PacketOutcome(NamedTuple):
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Return the outcomes of a flow's datagrams that reached the network emulator."""
     released = _released(record, flow)
-    parts = [_outcomes(rows, flow, *released) for rows in record.source.batches(NETEM_PACKET)]
-    parts.append(_outcomes(np.zeros(0, record.tables[NETEM_PACKET]), flow, *released))
+    batches = [*record.source.batches(NETEM_PACKET)] or [np.zeros(0, record.tables[NETEM_PACKET])]
+    parts = [_outcomes(rows, flow, *released) for rows in batches]
     return PacketOutcome(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -349,7 +350,7 @@ def _scale(scenario: Scenario) -> float:
             until_s = min(one.until_s or scenario.horizon_s, scenario.horizon_s)
             carried += float(np.linalg.norm(push)) * max(until_s - one.from_s, 0.0)
     setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
-    threshold = scenario.trigger.largest_threshold
+    threshold = policy_of(scenario).largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
     return max(carried, setpoint, threshold)

@@ -5,6 +5,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from cosim.record.processes import (
     LIFE_COLUMNS,
     Life,
+    Report,
     entries_of_loop,
     generations,
     joint_reports,
@@ -40,6 +42,7 @@ from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
 from noack.config.resolution import (
     LoopMatrices,
+    has_loop,
     is_of_network,
     loop_of,
     network_tables,
@@ -59,6 +62,7 @@ from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
+from noack.core.process_limits import cores
 from noack.protocol.machine_interface import RESTART
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -75,6 +79,8 @@ if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables
 
 _NOTICES_FILE = "notices.jsonl"
+Notice = dict[str, Any]
+"""A line of the run's log: t_ns, level, text, process, and the number of a loop if it has one."""
 _MOST_NAMES = 12
 _ROWS_PER_STEP, _MORE_ROWS = 4, 100_000
 """A table has at most this number of rows per step of the loops, and more for restarts."""
@@ -115,10 +121,10 @@ class RunRecord:
         self,
         scenario: Scenario,
         rows: Mapping[str, Rows] | RecordSource,
-        notices: list[dict[str, Any]],
-        reports: Mapping[str, dict[str, Any]],
+        notices: list[Notice],
+        reports: Mapping[str, Report],
         kind: Kind = "live",
-        earlier: Sequence[dict[str, Any]] = (),
+        earlier: Sequence[Report] = (),
         number: int = 0,
         roles: Sequence[str] = LOOP_ROLES,
     ) -> None:
@@ -152,7 +158,7 @@ class RunRecord:
     def slices(self, *tables: str, columns: Sequence[str] = ()) -> Iterator[Slice]:
         """Yield consecutive parts of some tables, or of all, each up to the same time.
 
-        They have all columns, or only some besides ``now_ns``.
+        They have all columns, or at least some besides ``now_ns``.
 
         A short run is one part. A part of a longer one has half of ``BATCH_ROWS`` steps: what is
         computed from it is several times as large.
@@ -161,11 +167,7 @@ class RunRecord:
         if any(self.count(table) > BATCH_ROWS for table in names):
             yield from slices(self.source, names, self._slice_ns, columns)
         elif any(map(self.count, names)):
-            types = {table: with_columns(self.source.types[table], columns) for table in names}
-            yield {
-                table: joined([*self.source.batches(table, columns)], dtype)
-                for table, dtype in types.items()
-            }
+            yield {table: self.source.whole(table) for table in names}
 
     def columns(
         self, table: str, *names: str, where: Callable[[Rows], NDArray[np.bool_]] | None = None
@@ -230,7 +232,7 @@ class RunRecord:
             for one in self.row_counts(role)
         )
 
-    def _reports_of(self, role: str) -> Mapping[int, Mapping[str, Any]]:
+    def _reports_of(self, role: str) -> Mapping[int, Report]:
         """The final reports of a process, by generation."""
         newest = [] if role not in self.reports else [self.reports[role]]
         earlier = [report for report in self.earlier if report["process"] == role]
@@ -287,11 +289,6 @@ class RecordedRun:
         return phases_ns(self.scenario)
 
     @cached_property
-    def scenarios(self) -> Sequence[Scenario]:
-        """The resolved scenario of each loop."""
-        return resolved_loops(self.scenario)
-
-    @cached_property
     def names(self) -> list[str]:
         """The names of the loops."""
         return loop_names(self.scenario)
@@ -312,6 +309,15 @@ class RecordedRun:
         """Return the record of a loop; see :meth:`number_of`."""
         return self.loops[self.number_of(name)]
 
+    def together(self, numbers: range) -> Sequence[RunRecord]:
+        """Return the records of some loops, whose rows are read at once and kept in memory.
+
+        The rows of one loop are read when they are used.
+        """
+        if len(numbers) > 1 and isinstance(self.loops, StoredLoops):
+            return self.loops.together(numbers)
+        return [self.loops[number] for number in numbers]
+
 
 def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     """Return the error for a name that none of a run's loops has, or for no name of several."""
@@ -324,11 +330,11 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
     return CallerError(f"--loop {name}: the run has no such loop; it has {few}")
 
 
-class _StoredLoops(Sequence[RunRecord]):
+class StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 
     def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
-        self._kind, self._stored = network.kind, stored
+        self._kind, self._stored, self._scenario = network.kind, stored, network.scenario
         self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
@@ -348,6 +354,17 @@ class _StoredLoops(Sequence[RunRecord]):
         if self._newest is None or self._newest.number != number:
             self._newest = self._record_of(number)
         return self._newest
+
+    def together(self, numbers: range) -> list[RunRecord]:
+        """See :meth:`RecordedRun.together`."""
+        records = [self._record_of(number) for number in numbers]
+        for table in filter(has_loop, run_tables(self._scenario)):
+            having = [record for record in records if table in record.tables]
+            types = [record.tables[table] for record in having]
+            loops = [record.number for record in having]
+            for place, rows in self._stored.of_loops(table, loops, types):
+                having[place].source.keep(table, rows)
+        return records
 
     def _record_of(self, number: int) -> RunRecord:
         loop = self._loops[number]
@@ -393,7 +410,7 @@ def load_run(run_dir: Path) -> RecordedRun:
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
     kind = kind_of(run_dir)
     network = RunRecord(scenario, stored, notices, reports, kind, earlier, roles=NETWORK_ROLES)
-    return RecordedRun(network, _StoredLoops(run_dir, network, stored))
+    return RecordedRun(network, StoredLoops(run_dir, network, stored))
 
 
 def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:
@@ -469,7 +486,7 @@ def write_tables(
     tables: Iterable[tuple[str, Iterable[Rows]]],
     types: Mapping[str, np.dtype[np.void]],
     names: Mapping[str, Sequence[str]],
-    notices: Iterable[Mapping[str, Any]],
+    notices: Iterable[Notice],
 ) -> None:
     """Write tables, with the names of states and inputs, and the run's log."""
     from cosim.record.table_files import write_table
@@ -477,13 +494,18 @@ def write_tables(
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
-    for table, batches in tables:
-        write_table(folder / f"{table}.parquet", batches, types[table], names)
+    with ThreadPoolExecutor(cores()) as threads:  # most of the work is done without the lock
+        written = [
+            threads.submit(write_table, folder / f"{table}.parquet", batches, types[table], names)
+            for table, batches in tables
+        ]
+    for one in written:
+        one.result()
     with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 
 
-def read_notices(folder: Path) -> list[dict[str, Any]]:
+def read_notices(folder: Path) -> list[Notice]:
     """Read the run's log from the folder of its record."""
     path = folder / _NOTICES_FILE
     try:

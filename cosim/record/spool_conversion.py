@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
 from cosim.record.run_record import (
+    Notice,
     RecordedRun,
     load_run,
     read_notices,
@@ -123,12 +124,13 @@ def by_loop(segments: Iterable[Segment], dtype: np.dtype[np.void], loops: range)
     read = (segment.read() for segment in sorted(segments, key=lambda segment: segment.first))
     own = [rows.compress((rows[LOOP] >= loops.start) & (rows[LOOP] < loops.stop)) for rows in read]
     rows = joined(own, dtype)
+    del own  # as large as the rows
     rows = rows.take(np.argsort(rows[LOOP], kind="stable"))
     ends = np.searchsorted(rows[LOOP], np.arange(loops.start, loops.stop), "right")
     return [in_order(rows[first:end]) for first, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
-_BLOCK_BYTES = 64 * 1024 * 1024
+_BLOCK_BYTES = 32 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
 
 
@@ -211,7 +213,7 @@ def _kept(run_dir: Path, error: OSError) -> MachineError:
     )
 
 
-def _notices(folder: Path, spool: Path, loops: int) -> list[dict[str, Any]]:
+def _notices(folder: Path, spool: Path, loops: int) -> list[Notice]:
     notices = read_notices(folder)
     known = {json.dumps(notice, sort_keys=True) for notice in notices}
     for role in (*LOOP_ROLES, RECORDER):

@@ -268,24 +268,9 @@ def simulate_continuous(
         CallerError: the threshold decays below the smallest supported value before the horizon, or
             the run cannot be decided.
     """
-    loop, fates = system.loop, [] if callable(delivered) else list(delivered)
     until_s = min(horizon_s, vanishes_s(system.trigger))
-    x0, places = np.array(loop.x0 if x0 is None else x0, np.float64), min(_PLACES, max_events)
-    while True:
-        if callable(delivered):
-            fates += [bool(delivered(event)) for event in range(len(fates), places)]
-        simulation = system.simulation(
-            until_s, known_start=known_start, most_events=places, delivered=np.array(fates, bool),
-            measure=core.NOACK_EXACT_TIMES,
-        )  # fmt: skip
-        rows, log = simulation.runs(
-            loop.A[None], loop.B[None], x0[None], places=places, states=True
-        )
-        row = rows[0]
-        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
-        if not full or places == max_events:
-            break
-        places = min(4 * places, max_events)
+    x0 = np.array(system.loop.x0 if x0 is None else x0, np.float64)
+    row, log = _with_room(system, until_s, x0, delivered, known_start, max_events)
     if row["status"] == OK and until_s < horizon_s:
         raise vanished(until_s)
     if row["status"] not in (OK, DIVERGED, TOO_MANY_EVENTS):
@@ -306,6 +291,30 @@ def simulate_continuous(
         too_many.run = replace(run, horizon_s=float(last_s))
         raise too_many
     return run
+
+
+def _with_room(
+    system: ContinuousLoop, until_s: float, x0: Vector,
+    delivered: Callable[[int], bool] | Sequence[bool], known_start: bool, max_events: int,
+) -> tuple[np.void, EventLog]:  # fmt: skip
+    """Return row and events of a run, for which more room is made until its events fit."""
+    loop, fates = system.loop, [] if callable(delivered) else list(delivered)
+    places = min(_PLACES, max_events)
+    while True:
+        if callable(delivered):
+            fates += [bool(delivered(event)) for event in range(len(fates), places)]
+        simulation = system.simulation(
+            until_s, known_start=known_start, most_events=places, delivered=np.array(fates, bool),
+            measure=core.NOACK_EXACT_TIMES,
+        )  # fmt: skip
+        rows, log = simulation.runs(
+            loop.A[None], loop.B[None], x0[None], places=places, states=True
+        )
+        row: np.void = rows[0]
+        full = row["status"] == TOO_MANY_EVENTS and row["transmissions"] == places
+        if not full or places == max_events:
+            return row, log
+        places = min(4 * places, max_events)
 
 
 def _read_run(
@@ -368,28 +377,20 @@ def run_continuous(resolved: Scenario, max_events: int = MAX_EVENTS) -> Continuo
 
 
 @np.errstate(all="ignore")  # a run may diverge
-def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     """Return the run as JSON: its summary, every event, and the states at 501 times."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    before = run.before
+    states = ("x", "e_s", "e_c")
     return {
         "summary": summary(run, resolved),
         "events": [
-            {
-                "t_s": state.t_s,
-                "delivered": bool(delivered),
-                "x": state.x.tolist(),
-                "e_s": state.e_s.tolist(),
-                "e_c": state.e_c.tolist(),
-            }
-            for state, delivered in zip(before, run.delivered, strict=True)
+            {"t_s": state.t_s, "delivered": bool(delivered)}
+            | {name: getattr(state, name).tolist() for name in states}
+            for state, delivered in zip(run.before, run.delivered, strict=True)
         ],
         "state_names": list(run.system.loop.state_names),
         "samples": {
-            "t_s": samples.t_s.tolist(),
-            "x": samples.x.tolist(),
-            "x_s": samples.x_s.tolist(),
-            "x_c": samples.x_c.tolist(),
+            **{name: getattr(samples, name).tolist() for name in ("t_s", "x", "x_s", "x_c")},
             "e_s_norm": run.e_s_norm(samples).tolist(),
             "e_c_norm": run.e_c_norm(samples).tolist(),
             "threshold": _thresholds(run, samples),

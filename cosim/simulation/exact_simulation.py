@@ -130,9 +130,10 @@ class ExactSimulation:
         A, B, x0 = (np.ascontiguousarray(part, np.float64) for part in (A, B, x0))
         rows = np.zeros(k, ROW)
         log = EventLog(
-            np.empty((k, places)), np.empty((k, places), np.bool_),
+            np.empty((k, places)),
+            np.empty((k, places), np.bool_),
             np.empty((k, places, 3, self.n)) if states else None,
-        )  # fmt: skip
+        )
         self.core.event_places = places
         for begin in range(0, k, _RUNS_AT_ONCE):
             part = slice(begin, min(begin + _RUNS_AT_ONCE, k))
@@ -141,11 +142,12 @@ class ExactSimulation:
             if log.states is not None:
                 self.core.states = pointer_to(log.states[part], "double *")
             core.noack_exact_runs(
-                self.core, part.stop - begin,
+                self.core,
+                part.stop - begin,
                 *(pointer_to(one[part], "double *") for one in (A, B, x0)),
                 ffi.NULL if keys is None else pointer_to(keys[part], "int64_t *"),
                 pointer_to(rows[part], "noack_exact_row *"),
-            )  # fmt: skip
+            )
         return rows, log
 
     def segments(

@@ -123,8 +123,9 @@ class SampledLoop:
         plant.sources, plant.at_input.width = sources.shape[1], 0
         noises = _dense(noise)
         for signal, values, given in (
-            (plant.at_state, pushes, len(push)), (plant.noise, noises, len(noise)),
-        ):  # fmt: skip
+            (plant.at_state, pushes, len(push)),
+            (plant.noise, noises, len(noise)),
+        ):
             signal.width = values.shape[1] if given else 0
             signal.first, signal.rows = 0, len(values)
             signal.values = pointer_to(values, "double *")

@@ -160,7 +160,7 @@ class RunComparison:
         template = templates(Path(__file__).parent).get_template("overlay.html.jinja")
         write_whole(path, template.render(found=self, figure=overlay_figure(self.runs)))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the comparison without the figure, for programs."""
         return {
             "runs": [

@@ -1,9 +1,10 @@
 /* The sensor: runs the model x_s in parallel to the plant and transmits at events (eq:ModSensor).
 
-   At a measurement: propagate x_s, test, send at most one state update. x_s is reset at every
-   event, whether or not the network delivers the update: nothing is acknowledged. Its time is the
-   time of the measurements: what it sends does not depend on when a datagram was read. With an
-   observer the estimate x-hat takes the place of x.
+   Its step is noack_sensor_handle, at the end of this file. At a measurement (measured): propagate
+   x_s, test, send at most one state update. x_s is reset at every event, whether or not the network
+   delivers the update: nothing is acknowledged. Its time is the time of the measurements: what it
+   sends does not depend on when a datagram was read. With an observer the estimate x-hat takes the
+   place of x. Where the step needs Python, it returns a question; with the answer it is repeated.
 
    In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the

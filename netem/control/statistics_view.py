@@ -32,6 +32,7 @@ from netem.control.emulator_statistics import (
     Statistics,
 )
 from netem.relay_links import DIRECTIONS, Direction
+from noack.core.number_format import with_unit
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 NONE = "–"
@@ -44,12 +45,12 @@ def rate_text(per_s: float) -> str:
 
 def bits_text(bits_per_s: float) -> str:
     """Bits per second, with three digits."""
-    return _with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
+    return with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
 
 
 def time_text(t_ns: float | None) -> str:
     """A duration, with three digits."""
-    return NONE if t_ns is None else _with_unit(t_ns, ("s", "ms", "µs", "ns"))
+    return NONE if t_ns is None else with_unit(t_ns, ("s", "ms", "µs", "ns"))
 
 
 def percent_text(share: float | None) -> str:
@@ -84,16 +85,6 @@ def bar(share: float, width: int) -> tuple[str, str]:
     """Return the filled part and the rest of a bar of ``width`` characters."""
     filled = round(min(max(share, 0.0), 1.0) * width)
     return "━" * filled, "─" * (width - filled)
-
-
-def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
-    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
-    for unit, size in zip(units, (1e9, 1e6, 1e3), strict=False):
-        if value >= 0.9995 * size:
-            part = value / size
-            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
-            return f"{part:.{digits}f} {unit}"
-    return f"{value:.0f} {units[-1]}"
 
 
 _SPAN_S = 60.0

@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from noack.config.resolution import policy_of, resolve
-from noack.config.scenario import Scenario, loop_scenario
+from noack.config.scenario import Scenario, loop_scenario, loop_sections
 from noack.config.scenario_checks import with_settings
 from noack.config.sections import DirectionSection
 from noack.core.clock import NS_PER_S
@@ -124,9 +124,9 @@ def update_delay(scenario: Scenario) -> DelayBound:
 
 def _stages(scenario: Scenario) -> tuple[list[_Stage], list[_Stage]]:
     """Return the parts of the run between changes of settings: updates, actuations."""
-    sections = scenario.loops
-    loops = [scenario] if sections is None else [loop_scenario(scenario, one) for one in sections]
-    counts = [1] if sections is None else [one.count for one in sections]
+    sections = loop_sections(scenario)
+    loops = [loop_scenario(scenario, one) for one in sections]
+    counts = [one.count for one in sections]
     updates, actuations = list[_Stage](), list[_Stage]()
     for number in range(len(scenario.changes) + 1):
         begin = f"from changes.{number - 1} on, " if number else ""

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from noack.config.mat_file import matrices_as_npz
@@ -23,9 +24,10 @@ from noack.core.errors import CallerError
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import require_shape, rows_of
+from noack.settings.section import ReadTable, require_shape, rows_of
 from noack.settings.user_files import NamedFile
 
+Arrays = dict[str, NDArray[Any]]
 NPZ, MAT = ".npz", ".mat"
 GAIN = "gain"
 _GAINS = (GAIN, "K")
@@ -38,7 +40,7 @@ _DIRECTORY_ENTRY = b"PK\1\2"
 _NUMBERS = "fiub"
 
 
-def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapping[str, Any]:
+def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
     """Return a scenario's content with the matrices of the files that it names.
 
     ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` gives A and
@@ -64,7 +66,7 @@ def _is_flat(loop: object) -> bool:
     return isinstance(loop, Mapping) and "loops" not in loop
 
 
-def _can_be_read(section: Mapping[str, Any]) -> bool:
+def _can_be_read(section: ReadTable) -> bool:
     """Whether a section names a file correctly; the validation refuses incorrect entries."""
     names = section.get("names", {})
     return (
@@ -75,9 +77,7 @@ def _can_be_read(section: Mapping[str, Any]) -> bool:
     )
 
 
-def _replaced(
-    section: Mapping[str, Any], keys: tuple[str, ...], file: NamedFile
-) -> Mapping[str, Any]:
+def _replaced(section: ReadTable, keys: tuple[str, ...], file: NamedFile) -> ReadTable:
     for key in ("A", "B"):
         if key in section:
             file.wrong(f"the file has {key}, and so has the scenario; give one or the other")
@@ -114,7 +114,7 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
     return found
 
 
-def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
+def unfit(C: ArrayLike | None, D: ArrayLike | None, dt: ArrayLike | None, n: int) -> str | None:
     """Return why the loop cannot use a state-space model of n states; None if it can.
 
     C, D and the sampling time dt may be None; dt = 0 is continuous time.
@@ -150,7 +150,7 @@ def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
 _SUFFIXES = f"must end in {NPZ} (NumPy) or {MAT} (MATLAB)"
 
 
-def _arrays(file: NamedFile) -> dict[str, Any]:
+def _arrays(file: NamedFile) -> Arrays:
     if file.path.suffix not in (NPZ, MAT):
         file.wrong(_SUFFIXES)
     content = file.content()
@@ -167,7 +167,7 @@ def _arrays(file: NamedFile) -> dict[str, Any]:
         file.wrong(f"is no {file.path.suffix} file, or a damaged one")
 
 
-def _of_npz(content: bytes) -> dict[str, Any]:
+def _of_npz(content: bytes) -> Arrays:
     """Return the arrays that are not too large, by name."""
     found = {}
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -190,7 +190,7 @@ _HEADERS = {
 }
 
 
-def _matrix(file: NamedFile, name: str, value: Any) -> Matrix:
+def _matrix(file: NamedFile, name: str, value: NDArray[Any]) -> Matrix:
     if value.dtype.kind not in _NUMBERS:
         file.wrong(f"{name} is not of real numbers")
     if value.ndim != 2 or not value.size:
@@ -201,7 +201,7 @@ def _matrix(file: NamedFile, name: str, value: Any) -> Matrix:
     return np.asarray(value, dtype=np.float64)
 
 
-def _missing(name: str, arrays: Mapping[str, Any]) -> str:
+def _missing(name: str, arrays: Arrays) -> str:
     listed = ", ".join(list(arrays)[:10]) or "none"
     most = f"{MAX_DIMENSION} x {MAX_DIMENSION}"
     return f"has no matrix {name} of numbers, at most {most}; it has {listed}"
@@ -209,7 +209,7 @@ def _missing(name: str, arrays: Mapping[str, Any]) -> str:
 
 def model_of(
     system: Any,
-    gain: Any,
+    gain: ArrayLike,
     *,
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
@@ -237,7 +237,7 @@ def model_of(
         raise CallerError(f"the system: {brief(error)}") from None
 
 
-def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
+def save_model(path: str | Path, system: Any, gain: ArrayLike | None = None) -> None:
     """Write an ``.npz`` or ``.mat`` file for ``model.file`` or ``plant.file`` of a scenario.
 
     Without the gain K of u = K x, (m, n), the scenario must give it. Raise CallerError as
@@ -249,7 +249,7 @@ def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
         raise CallerError(f"{path}: cannot be written: {error}") from None
 
 
-def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
+def matrices_of(system: Any, gain: ArrayLike | None = None) -> dict[str, Matrix]:
     """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
 
     Arguments and errors are those of :func:`model_of`.
@@ -283,7 +283,7 @@ def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
     return found
 
 
-def _numbers_of(name: str, value: Any) -> Matrix:
+def _numbers_of(name: str, value: ArrayLike) -> Matrix:
     try:
         found = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -295,7 +295,7 @@ def _numbers_of(name: str, value: Any) -> Matrix:
     return found
 
 
-def _labels(system: Any, key: str) -> Sequence[str] | None:
+def _labels(system: object, key: str) -> Sequence[str] | None:
     """Return the names that the user chose; None for the default names of python-control."""
     labels = getattr(system, key, None)
     return None if not labels or any("[" in label for label in labels) else labels

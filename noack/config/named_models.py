@@ -38,12 +38,14 @@ def lane_following(
     """
     if look_ahead == 0:
         raise ValueError("parameters.look_ahead: the look-ahead distance cannot be 0")
-    A = np.array([
-        [a11, a12, 0.0, 0.0],
-        [a21, a22, 0.0, 0.0],
-        [0.0, 1.0, 0.0, 0.0],
-        [1.0, 0.0, speed, 0.0],
-    ])  # fmt: skip
+    A = np.array(
+        [
+            [a11, a12, 0.0, 0.0],
+            [a21, a22, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [1.0, 0.0, speed, 0.0],
+        ]
+    )
     B = np.array([[b1, 0.0], [0.0, b2], [0.0, 0.0], [0.0, 0.0]])
     row = [0.0, 0.0, -gain, gain / look_ahead]
     return NamedModel(A, B, np.array([row, row]), ("V", "r", "psi", "Y_g"), ("u_1", "u_2"))
@@ -73,21 +75,25 @@ def single_track_lane(
         ValueError: a parameter that is a divisor is 0.
     """
     divisors = {
-        "mass_kg": mass_kg, "inertia_kg_m2": inertia_kg_m2, "speed_m_per_s": speed_m_per_s,
+        "mass_kg": mass_kg,
+        "inertia_kg_m2": inertia_kg_m2,
+        "speed_m_per_s": speed_m_per_s,
         "look_ahead_m": look_ahead_m,
-    }  # fmt: skip
+    }
     for name, value in divisors.items():
         if value == 0:
             raise ValueError(f"parameters.{name}: cannot be 0")
     m, inertia, v = mass_kg, inertia_kg_m2, speed_m_per_s
     a, b, c_f, c_r = front_m, rear_m, front_n_per_rad, rear_n_per_rad
     uneven = a * c_f - b * c_r
-    A = np.array([
-        [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
-        [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
-        [0.0, 1.0, 0.0, 0.0],
-        [1.0, 0.0, -v, 0.0],
-    ])  # fmt: skip
+    A = np.array(
+        [
+            [-(c_f + c_r) / (m * v), uneven / (m * v) + v, 0.0, 0.0],
+            [uneven / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v), 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [1.0, 0.0, -v, 0.0],
+        ]
+    )
     B = np.array([[-c_f / m], [a * c_f / inertia], [0.0], [0.0]])
     K = np.array([[0.0, 0.0, -gain, gain / look_ahead_m]])
     return NamedModel(A, B, K, ("V", "r", "psi", "Y_g"), ("steering",))

@@ -9,11 +9,9 @@ notice.
 
 import json
 from bisect import bisect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from operator import attrgetter
 from typing import Any, NamedTuple
-
-from pydantic import ValidationError
 
 from noack.config.runtime_parameters import (
     CONSTRAINTS,
@@ -24,13 +22,13 @@ from noack.config.runtime_parameters import (
     trigger_parameters,
 )
 from noack.config.scenario import Scenario
-from noack.config.scenario_checks import content_with_settings, with_settings
+from noack.config.scenario_checks import with_settings
 from noack.config.sections import PlantSection
-from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
+from noack.settings.section import ReadTable, Table
 
 _shared_tables = attrgetter(*(Scenario.model_fields.keys() - {"name", "plant", "seeds"}))
 _shared_of_plant = attrgetter(*(PlantSection.model_fields.keys() - {"initial_state", "A", "B"}))
@@ -42,10 +40,10 @@ class ParameterChange(NamedTuple):
 
     number: int  # number of the change, in the order in which the run's changes were announced
     t_ns: int  # T, the time from which the settings are in force
-    settings: Mapping[str, Any]  # values by keys of the scenario
+    settings: ReadTable  # values by keys of the scenario
 
 
-def settings_bytes(settings: Mapping[str, Any]) -> bytes:
+def settings_bytes(settings: ReadTable) -> bytes:
     """Return settings as JSON, padded with zeros to the width of the record's column.
 
     Raise CallerError if they are too long for the column.
@@ -58,7 +56,7 @@ def settings_bytes(settings: Mapping[str, Any]) -> bytes:
     return data.ljust(CHANGE_BYTES, b"\0")
 
 
-def settings_of(data: bytes) -> dict[str, Any]:
+def settings_of(data: bytes) -> Table:
     """Read settings from the record; raise ValueError if the data are not settings."""
     found = json.loads(data.rstrip(b"\0"))
     if not isinstance(found, dict):
@@ -66,7 +64,7 @@ def settings_of(data: bytes) -> dict[str, Any]:
     return found
 
 
-def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
+def changed(scenario: Scenario, settings: ReadTable) -> Scenario:
     """Return a scenario with other settings, validated as a whole.
 
     Raise CallerError with one line per mistake.
@@ -74,16 +72,16 @@ def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     settings_bytes(settings)
     try:
         return with_settings(scenario, settings)
-    except ValidationError:
-        return validated(Scenario, content_with_settings(scenario, settings), "the change")
     except ValueError as error:
-        raise CallerError(f"the change: {error}") from None
+        raise CallerError(
+            "\n".join(f"the change: {line}" for line in str(error).splitlines())
+        ) from None
 
 
-def current_parameters(scenario: Scenario) -> dict[str, Any]:
+def current_parameters(scenario: Scenario) -> Table:
     """Return the parameters that can be changed during a run, with their values."""
     trigger = scenario.trigger
-    loss = scenario.network.loss.model_dump(mode="json", exclude_none=True)
+    loss = scenario.network.loss.content()
     values = {
         key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)
     }
@@ -147,7 +145,7 @@ class AppliedParameters(NamedTuple):
 
     since_ns: int
     number: int  # number of the change; −1 for the run's initial scenario
-    settings: Mapping[str, Any]
+    settings: ReadTable
     scenario: Scenario
     prepared: Any  # data that the machine computed from the scenario when the change was announced
 

@@ -99,11 +99,7 @@ def resolve_run(scenario: Scenario) -> Scenario:
     for section in scenario.loops:
         loop, first = resolved[first], first + section.count
         tables = {"model": loop.model, "observer": loop.observer}
-        update = {
-            part: table.model_dump(mode="json", exclude_none=True)
-            for part, table in tables.items()
-            if table is not None
-        }
+        update = {part: table.content() for part, table in tables.items() if table is not None}
         sections.append(section.model_copy(update=update))
     return scenario.model_copy(update={"loops": tuple(sections)})
 
@@ -200,9 +196,8 @@ def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
     observer = scenario.observer
     if observer is None:
         return None
-    A, n = np.array(model.A), len(model.A or ())
-    given = scenario.plant.measurement.C
-    C = np.eye(n) if given is None else np.array(given)
+    A = np.array(model.A)
+    C = scenario.plant.measurement.matrix(len(A))
     period_ns = scenario.timing.measurement_period_ns
     with np.errstate(all="ignore"):
         step = transition(A, period_ns)
@@ -347,7 +342,7 @@ def true_model(resolved: Scenario) -> EstimationModel:
     noise = plant.noise_variances(loop.n, loop.m)
     Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
     _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
-    C = np.eye(loop.n) if plant.measurement.C is None else np.array(plant.measurement.C)
+    C = plant.measurement.matrix(loop.n)
     model = EstimationModel(
         Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every
     )

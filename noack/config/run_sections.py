@@ -1,12 +1,12 @@
 """The tables of a scenario that describe the run: all but those of a loop, and ``[[loops]]``."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from noack.config.runtime_parameters import full_key
 from noack.core.clock import NS_PER_S
-from noack.settings.section import ScenarioSection, Seed
+from noack.settings.section import ScenarioSection, Seed, Table
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 
@@ -52,13 +52,13 @@ class ScheduledChange(ScenarioSection):
 
     at_s: Annotated[FiniteFloat, Field(ge=0, le=1e7)]
     """Simulated time at which the new values take effect."""
-    set: Annotated[dict[str, Any], Field(min_length=1)]
+    set: Annotated[Table, Field(min_length=1)]
     """The new values by their keys, e.g. "network.loss.probability" = 0.9: the keys of
     network.loss, network.mansd, controller.setpoint, and the numbers of the trigger."""
 
     @field_validator("set")
     @classmethod
-    def _with_full_keys(cls, given: dict[str, Any]) -> dict[str, Any]:
+    def _with_full_keys(cls, given: Table) -> Table:
         settings = {full_key(name): value for name, value in given.items()}
         if len(settings) < len(given):
             raise ValueError("a key is given twice, by its short name, too")
@@ -136,8 +136,6 @@ SHARED = (
 )  # fmt: skip
 """Keys of a scenario that all its loops share."""
 
-Table = dict[str, Any]
-
 
 class LoopSeeds(ScenarioSection):
     """Seeds that an entry of ``[[loops]]`` sets itself; all loops of the entry use them."""
@@ -189,7 +187,7 @@ class LoopSection(ScenarioSection):
 
     @model_validator(mode="before")
     @classmethod
-    def _check(cls, content: Any) -> Any:
+    def _check(cls, content: object) -> object:
         for key in SHARED:
             if isinstance(content, dict) and key in content:
                 raise ValueError(f"{key}: all loops share it; set it at the top level")

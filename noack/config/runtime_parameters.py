@@ -7,9 +7,10 @@ like a scenario file. So a change can only set values that a run could also star
 import json
 from collections.abc import Mapping
 from types import NoneType
-from typing import Any, get_args
+from typing import get_args
 
 from noack.config.toml_file import nearest_key
+from noack.settings.section import ReadTable, Table
 from noack.trigger.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"
@@ -49,7 +50,7 @@ def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
     )
 
 
-def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySettings) -> None:
+def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> None:
     """Raise ValueError unless all keys are runtime parameters; the message lists these."""
     known = (LOSS, MANSD, CONSTRAINTS, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
@@ -63,7 +64,7 @@ def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySetti
             raise ValueError(f"{key}: needs a value")
 
 
-def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
+def put_settings(content: Table, settings: ReadTable) -> None:
     """Write checked settings into a scenario's content; a new loss model replaces all its keys."""
     model = f"{LOSS}.model"
     if model in settings and settings[model] != content["network"]["loss"].get("model"):
@@ -80,17 +81,17 @@ def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
         table[last] = settings[key]
 
 
-def is_of_loss_alone(settings: Mapping[str, Any]) -> bool:
+def is_of_loss_alone(settings: ReadTable) -> bool:
     """Whether a change concerns the loss model only, on which no claim about the run depends."""
     return all(key == LOSS or key.startswith(f"{LOSS}.") for key in settings)
 
 
-def text_of(settings: Mapping[str, Any]) -> str:
+def text_of(settings: ReadTable) -> str:
     """Return settings as text: ``network.mansd = 2, trigger.beta = 0.3``."""
     return ", ".join(f"{key} = {_value(value)}" for key, value in sorted(settings.items()))
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     if isinstance(value, Mapping):
         inner = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
         return f"{{ {inner} }}"
@@ -101,12 +102,12 @@ def _value(value: Any) -> str:
     return json.dumps(value)
 
 
-def _is_number(annotation: Any) -> bool:
+def _is_number(annotation: object) -> bool:
     kinds = [one for one in (get_args(annotation) or (annotation,)) if one is not NoneType]
     return all(kind in (int, float) for kind in kinds)
 
 
-def _has_none(value: Any) -> bool:
+def _has_none(value: object) -> bool:
     if isinstance(value, Mapping):
         return any(map(_has_none, value.values()))
     return any(map(_has_none, value)) if isinstance(value, list | tuple) else value is None

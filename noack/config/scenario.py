@@ -13,7 +13,7 @@ from functools import cache
 from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ValidationError, create_model, model_validator
+from pydantic import ValidationError, create_model, model_validator
 
 from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
 from noack.config.scenario_checks import check_changes, check_sections
@@ -21,7 +21,7 @@ from noack.config.scenario_tables import ScenarioTables
 from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
 from noack.core.random_streams import named_stream_keys, stream
-from noack.settings.section import ScenarioSection
+from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.trigger.periodic_trigger import PeriodicSettings
 
 
@@ -97,7 +97,7 @@ def phases_ns(scenario: Scenario) -> tuple[int, ...]:
 
 
 def with_loop_tables(
-    scenario: Scenario, change: Callable[[str, Scenario], Mapping[str, BaseModel]]
+    scenario: Scenario, change: Callable[[str, Scenario], Mapping[str, ScenarioSection]]
 ) -> Scenario:
     """Return a scenario with other tables in the entries of [[loops]].
 
@@ -107,11 +107,11 @@ def with_loop_tables(
     """
     sections = []
     for place, section in enumerate(scenario.loops or ()):
-        update: dict[str, Any] = {}
+        update: Table = {}
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")
-            content = table.model_dump(mode="json", exclude_none=True)
+            content = table.content()
             if (own := getattr(section, part)) is not None and (not inner or inner in own):
                 update[part] = own | {inner: content} if inner else content
             elif part in (file := update.get("scenario", section.scenario) or {}):
@@ -132,12 +132,12 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
         raise ValueError("scenario: it is read where a scenario file is loaded; give tables here")
     if section.scenario is not None:
         loop = _with_parts(loop, section.scenario, PARTS, "scenario.")
-    content: dict[str, Any] = {} if section.mode is None else {"mode": section.mode}
+    content: Table = {} if section.mode is None else {"mode": section.mode}
     for part, kinds in _KINDS.items():
         if (given := getattr(section, part)) is None:
             continue
         own = getattr(loop, part)
-        template = {} if own is None else own.model_dump(mode="json", exclude_none=True)
+        template = {} if own is None else own.content()
         content[part] = given if any(kind in given for kind in kinds) else template | given
     if content:
         loop = _with_parts(loop, content, content)
@@ -148,7 +148,7 @@ def loop_scenario(scenario: Scenario, section: LoopSection) -> Scenario:
 
 
 def _with_parts(
-    scenario: Scenario, content: Mapping[str, Any], parts: Iterable[str], place: str = ""
+    scenario: Scenario, content: ReadTable, parts: Iterable[str], place: str = ""
 ) -> Scenario:
     """Return a scenario with other parts; raise ValueError, after the place, if one is invalid."""
     model = parts_model(frozenset(parts))
@@ -208,7 +208,7 @@ def _seeds(
 @cache
 def parts_model(parts: frozenset[str], *, others: bool = False) -> type[ScenarioSection]:
     """Return a model of some of a scenario's parts; with ``others``, those are optional keys."""
-    fields: dict[str, Any] = {}
+    fields: Table = {}
     for name, field in Scenario.model_fields.items():
         kind: Any = field.annotation
         if name in parts:

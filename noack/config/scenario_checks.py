@@ -9,23 +9,20 @@ x_c − x_r, with a constant disturbance if the plant does not rest at x_r
 """
 
 import json
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from noack.config.runtime_parameters import (
-    CONSTRAINTS,
     LOSS,
-    MANSD,
     put_settings,
     require_runtime_parameters,
 )
 from noack.config.scenario_tables import ScenarioTables
-from noack.config.sections import AnyController, AnyTrigger, NetworkSection
-from noack.config.toml_file import brief
+from noack.config.sections import AnyController, AnyTrigger
+from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.constraints import require_consistent
@@ -34,18 +31,27 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import require_length, require_shape
+from noack.settings.section import ReadTable, ScenarioSection, Table, require_length, require_shape
 
 S = TypeVar("S", bound=ScenarioTables)
-_AT_FIRST_USE = ConfigDict(defer_build=True)
-_CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
-    LOSS: TypeAdapter(Loss, config=_AT_FIRST_USE),
-    MANSD: TypeAdapter(Mansd, config=_AT_FIRST_USE),
-    CONSTRAINTS: TypeAdapter(Constraints, config=_AT_FIRST_USE),
-    "trigger": TypeAdapter(AnyTrigger, config=_AT_FIRST_USE),
-    "controller": TypeAdapter(AnyController, config=_AT_FIRST_USE),
-}
-"""The parts of a scenario that may change during a run."""
+
+
+class _ChangedNetwork(ScenarioSection):
+    """The keys of the network that a change may set."""
+
+    loss: Loss | None = None
+    mansd: Mansd | None = None
+    constraints: Constraints | None = None
+
+
+class _Change(ScenarioSection):
+    """The tables of a scenario in which a change may set keys; None: it sets none."""
+
+    trigger: AnyTrigger | None = None
+    controller: AnyController | None = None
+    network: _ChangedNetwork | None = None
+
+
 _ROUNDING = 1e-9  # largest Âx_r + B̂u_r that is taken as 0, relative to the larger term
 
 
@@ -231,82 +237,50 @@ def check_changes(scenario: ScenarioTables) -> None:
             raise ValueError(f"changes.{place}.at_s: the run ends at {scenario.horizon_s:g} s")
         try:
             changed = with_settings(changed, change.set)
-        except ValidationError as error:
-            raise ValueError(f"changes.{place}.set: {brief(error)}") from None
         except ValueError as error:
-            raise ValueError(f"changes.{place}.set: {error}") from None
+            raise ValueError(f"changes.{place}.set: {str(error).splitlines()[0]}") from None
 
 
 def prepare_changes() -> None:
     """Build the validators of changes, which takes 20 ms, before a loop needs them."""
-    for part in _CHANGEABLE.values():
-        part.rebuild()
+    _Change.model_rebuild()
 
 
-def with_settings(scenario: S, settings: Mapping[str, Any]) -> S:
+def with_settings(scenario: S, settings: ReadTable) -> S:
     """Return a scenario with other values of its runtime parameters.
 
     Only the parts that change are validated: the processes of a run do this in their loop. Raise
-    ValueError if a key is not a runtime parameter, or the scenario would be invalid.
+    ValueError, with one line per mistake, if a key is not a runtime parameter, or the scenario
+    would be invalid.
     """
     if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
     require_runtime_parameters(settings, scenario.trigger)
-    sections = {key.split(".")[0] for key in settings} - {"network"}
+    sections = {key.split(".")[0] for key in settings}
     changes_loss = any(key.startswith(LOSS) for key in settings)
-    loss = scenario.network.loss
-    content: dict[str, Any] = {
-        name: getattr(scenario, name).model_dump(mode="json", exclude_none=True)
-        for name in sections
-    }
-    content["network"] = {
-        "loss": loss.model_dump(mode="json", exclude_none=True) if changes_loss else {}
-    }
+    content: Table = {name: getattr(scenario, name).content() for name in sections - {"network"}}
+    if "network" in sections:
+        loss = scenario.network.loss.content()
+        content["network"] = {"loss": loss} if changes_loss else {}
     put_settings(content, settings)
-    update: dict[str, Any] = {name: _validated(name, content[name]) for name in sections}
-    update["changes"] = ()
-    update["network"] = _changed_network(scenario, content["network"], changes_loss)
-    changed = scenario.model_copy(update=update)
-    if "trigger" in sections:
-        check_trigger(changed)
-    if "controller" in sections:
-        check_setpoint(changed)
-    if "network" in sections or any(key.startswith("network.") for key in settings):
-        check_kept_loss(changed)
-    return changed
-
-
-def content_with_settings(scenario: ScenarioTables, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario's content with other values of its runtime parameters, unchecked.
-
-    Raise ValueError if a key is not a runtime parameter.
-    """
-    require_runtime_parameters(settings, scenario.trigger)
-    content = scenario.model_dump(mode="json", exclude_none=True, exclude={"changes"})
-    put_settings(content, settings)
-    return content
-
-
-def _changed_network(
-    scenario: ScenarioTables, content: Mapping[str, Any], changes_loss: bool
-) -> NetworkSection:
-    """Return the network with another cap or loss model; its other settings cannot change."""
-    update: dict[str, Any] = {}
-    if "mansd" in content:
-        update["mansd"] = _validated(MANSD, content["mansd"])
-    if "constraints" in content:
-        update["constraints"] = _validated(CONSTRAINTS, content["constraints"])
-        require_consistent(scenario.network.mansd, update["constraints"])
-    if changes_loss:
-        update["loss"] = _validated(LOSS, content["loss"])
-        if isinstance(update["loss"], TraceLoss):
+    try:
+        given = _Change.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        lines = (line.removeprefix(": ") for line in explain(error, "", _Change))
+        raise ValueError("\n".join(lines)) from None
+    update = {name: getattr(given, name) for name in sections}
+    if given.network is not None:
+        if isinstance(given.network.loss, TraceLoss):
             raise ValueError(
                 "network.loss.model: a trace is read before a run begins; give its losses as "
                 '{ model = "scripted", lost = [...] }'
             )
-        require_scores(scenario.network.impairments, update["loss"])
-    return scenario.network.model_copy(update=update)
-
-
-def _validated(part: str, content: Any) -> Any:
-    return _CHANGEABLE[part].validate_json(json.dumps(content))
+        keys = {name: getattr(given.network, name) for name in given.network.model_fields_set}
+        network = update["network"] = scenario.network.model_copy(update=keys)
+        require_consistent(network.mansd, network.constraints)
+        require_scores(network.impairments, network.loss)
+    changed = scenario.model_copy(update={**update, "changes": ()})
+    check_trigger(changed)
+    check_setpoint(changed)
+    check_kept_loss(changed)
+    return changed

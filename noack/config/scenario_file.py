@@ -8,7 +8,7 @@ speed, ports, real-time settings and recovery of the file have no effect.
 
 import copy
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from os.path import commonprefix
 from pathlib import Path
@@ -26,6 +26,7 @@ from noack.config.toml_file import keys as known_keys
 from noack.config.toml_file import nearest_key
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_folder
+from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import FileSettings, file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
@@ -56,7 +57,7 @@ def load(
         raise CallerError(_attributed(str(error), path, keys) if keys else str(error)) from None
 
 
-def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
+def completed(content: ReadTable, path: Path, source: str | None = None) -> Scenario:
     """Validate parsed content and read the files that it names, relative to the scenario file.
 
     ``source`` (by default the path) names the content in error messages: CallerError has one line
@@ -68,14 +69,14 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
     return _with_files(validate(content, source), path, source)
 
 
-def validate(content: Mapping[str, Any], source: str) -> Scenario:
+def validate(content: ReadTable, source: str) -> Scenario:
     """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     return toml_file.validated(Scenario, content, source)
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     network = scenario.network
-    update: dict[str, Any] = {}
+    update: dict[str, object] = {}
     for place, section in network.directions.items():
         read = _read(section, path.parent, f"{source}: {place}")
         _, _, key = place.partition(".")
@@ -96,7 +97,7 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     return with_loop_tables(scenario, lambda place, one: tables(f"{place}.", one))
 
 
-def _read(section: DirectionSection, folder: Path, place: str) -> dict[str, Any]:
+def _read(section: DirectionSection, folder: Path, place: str) -> Table:
     impairments = tuple(
         impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)
@@ -104,9 +105,7 @@ def _read(section: DirectionSection, folder: Path, place: str) -> dict[str, Any]
     return {"loss": section.loss.without_files(folder, f"{place}.loss"), "impairments": impairments}
 
 
-def with_named_scenarios(
-    content: Mapping[str, Any], folder: Path, source: str
-) -> Mapping[str, Any]:
+def with_named_scenarios(content: ReadTable, folder: Path, source: str) -> ReadTable:
     """Return a scenario's content with the tables of the files that its loops name.
 
     Names are relative to ``folder``, or those of shipped scenarios. Raise CallerError, with one
@@ -124,7 +123,7 @@ def with_named_scenarios(
     return {**content, "loops": read}
 
 
-def _loop_tables(path: Path, named: str) -> dict[str, Any]:
+def _loop_tables(path: Path, named: str) -> Table:
     """Return the tables of a loop's file, which the setting ``named`` names."""
     content = toml_file.read(path, Scenario)
     if content.get("loops"):
@@ -153,10 +152,10 @@ def _path(name: str, folder: Path, named: str) -> Path:
 
 def dumps(scenario: Scenario) -> str:
     """Return the scenario as TOML that :func:`load` reads back to an equal scenario."""
-    return toml_text(scenario.model_dump(mode="json", exclude_none=True))
+    return toml_text(scenario.content())
 
 
-def toml_text(content: Mapping[str, Any]) -> str:
+def toml_text(content: ReadTable) -> str:
     """Return tables as TOML, with each row of numbers or names on one line."""
     text = tomli_w.dumps(content, indent=2)
     return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
@@ -192,7 +191,7 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", attributed, lines, flags=re.MULTILINE)
 
 
-def _apply(content: dict[str, Any], override: str) -> str:
+def _apply(content: Table, override: str) -> str:
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         shown = shortened(printable(override))
@@ -215,7 +214,7 @@ def value_of(text: str, source: str) -> Any:
         return text
 
 
-def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
+def put(content: Table, key: str, value: Any, source: str) -> None:
     """Set the value of a key such as ``trigger.beta``, which may be short; create missing tables.
 
     An entry of a list is named by its number: ``network.impairments.0.rate_bps``.

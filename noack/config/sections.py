@@ -5,7 +5,7 @@ have (:func:`noack.settings.section.kinds_in`).
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
@@ -26,16 +26,17 @@ from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
 from noack.settings.section import (
+    Bounds,
+    Deviations,
+    HalfWidthRows,
+    HalfWidths,
     RateHz,
     Row,
     Rows,
     ScenarioSection,
     kinds_in,
     require_length,
-    require_non_negative,
     require_shape,
-    require_squares,
-    require_whole_period,
     shape,
     union_of,
 )
@@ -168,7 +169,7 @@ class ModelSection(ScenarioSection):
         return np.array(self.A), np.array(self.B)
 
 
-def require_read(file: str | None, names: Mapping[Any, str] | None) -> None:
+def require_read(file: str | None, names: object | None) -> None:
     """Raise ValueError if a section still names a file: loading a scenario replaces the name."""
     if file is not None:
         raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
@@ -205,16 +206,10 @@ class MeasurementSection(ScenarioSection):
 
     C: Rows | None = None
     """C by rows, p x n; by default the identity: every state is measured."""
-    noise_std: Row | None = None
+    noise_std: Deviations | None = None
     """Standard deviation of the normally distributed part of v, p entries; by default 0."""
-    noise_bound: Row | None = None
+    noise_bound: Bounds | None = None
     """Bound of the uniformly distributed part of v, p entries; by default 0."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        require_squares(self.noise_std or (), "noise_std", "standard deviations")
-        require_squares(self.noise_bound or (), "noise_bound", "bounds")
-        return self
 
     def outputs(self, n: int) -> int:
         """Number of measured outputs p of a plant of n states."""
@@ -231,12 +226,20 @@ class MeasurementSection(ScenarioSection):
         """Whether there is any noise."""
         return any(self.noise_std or ()) or any(self.noise_bound or ())
 
+    def matrix(self, n: int) -> Matrix:
+        """C of a plant of n states, (p, n)."""
+        return np.eye(n) if self.C is None else np.array(self.C)
+
+    def noise(self, n: int) -> tuple[Vector, Vector]:
+        """Standard deviations of the normal part of v, bounds of the uniform part, (p,) each."""
+        p, given = self.outputs(n), (self.noise_std, self.noise_bound)
+        std, bound = (np.zeros(p) if row is None else np.array(row) for row in given)
+        return std, bound
+
     def variance(self, n: int) -> Vector:
         """Variance of v, shape (p,)."""
-        variance = np.zeros(self.outputs(n))
-        if self.noise_std is not None:
-            variance = variance + np.square(self.noise_std)
-        return variance if self.noise_bound is None else variance + np.square(self.noise_bound) / 3
+        std, bound = self.noise(n)
+        return std**2 + bound**2 / 3
 
     def check(self, n: int, why: str) -> None:
         """Raise ValueError, with the key, unless the shapes fit a model of n states."""
@@ -268,9 +271,9 @@ class PlantSection(ScenarioSection):
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
     one end of its half-width; given: the matrices A and B below."""
-    uncertainty_A: Rows | None = None
+    uncertainty_A: HalfWidthRows | None = None
     """Half-widths of the uncertainty box around Â, n x n."""
-    uncertainty_B: Rows | None = None
+    uncertainty_B: HalfWidthRows | None = None
     """Half-widths of the uncertainty box around B̂, n x m."""
     A: Rows | None = None
     """The true A, n x n, for draw = "given"."""
@@ -282,7 +285,7 @@ class PlantSection(ScenarioSection):
     """Names of the arrays in the file, if they differ from A and B."""
     initial_state: Row
     """x(0), n entries."""
-    initial_state_halfwidth: Row | None = None
+    initial_state_halfwidth: HalfWidths | None = None
     """x(0) is drawn uniformly within these distances of initial_state; n entries."""
     rate_hz: RateHz = 500.0
     """Steps per second of simulated time."""
@@ -295,7 +298,6 @@ class PlantSection(ScenarioSection):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_whole_period(self.rate_hz, "rate_hz")
         require_read(self.file, self.names)
         for key in ("A", "B"):
             matrix = getattr(self, key)
@@ -312,10 +314,6 @@ class PlantSection(ScenarioSection):
             raise ValueError(
                 f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
             )
-        for key in ("uncertainty_A", "uncertainty_B"):
-            for row in getattr(self, key) or ():
-                require_non_negative(row, key)
-        require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
         return self
 
     def noise_variances(self, n: int, m: int) -> NoiseVariances:
@@ -443,7 +441,7 @@ class NetworkSection(DirectionSection):
     @property
     def link(self) -> LinkSettings:
         """The link from sensor to controller."""
-        update: dict[str, Any] = {"first_delivered": self.initial_sync == "first_packet"}
+        update: dict[str, object] = {"first_delivered": self.initial_sync == "first_packet"}
         if not self.enforce_mansd:
             update |= {"mansd": None, "constraints": ()}
         return super().link.model_copy(update=update)

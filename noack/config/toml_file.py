@@ -13,16 +13,29 @@ from contextlib import suppress
 from datetime import date, time
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+)
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import read_regular
-from noack.settings.section import ScenarioSection
+from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
+Value: TypeAlias = Any  # what JSON has
+Kind: TypeAlias = object
+"""The annotation of a value: a class, a union, a list."""
 
 MOST_BYTES = 2**20  # largest size of a settings file
 MOST_LEVELS = 32  # largest number of parts of a dotted key, and of nested tables and lists
@@ -52,7 +65,7 @@ _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}
 
 def read(
     path: Path, model: type[ScenarioSection] = ScenarioSection, most_bytes: int = MOST_BYTES
-) -> dict[str, Any]:
+) -> Table:
     """Read a TOML file of at most ``most_bytes``.
 
     If the file does not exist, the message suggests a similar file of the type ``model`` beside it.
@@ -69,7 +82,7 @@ def read(
     return parsed(text, str(path))
 
 
-def parsed(text: str, source: str) -> dict[str, Any]:
+def parsed(text: str, source: str) -> Table:
     """Parse TOML; ``source`` names it in error messages.
 
     :mod:`tomllib` needs memory for n² parts for a key of n parts. So keys with too many parts are
@@ -92,7 +105,7 @@ def parsed(text: str, source: str) -> dict[str, Any]:
         raise CallerError(f"{source}: {_TOO_LARGE}") from None
 
 
-def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
+def validated(model: type[M], content: ReadTable, source: str) -> M:
     """Validate parsed content; raise CallerError with one line per mistake, named by ``source``."""
     if _is_deeper(content, MOST_LEVELS):
         raise CallerError(f"{source}: {_TOO_DEEP}")
@@ -109,12 +122,12 @@ def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
         raise CallerError("\n".join(explain(error, source, model))) from None
 
 
-def json_schema(model: type[ScenarioSection]) -> dict[str, Any]:
+def json_schema(model: type[ScenarioSection]) -> Table:
     """Return the JSON Schema of a file, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
 
 
-def _is_deeper(value: Any, levels: int) -> bool:
+def _is_deeper(value: object, levels: int) -> bool:
     if not isinstance(value, dict | list | tuple):
         return False
     inner = value.values() if isinstance(value, dict) else value
@@ -194,7 +207,7 @@ _MOST_LINES = 50
 _SIMILAR = 0.8
 """Least similarity of a suggested key, or of its last part, as difflib measures it."""
 _MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
-_LISTS = {
+_LISTS: dict[object, str] = {
     float: "should be a list of numbers, e.g. [1.0, 0.0]",
     int: "should be a list of numbers, e.g. [1, 2]",
     str: 'should be a list of names, e.g. ["a", "b"]',
@@ -256,7 +269,7 @@ def brief(error: ValidationError) -> str:
     return printable(f"{place}: {message}" if place else message)
 
 
-def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
+def _has_inner(place: Sequence[str | int], places: Iterable[Sequence[str | int]]) -> bool:
     """Whether an entry of this list is itself wrong, so that the list seems too short."""
     return any(len(other) > len(place) and other[: len(place)] == place for other in places)
 
@@ -291,23 +304,23 @@ def _explain(mistake: ErrorDetails, root: type[ScenarioSection]) -> str:
 class _Place(NamedTuple):
     """The place of a mistake in a file."""
 
-    path: Sequence[Any]  # of the key
+    path: Sequence[str | int]  # of the key
     section: type[ScenarioSection] | None  # which contains the key
     choices: Mapping[str, type[ScenarioSection]]  # possible tables, by the discriminator's value
     discriminator: str  # the key that selects the table
-    kind: Any  # the annotation of the value
+    kind: Kind  # the annotation of the value
 
 
-def _locate(place: Sequence[Any], root: type[ScenarioSection]) -> _Place:
+def _locate(place: Sequence[str | int], root: type[ScenarioSection]) -> _Place:
     """Find a place; pydantic's path also has the names of selected tables, which are not keys."""
-    kind: Any = root
-    path: list[Any] = []
+    kind: Kind = root
+    path: list[str | int] = []
     section: type[ScenarioSection] | None = None
     alternatives = _choices(kind)
     for part in place:
         choices, _ = _choices(kind)
         if part in choices:
-            kind = choices[part]
+            kind = choices[str(part)]
             continue
         path.append(part)
         kind, section = _within(kind, part)
@@ -315,7 +328,7 @@ def _locate(place: Sequence[Any], root: type[ScenarioSection]) -> _Place:
     return _Place(path, section, *alternatives, kind)
 
 
-def _within(kind: Any, part: Any) -> tuple[Any, type[ScenarioSection] | None]:
+def _within(kind: Kind, part: str | int) -> tuple[Kind, type[ScenarioSection] | None]:
     """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
     section = _section_of(kind)
     if section is not None:
@@ -325,7 +338,7 @@ def _within(kind: Any, part: Any) -> tuple[Any, type[ScenarioSection] | None]:
     return (entries[0] if isinstance(part, int) and entries else None), None
 
 
-def _entry_of(at: _Place) -> Any:
+def _entry_of(at: _Place) -> Kind:
     """Return the entry type of the expected list; for an entry of a row, ``tuple``."""
     lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
     if isinstance(at.path[-1], int) or not lists:
@@ -334,7 +347,7 @@ def _entry_of(at: _Place) -> Any:
     return get_origin(entry) or entry
 
 
-def _share(value: Any, at: _Place) -> str:
+def _share(value: object, at: _Place) -> str:
     """Suggest a share if a percentage was given for a number that is at most 1."""
     field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
     limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
@@ -343,17 +356,18 @@ def _share(value: Any, at: _Place) -> str:
     percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
     if percent is not None:
         value = float(percent[1])
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return f"; {value:g} % is {value / 100:g}" if is_number and 1 < value <= 100 else ""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 < value <= 100:
+        return ""
+    return f"; {value:g} % is {value / 100:g}"
 
 
-def _metadata(kind: Any) -> list[Any]:
+def _metadata(kind: Kind) -> list[Kind]:
     """Return the metadata of an annotation's alternatives, e.g. that they are at most 1."""
     found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
     return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
 
 
-def _alternatives(kind: Any) -> list[Any]:
+def _alternatives(kind: Kind) -> list[Kind]:
     """Return a value's possible types, without metadata: A and B for ``Annotated[A | B, ...]``."""
     if get_origin(kind) is Annotated:
         return _alternatives(get_args(kind)[0])
@@ -362,34 +376,35 @@ def _alternatives(kind: Any) -> list[Any]:
     return [kind]
 
 
-def sections_of(kind: Any) -> list[type[ScenarioSection]]:
+def sections_of(kind: Kind) -> list[type[ScenarioSection]]:
     """Return the tables that a value of an annotation may be."""
     types = [one for one in _alternatives(kind) if isinstance(one, type)]
     return [one for one in types if issubclass(one, ScenarioSection)]
 
 
-def _section_of(kind: Any) -> type[ScenarioSection] | None:
+def _section_of(kind: Kind) -> type[ScenarioSection] | None:
     sections = sections_of(kind)
     return sections[0] if len(sections) == 1 else None
 
 
-def _choices(kind: Any) -> tuple[Mapping[str, type[ScenarioSection]], str]:
+def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     """Return the possible tables of a value by their discriminator, and the discriminator."""
     sections = sections_of(kind)
     if len(sections) < 2:
         return {}, ""
     key = next(
-        name for name, field in sections[0].model_fields.items()
+        name
+        for name, field in sections[0].model_fields.items()
         if get_origin(field.annotation) is Literal
-    )  # fmt: skip
+    )
     return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
 
-def _own_check(key: str, value: Any, message: str) -> str:
+def _own_check(key: str, value: Value, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
-        shown = f" = {show_value(value)}" if isinstance(value, str) else ""
+        shown = "" if isinstance(value, Mapping) else f" = {show_value(value)}"
         return f"{key}{shown}: {message}"
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
@@ -400,7 +415,7 @@ def _own_check(key: str, value: Any, message: str) -> str:
     return f"{path} = {show_value(value)}: {rest}"
 
 
-def _choice(key: str, value: Any, at: _Place) -> str:
+def _choice(key: str, value: object, at: _Place) -> str:
     known = ", ".join(at.choices)
     key = f"{key}.{at.discriminator}"
     if not isinstance(value, Mapping) or at.discriminator not in value:
@@ -411,7 +426,7 @@ def _choice(key: str, value: Any, at: _Place) -> str:
     return f"{key} = {show_value(chosen)}: must be one of {known}{hint}"
 
 
-def _table_example(value: Any, at: _Place) -> str:
+def _table_example(value: object, at: _Place) -> str:
     """Return an example of the table: of the kind that the value names, or for a user's class."""
     known = isinstance(value, str) and value in at.choices
     if not known and "python" in at.choices and str(value).isidentifier():
@@ -450,7 +465,7 @@ def _nearest(key: str, section: type[ScenarioSection] | None) -> str:
     return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"
 
 
-def show_value(value: Any) -> str:
+def show_value(value: object) -> str:
     """Return a value as JSON, cut off after 60 characters."""
     text = json.dumps(value, default=str, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."

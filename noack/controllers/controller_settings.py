@@ -1,14 +1,14 @@
 """The settings and the interface that every kind of controller has."""
 
 from abc import abstractmethod
-from typing import Annotated, ClassVar, NamedTuple, Protocol, Self
+from typing import Annotated, ClassVar, NamedTuple, Protocol
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat
 
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import RateHz, Row, ScenarioSection, require_whole_period
+from noack.settings.section import RateHz, Row, ScenarioSection
 
 
 class ControlModel(NamedTuple):
@@ -72,11 +72,6 @@ class ControllerSettings(ScenarioSection):
     """Number of inputs in an actuation: that of the tick, and those of the model for the following
     ticks. The plant applies each at its time, until a newer actuation arrives (packetised
     predictive control)."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        require_whole_period(self.rate_hz, "rate_hz")
-        return self
 
     @abstractmethod
     def law(self, model: ControlModel) -> ControlLaw:

@@ -39,12 +39,12 @@ def seconds(value_s: float | None) -> str:
 
 def duration(value_s: float) -> str:
     """Write a time with three digits, in s, ms, µs or ns."""
-    return _with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
+    return with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
 
 
 def byte_size(value: float) -> str:
     """Write a number of bytes with three digits, in GB, MB, kB or bytes."""
-    return _with_unit(value, ("GB", "MB", "kB", "bytes"))
+    return with_unit(value, ("GB", "MB", "kB", "bytes"))
 
 
 def ratio(part: int, of: int) -> str:
@@ -57,11 +57,14 @@ def percent(share: float) -> str:
     return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
-def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
-    size, unit = next(
-        (pair for pair in zip(_SIZES, units, strict=False) if abs(value) >= pair[0]), (1, units[-1])
-    )
-    return f"{value / size:.3g} {unit}"
+def with_unit(value: float, units: tuple[str, str, str, str]) -> str:
+    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
+    for unit, size in zip(units, _SIZES, strict=False):
+        if abs(value) >= 0.9995 * size:
+            part = abs(value) / size
+            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
+            return f"{value / size:.{digits}f} {unit}"
+    return f"{value:.0f} {units[-1]}"
 
 
 def plus_minus(mean: float, halfwidth: float) -> str:

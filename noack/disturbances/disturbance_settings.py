@@ -7,12 +7,12 @@ input is added to u after the actuator, where it is not measured. A disturbance 
 
 import math
 from abc import abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.settings.section import Row, ScenarioSection
+from noack.settings.section import Row, ScenarioSection, Table
 
 Place = Literal["input", "state"]
 
@@ -30,7 +30,7 @@ class DisturbanceSettings(ScenarioSection):
 
     entries_key: ClassVar[str]
     """The key that gives the disturbance's size, one entry per input or per state."""
-    example: ClassVar[dict[str, Any]]
+    example: ClassVar[Table]
     """Settings of this kind with one entry, for property tests and benchmarks."""
 
     kind: str

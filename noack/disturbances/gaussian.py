@@ -1,14 +1,13 @@
 """A random disturbance without a bound."""
 
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import model_validator
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import normals
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Row, require_squares
+from noack.settings.section import Deviations
 
 
 class GaussianDisturbance(DisturbanceSettings):
@@ -18,13 +17,8 @@ class GaussianDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "gaussian", "std": [0.2]}
 
     kind: Literal["gaussian"]
-    std: Row
+    std: Deviations
     """Standard deviation of the value of a step, entry by entry."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        require_squares(self.std, "std", "standard deviations")
-        return self
 
     @property
     def variance(self) -> Vector:

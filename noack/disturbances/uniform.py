@@ -1,14 +1,13 @@
 """A random disturbance with a bound."""
 
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import model_validator
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms
 from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
-from noack.settings.section import Row, require_squares
+from noack.settings.section import Bounds
 
 
 class UniformDisturbance(DisturbanceSettings):
@@ -18,13 +17,8 @@ class UniformDisturbance(DisturbanceSettings):
     example: ClassVar = {"kind": "uniform", "bound": [0.3]}
 
     kind: Literal["uniform"]
-    bound: Row
+    bound: Bounds
     """Largest absolute value, entry by entry."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        require_squares(self.bound, "bound", "bounds")
-        return self
 
     @property
     def variance(self) -> Vector:

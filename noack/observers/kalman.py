@@ -6,16 +6,16 @@ symmetric and positive semidefinite for any rounding error of L.
 """
 
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
 
 from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_memory import CoreMemory, Structure, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
-from noack.settings.section import Row, Rows, require_length, require_shape, require_squares
+from noack.settings.section import Deviations, Rows, require_length, require_shape
 
 
 class KalmanSettings(ObserverSettings):
@@ -26,26 +26,24 @@ class KalmanSettings(ObserverSettings):
     }  # fmt: skip
 
     kind: Literal["kalman"]
-    process_std: Row | None = None
+    process_std: Deviations | None = None
     """Standard deviation of w in ẋ = Âx + B̂u + w, constant over a step of the plant, n entries; by
     default that of the random disturbances at = "state"."""
-    input_std: Row | None = None
+    input_std: Deviations | None = None
     """Standard deviation of the disturbance of u, constant over a step, m entries; by default that
     of the random disturbances at = "input"."""
     Q: Rows | None = None
     """Instead of process_std and input_std: covariance of the noise added to x in a plant step, n x
     n."""
-    noise_std: Row | None = None
+    noise_std: Deviations | None = None
     """Standard deviation of v, p entries; by default that of the measurement."""
     R: Rows | None = None
     """Instead of noise_std: covariance of v, p x p."""
-    initial_std: Row
+    initial_std: Deviations
     """Standard deviation of x − x̂ before the first measurement, n entries: P(0) = diag(·²)."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for key in ("process_std", "input_std", "noise_std", "initial_std"):
-            require_squares(getattr(self, key) or (), key, "standard deviations")
         for key, others in (("Q", ("process_std", "input_std")), ("R", ("noise_std",))):
             for other in others:
                 if getattr(self, key) is not None and getattr(self, other) is not None:
@@ -55,9 +53,11 @@ class KalmanSettings(ObserverSettings):
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
         super().check(n, m, p, noise)
         for key, expected, what in (
-            ("process_std", n, "state"), ("input_std", m, "input"), ("noise_std", p, "output"),
+            ("process_std", n, "state"),
+            ("input_std", m, "input"),
+            ("noise_std", p, "output"),
             ("initial_std", n, "state"),
-        ):  # fmt: skip
+        ):
             require_length(getattr(self, key), f"observer.{key}", expected, f"one per {what}")
         require_shape(self.Q, "observer.Q", (n, n), "a covariance of states")
         require_shape(self.R, "observer.R", (p, p), "a covariance of outputs")
@@ -115,7 +115,9 @@ class KalmanSettings(ObserverSettings):
             for _ in range(assumed.steps):
                 core.noack_observer_predict(observer, n, m, nothing)
 
-    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+    def fill(
+        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+    ) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {
             "kind": core.NOACK_KALMAN, "P": np.diag(np.square(self.initial_std)),

@@ -6,13 +6,13 @@ the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
 
 from collections.abc import Iterator
 from itertools import repeat
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
 from noack.core.core_library import core
-from noack.core.core_memory import CoreMemory
+from noack.core.core_memory import CoreMemory, Structure
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import (
@@ -91,6 +91,8 @@ class LuenbergerSettings(ObserverSettings):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         return repeat(np.array(self.gain))
 
-    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+    def fill(
+        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+    ) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {"kind": core.NOACK_LUENBERGER, "gain": np.array(self.gain)})

@@ -7,13 +7,13 @@ observability of a pair (A, C), and pole placement for an observer.
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from noack.core.core_memory import CoreMemory
+from noack.core.core_memory import CoreMemory, Structure
 from noack.core.linear_systems import Matrix, Vector
-from noack.settings.section import Row, ScenarioSection, require_length
+from noack.settings.section import Row, ScenarioSection, Table, require_length
 
 _RANK_TOLERANCE = 1e-9
 _POLE_TOLERANCE = 1e-6
@@ -57,7 +57,7 @@ def _covariance(through: Matrix, variance: Vector) -> Matrix:
 class ObserverSettings(ScenarioSection):
     """Settings of an observer."""
 
-    example: ClassVar[dict[str, Any]]
+    example: ClassVar[Table]
     """Settings of this kind for two states, one input and one output, for property tests."""
 
     kind: str
@@ -96,7 +96,9 @@ class ObserverSettings(ScenarioSection):
     def gains(self, assumed: EstimationModel) -> Iterator[Matrix]:
         """Yield L of every measurement, (n, p), without end."""
 
-    def fill(self, observer: Any, assumed: EstimationModel, x: Vector, memory: CoreMemory) -> None:
+    def fill(
+        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+    ) -> None:
         """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
         (n, n), p = assumed.Ad.shape, len(assumed.C)
         memory.fill(observer, {

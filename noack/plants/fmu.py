@@ -52,7 +52,11 @@ _LONGEST = 300
 _PREFIX = "noack-native-"
 _STREAMS = (1, 2)
 _LIBC = ctypes.CDLL(None)
-Refusal = Callable[[Any], str | None]
+Library = Any  # FMPy
+Fmu = Any  # its instance of an FMU
+Description = Any  # what the FMU says of itself
+Variable = Any  # one of its variables
+Refusal = Callable[[Variable], str | None]
 """Returns why a variable is unsuitable; None if it is suitable."""
 
 
@@ -102,7 +106,6 @@ class FmuSettings(FileSettings, PlantSettings):
         require_length(self.operating_input, "plant.system.operating_input", m, why)
 
     def system(self, start: PlantStart) -> PlantSystem:
-
         return FmuSystem(self, start.x0)
 
 
@@ -155,7 +158,7 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _described(self, path: Path) -> Any:
+    def _described(self, path: Path) -> Description:
         fmpy = _fmpy()
         try:
             with path.open("rb") as file:  # FMPy does not close a file that it cannot read
@@ -168,7 +171,9 @@ class FmuSystem:
             self._wrong("is not for co-simulation; export it as a co-simulation FMU")
         return description
 
-    def _loaded(self, path: Path, end: contextlib.ExitStack, description: Any) -> "_Instance":
+    def _loaded(
+        self, path: Path, end: contextlib.ExitStack, description: Description
+    ) -> "_Instance":
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
         self._require_binary(folder, description)
@@ -184,7 +189,7 @@ class FmuSystem:
         end.callback(instance.release)
         return instance
 
-    def _require_binary(self, folder: Path, description: Any) -> None:
+    def _require_binary(self, folder: Path, description: Description) -> None:
         fmpy = _fmpy()
         modern = description.fmiVersion.startswith("3.")
         platform = fmpy.platform_tuple if modern else fmpy.platform
@@ -197,7 +202,7 @@ class FmuSystem:
         hint = "; it has sources, which `fmpy compile` can compile" if sources else ""
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
-    def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
+    def _start(self, settings: FmuSettings, x0: Vector, description: Description) -> None:
         fmu, variables = self._instance.fmu, _Variables(description)
 
         def port(key: str, names: Sequence[str], refusal: Refusal = lambda variable: None) -> _Port:
@@ -234,7 +239,7 @@ class FmuSystem:
 class _Instance:
     """An instance of an FMU, and its state by the standard."""
 
-    def __init__(self, fmu: Any) -> None:
+    def __init__(self, fmu: Fmu) -> None:
         self.fmu = fmu
         self.started = False
         self.status = 0
@@ -274,12 +279,12 @@ class _Variables:
     If a variable is missing or unsuitable, every method raises a CallerError of one line.
     """
 
-    def __init__(self, description: Any) -> None:
-        self._known: Mapping[str, Any] = {
+    def __init__(self, description: Description) -> None:
+        self._known: Mapping[str, Variable] = {
             variable.name: variable for variable in description.modelVariables
         }
 
-    def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Any]:
+    def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Variable]:
         """Return real scalars that are not refused."""
         variables = [self._named(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
@@ -290,7 +295,7 @@ class _Variables:
                 _refuse(key, variable, why)
         return variables
 
-    def parameter(self, name: str, value: object) -> tuple[Any, Any]:
+    def parameter(self, name: str, value: object) -> tuple[Variable, object]:
         """Return a variable and its start value."""
         variable = self._named("parameters", name)
         kinds, needed = _VALUES.get(variable.type, ((int,), "a whole number"))
@@ -304,7 +309,7 @@ class _Variables:
             _refuse("parameters", variable, why)
         return variable, value
 
-    def _named(self, key: str, name: str) -> Any:
+    def _named(self, key: str, name: str) -> Variable:
         if name in self._known:
             return self._known[name]
         close = difflib.get_close_matches(name, self._known, n=1)
@@ -313,14 +318,14 @@ class _Variables:
         raise CallerError(f'plant.system.{key}: the FMU has no variable "{name}"; {hint}')
 
 
-def _refuse(key: str, variable: Any, why: str) -> NoReturn:
+def _refuse(key: str, variable: Variable, why: str) -> NoReturn:
     raise CallerError(f'plant.system.{key}: the FMU\'s "{variable.name}" {why}')
 
 
 class _Port:
     """Real variables of an instance, read or set together."""
 
-    def __init__(self, fmu: Any, variables: Sequence[Any]) -> None:
+    def __init__(self, fmu: Fmu, variables: Sequence[Variable]) -> None:
         self._fmu, self._size = fmu, len(variables)
         places: dict[str, tuple[list[int], list[int]]] = {}
         for index, variable in enumerate(variables):
@@ -342,49 +347,49 @@ class _Port:
             _set(self._fmu, kind, references, values[at].tolist())
 
 
-def _set(fmu: Any, kind: str, references: Sequence[int], values: Sequence[Any]) -> None:
+def _set(fmu: Fmu, kind: str, references: Sequence[int], values: Sequence[object]) -> None:
     if kind == "Enumeration":
         kind = "Int64" if hasattr(fmu, "setInt64") else "Integer"
     getattr(fmu, f"set{kind}")(references, values)
 
 
-def _not_a_real_scalar(variable: Any) -> str | None:
+def _not_a_real_scalar(variable: Variable) -> str | None:
     if variable.type not in _REAL:
         return f"is of type {variable.type}; real numbers are needed"
     return "is an array; name scalar variables" if variable.dimensions else None
 
 
-def _not_readable(variable: Any) -> str | None:
+def _not_readable(variable: Variable) -> str | None:
     readable = variable.causality in ("output", "local")
     return None if readable else f"is neither output nor local, but {variable.causality}"
 
 
-def _not_an_input(variable: Any) -> str | None:
+def _not_an_input(variable: Variable) -> str | None:
     return None if variable.causality == "input" else f"is no input, but {variable.causality}"
 
 
-def _not_settable(variable: Any) -> str | None:
+def _not_settable(variable: Variable) -> str | None:
     """Refuse a variable that cannot be set before the initialisation."""
-    from fmpy.simulation import settable_in_instantiated
+    from fmpy.simulation import settable_in_instantiated  # an extra of noack
 
     if settable_in_instantiated(variable):
         return None
     return "cannot be set at the start"
 
 
-def _not_initial(variable: Any) -> str | None:
+def _not_initial(variable: Variable) -> str | None:
     """Refuse a variable to which x(0) cannot be written."""
     why = _not_settable(variable)
     return why and f"{why}; name variables whose initial is exact or approx, or none: []"
 
 
-def _about(description: Any) -> str:
+def _about(description: Description) -> str:
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"
 
 
-def _fmpy() -> Any:
+def _fmpy() -> Library:
     with contextlib.redirect_stdout(io.StringIO()):  # the import prints warnings about the platform
         import fmpy
     return fmpy

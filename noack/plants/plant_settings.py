@@ -9,7 +9,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
+from typing import Annotated, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +17,7 @@ from pydantic import Field
 from noack.core.errors import CallerError, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.wire_format import MAX_DIMENSION
-from noack.settings.section import ScenarioSection
+from noack.settings.section import ScenarioSection, Table
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
@@ -96,7 +96,7 @@ class PlantSettings(ScenarioSection):
     """The module that this kind needs, and the extra of noack that installs it."""
     scenario: ClassVar[str | None] = None
     """A shipped scenario with this kind, for tests and benchmarks."""
-    variants: ClassVar[tuple[dict[str, Any], ...]] = ({},)
+    variants: ClassVar[tuple[Table, ...]] = ({},)
     """Settings that tests and benchmarks use one after the other."""
 
     kind: str

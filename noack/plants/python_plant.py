@@ -5,7 +5,7 @@ but not the run.
 """
 
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -20,7 +20,14 @@ from noack.plants.plant_settings import (
     PlantSystem,
     SystemFailedError,
 )
-from noack.settings.user_files import ClassSettings, new_instance, read_only, real_vector, user_code
+from noack.settings.user_files import (
+    ClassSettings,
+    UserCode,
+    new_instance,
+    read_only,
+    real_vector,
+    user_code,
+)
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
@@ -84,7 +91,7 @@ class PythonSystem:
         if self._recorded:
             self.z = real_vector("z", self._system.z, self._recorded)
 
-    def _make_system(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
+    def _make_system(self, plant: UserCode, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
             both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
             raise TypeError(f"it has {both} advance; one of them is needed")
@@ -114,16 +121,16 @@ class PythonSystem:
 class _Stepping:
     """An object that advances itself."""
 
-    def __init__(self, plant: Any, x0: Vector) -> None:
+    def __init__(self, plant: UserCode, x0: Vector) -> None:
         self._plant = plant
         plant.start(x0.copy())
 
     @property
-    def x(self) -> Any:
+    def x(self) -> UserCode:
         return self._plant.x
 
     @property
-    def z(self) -> Any:
+    def z(self) -> UserCode:
         return self._plant.z
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:

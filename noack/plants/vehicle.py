@@ -65,6 +65,9 @@ _TYRE_FIELDS = [
     ("cambers", (np.float64, _WHEELS), np.zeros(_WHEELS)),
 ]
 """Fields, and their values, that a compiled vehicle has besides the library's tyre parameters."""
+Compiled = Any  # a function, by numba
+Parameters = Any
+"""A parameter set of the library, or an array of one record of it."""
 Rates = Callable[[Vector, float, float], Vector]
 """ż as a function of z (N,), steering rate (rad/s) and acceleration (m/s²)."""
 
@@ -83,9 +86,11 @@ class VehicleSettings(EquationSettings):
     needs: ClassVar = ("vehiclemodels", "vehicle")
     scenario: ClassVar = "lane_vehicle"
     variants: ClassVar = (
-        {"model": "kinematic"}, {"model": "single_track"}, {"model": "drift"},
+        {"model": "kinematic"},
+        {"model": "single_track"},
+        {"model": "drift"},
         {"model": "multi_body"},
-    )  # fmt: skip
+    )
 
     kind: Literal["vehicle"]
     model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"
@@ -191,16 +196,16 @@ class VehicleSettings(EquationSettings):
 class _Model(NamedTuple):
     """One of the library's models."""
 
-    start: Callable[[Vector, float, Any], list[float]]
+    start: Callable[[Vector, float, Parameters], list[float]]
     """z(0) from x(0), the speed and the parameters."""
-    output: Callable[[Vector, Any], Vector]
+    output: Callable[[Vector, Parameters], Vector]
     """x from z and the parameters."""
     relative: float = 1e-9
     """Relative tolerance of the integration."""
 
 
 @cache
-def _load_parameters(settings: VehicleSettings) -> Any:
+def _load_parameters(settings: VehicleSettings) -> Parameters:
     number = _PARAMETERS[settings.parameters]
     parameters = library(f"parameters_vehicle{number}")()
     parameters.tire.p_dx1 *= settings.friction
@@ -208,30 +213,30 @@ def _load_parameters(settings: VehicleSettings) -> Any:
     return parameters
 
 
-def _start(x0: Vector, speed: float, parameters: Any) -> list[float]:
+def _start(x0: Vector, speed: float, parameters: Parameters) -> list[float]:
     sideways, rate, yaw, lateral = x0.tolist()
     slip = math.atan2(-sideways, speed)
     return [0.0, -lateral, 0.0, math.hypot(sideways, speed), yaw, rate, slip]
 
 
-def _output(z: Vector, parameters: Any) -> Vector:
+def _output(z: Vector, parameters: Parameters) -> Vector:
     return np.array([-z[3] * math.sin(z[6]), z[5], z[4], -z[1]])
 
 
-def _start_kinematic(x0: Vector, speed: float, parameters: Any) -> list[float]:
+def _start_kinematic(x0: Vector, speed: float, parameters: Parameters) -> list[float]:
     # The reference point of this model is the rear axle; V follows from r, and the steering sets r.
     _, rate, yaw, lateral = x0.tolist()
     steering = math.atan(rate * (parameters.a + parameters.b) / speed)
     return [0.0, -lateral - parameters.b * math.sin(yaw), steering, speed, yaw]
 
 
-def _output_kinematic(z: Vector, parameters: Any) -> Vector:
+def _output_kinematic(z: Vector, parameters: Parameters) -> Vector:
     behind, wheelbase = parameters.b, parameters.a + parameters.b
     rate = z[3] * math.tan(z[2]) / wheelbase
     return np.array([-behind * rate, rate, z[4], -z[1] - behind * math.sin(z[4])])
 
 
-def _start_by_library(name: str, x0: Vector, speed: float, parameters: Any) -> list[float]:
+def _start_by_library(name: str, x0: Vector, speed: float, parameters: Parameters) -> list[float]:
     started: list[float] = library(name)(_start(x0, speed, parameters), parameters)
     return started
 
@@ -252,7 +257,7 @@ _MODELS = {
 class CompiledVehicle:
     """A vehicle's compiled equations and their integrator."""
 
-    def __init__(self, advance: Any, parameters: Any) -> None:
+    def __init__(self, advance: Compiled, parameters: Parameters) -> None:
         self._advance = advance
         self._parameters = _record(parameters)
         self._work = buffers(0, _WHEELS)
@@ -296,7 +301,7 @@ def library(module: str, name: str | None = None) -> Any:
     return getattr(import_module(f"{_LIBRARY}.{module}"), name or module)
 
 
-def equations(model: str, parameters: Any) -> Rates:
+def equations(model: str, parameters: Parameters) -> Rates:
     """Return the equations of a model (the library's name, e.g. ``st``) for a vehicle."""
     if (compiled := compiled_vehicle(model, parameters)) is not None:
         return compiled.rates
@@ -304,21 +309,21 @@ def equations(model: str, parameters: Any) -> Rates:
     return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
 
 
-def compiled_vehicle(model: str, parameters: Any) -> CompiledVehicle | None:
+def compiled_vehicle(model: str, parameters: Parameters) -> CompiledVehicle | None:
     """Return a vehicle's compiled equations; None if they run as Python code."""
     advance = compiled_dynamics(model)
     return None if advance is None else CompiledVehicle(advance, parameters)
 
 
 @cache
-def compiled_dynamics(model: str) -> Any:
+def compiled_dynamics(model: str) -> Compiled | None:
     """Return a model's compiled integrator; None if its equations run as Python code.
 
     The first call on a machine compiles them, which takes long.
     """
     if model not in _COMPILED:
         return None
-    import numba
+    import numba  # an extra of noack
     from numba.core.errors import NumbaError
 
     if not is_compiled(model):
@@ -342,8 +347,9 @@ def is_compiled(model: str) -> bool:
     return model not in _COMPILED or is_kept(_folder(model), _integrator(_dynamics(model)))
 
 
-def _dynamics(model: str) -> Any:
-    return library(f"vehicle_dynamics_{model}")
+def _dynamics(model: str) -> FunctionType:
+    dynamics: FunctionType = library(f"vehicle_dynamics_{model}")
+    return dynamics
 
 
 def _print(line: str) -> None:
@@ -351,11 +357,11 @@ def _print(line: str) -> None:
         print(f"noack: {line}", file=sys.stderr, flush=True)
 
 
-def _integrator(dynamics: Callable[..., Any]) -> Callable[..., int]:
+def _integrator(dynamics: FunctionType) -> Callable[..., int]:
     def integrate(
         z: Vector,
         v: Vector,
-        parameters: Any,
+        parameters: Parameters,
         duration_s: float,
         tolerances: tuple[float, float],
         work: Work,
@@ -366,10 +372,10 @@ def _integrator(dynamics: Callable[..., Any]) -> Callable[..., int]:
 
 
 def rates(
-    dynamics: Any,
+    dynamics: FunctionType,
     z: Vector,
     v: Vector,
-    parameters: Any,
+    parameters: Parameters,
     signs: Vector,
     cambers: Vector,
     slope: Vector,
@@ -388,8 +394,8 @@ def rates(
         cambers[k] = tyre.cambers[k]
 
 
-def _compiled(model: str) -> Any:
-    from numba.extending import overload, register_jitable
+def _compiled(model: str) -> Compiled:
+    from numba.extending import overload, register_jitable  # an extra of noack
 
     dynamics, lateral = _dynamics(model), library("utils.tire_model", "formula_lateral")
     own = [member for _, member in inspect.getmembers(jump_integrator, inspect.isfunction)]
@@ -406,7 +412,7 @@ def _held(alpha: Any, gamma: Any, F_z: Any, p: Any) -> Any:
     The library calls it for one wheel after the other. Its shifts are s (p₁ + p₃ |γ|) with the sign
     s of the camber γ. With −p₁ instead of p₁ it computes them for the other sign.
     """
-    from numba.extending import register_jitable
+    from numba.extending import register_jitable  # an extra of noack
 
     original = library("utils.tire_model", "formula_lateral")
     formula = FunctionType(original.__code__, original.__globals__)
@@ -452,7 +458,7 @@ def _named(function: FunctionType) -> Iterator[FunctionType]:
             yield value
 
 
-def _record(parameters: Any) -> NDArray[np.void]:
+def _record(parameters: Parameters) -> NDArray[np.void]:
     """A vehicle's parameters as an array of one record; its type is the same for all vehicles."""
 
     def convert(section: Any) -> tuple[list[Any], tuple[Any, ...]]:

@@ -6,6 +6,7 @@ A kind of settings is one module: a module in the kind's folder adds it (:func:`
 import ast
 import inspect
 import json
+import math
 import sys
 from collections.abc import Iterable, Mapping
 from functools import cache, reduce
@@ -16,6 +17,7 @@ from pkgutil import iter_modules
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Discriminator,
@@ -30,13 +32,15 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 
+Table = dict[str, Any]
+"""A table of a settings file before it is validated: the values that JSON has."""
+ReadTable = Mapping[str, Any]
+"""The same, where it is only read."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
-RateHz = Annotated[FiniteFloat, Field(ge=1e-6, le=100_000)]
-"""A run has at most 1e7 s: the times of its steps fit into 64 bits."""
 
 
 class ScenarioSection(BaseModel):
@@ -45,6 +49,10 @@ class ScenarioSection(BaseModel):
     # Validators are built at their first use, that of a scenario with those of all its tables. So
     # defaults in classes are made by model_construct, which needs no validator.
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
+
+    def content(self) -> Table:
+        """Return the table as JSON has it, without keys that have no value."""
+        return self.model_dump(mode="json", exclude_none=True)
 
     @classmethod
     def key_descriptions(cls) -> dict[str, str]:
@@ -61,7 +69,7 @@ class ScenarioSection(BaseModel):
     @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler, /
-    ) -> dict[str, Any]:
+    ) -> Table:
         """Return the JSON Schema with the descriptions of the keys."""
         schema = handler(core_schema)
         properties = handler.resolve_ref_schema(schema).get("properties", {})
@@ -95,23 +103,47 @@ def period_ns(rate_hz: float) -> int:
     return round(NS_PER_S / rate_hz)
 
 
-def require_whole_period(rate_hz: float, key: str) -> None:
+def _with_whole_period(rate_hz: float) -> float:
     """Raise ValueError unless the rate's period is a whole number of nanoseconds."""
     whole_ns = period_ns(rate_hz)
     if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
         raise ValueError(
-            f"{key}: the period must be a whole number of nanoseconds; "
+            "the period must be a whole number of nanoseconds; "
             f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
         )
+    return rate_hz
 
 
+RateHz = Annotated[FiniteFloat, Field(ge=1e-6, le=100_000), AfterValidator(_with_whole_period)]
+"""A run has at most 1e7 s: the times of its steps fit into 64 bits."""
 Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A vector."""
 Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A matrix by rows."""
 
-_LARGEST = 1e100
 _LONGEST_SHOWN = 60
+
+
+def _not_negative(what: str, most: float = math.inf) -> AfterValidator:
+    """Require entries from 0 to ``most``; the squares of larger ones might overflow."""
+
+    def check(row: tuple[float, ...]) -> tuple[float, ...]:
+        if any(entry < 0 for entry in row):
+            raise ValueError(f"{what} cannot be negative")
+        if any(entry > most for entry in row):
+            raise ValueError(f"{what} can be {most:g} at most")
+        return row
+
+    return AfterValidator(check)
+
+
+Deviations = Annotated[Row, _not_negative("standard deviations", 1e100)]
+"""Standard deviations, entry by entry."""
+Bounds = Annotated[Row, _not_negative("bounds", 1e100)]
+"""Largest absolute values, entry by entry."""
+HalfWidths = Annotated[Row, _not_negative("half-widths")]
+"""Half-widths of intervals, entry by entry."""
+HalfWidthRows = Annotated[tuple[HalfWidths, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 
 
 def rows_of(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
@@ -150,19 +182,6 @@ def require_length(row: tuple[object, ...] | None, key: str, expected: int, why:
     """Raise ValueError if a vector or list of names is given and has another length."""
     if row is not None and len(row) != expected:
         raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
-
-
-def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-widths") -> None:
-    """Raise ValueError if an entry of a vector is negative; ``what`` names the entries."""
-    if any(entry < 0 for entry in row):
-        raise ValueError(f"{key}: {what} cannot be negative")
-
-
-def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
-    """Raise ValueError if an entry is negative, or its square overflows."""
-    require_non_negative(row, key, what)
-    if any(entry > _LARGEST for entry in row):
-        raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")
 
 
 Settings = TypeVar("Settings", bound=ScenarioSection)

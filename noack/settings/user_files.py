@@ -26,6 +26,8 @@ from noack.core.file_access import read_regular
 from noack.core.linear_systems import Vector
 from noack.settings.section import Row, Rows, ScenarioSection
 
+UserCode = Any
+"""A class of the user, an object of it, or what its code returns."""
 MOST_BYTES = 64 * 2**20
 """Largest size of a file that is read completely."""
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -158,7 +160,7 @@ class ClassSettings(FileSettings):
         return self
 
 
-def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
+def new_instance(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
     """Return an instance of the class that loaded settings name, and a description of the class.
 
     Raises:
@@ -195,7 +197,7 @@ def read_only(values: Vector) -> Vector:
     return copy
 
 
-def real_vector(what: str, value: Any, size: int) -> Vector:
+def real_vector(what: str, value: UserCode, size: int) -> Vector:
     """Return a copy of a return value of the user's code, shape (size,).
 
     Raises:
@@ -211,7 +213,7 @@ def real_vector(what: str, value: Any, size: int) -> Vector:
     return found
 
 
-def _class(settings: ClassSettings, place: str) -> tuple[Any, str]:
+def _class(settings: ClassSettings, place: str) -> tuple[UserCode, str]:
     if settings.file is not None:
         path = unchanged(settings, place)
         return _attribute(_executed(path), settings.name), f"class {settings.name} of {path.name}"
@@ -232,7 +234,7 @@ def _class(settings: ClassSettings, place: str) -> tuple[Any, str]:
     return entry.load(), f"class {entry.value}{version}"
 
 
-def _attribute(module: ModuleType, name: str) -> Any:
+def _attribute(module: ModuleType, name: str) -> UserCode:
     if not hasattr(module, name):
         raise LookupError(f"{Path(module.__file__ or module.__name__).name} has no {name}")
     return getattr(module, name)
@@ -254,5 +256,5 @@ def _is_ours(frame: traceback.FrameSummary) -> bool:
     )
 
 
-def _as_list(value: Any) -> Any:
+def _as_list(value: object) -> object:
     return [_as_list(one) for one in value] if isinstance(value, tuple) else value

@@ -4,7 +4,7 @@ Stability is practical: the state ends in a neighbourhood of 0 of the size of δ
 inter-event time is positive for bounded states, as e_s grows from 0 at a bounded rate.
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
@@ -13,13 +13,11 @@ from noack.trigger.trigger_rule import TriggerRule, error_form
 class AbsoluteSettings(WeightedSettings):
     """Send-on-delta: transmit when ‖e_s‖_W > δ."""
 
+    example_keys: ClassVar = {"delta": 0.05}
+
     policy: Literal["absolute"]
     delta: Size
     """δ, in the units of ‖W x‖."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="absolute", delta=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         form = error_form(len(model.A), self.weight_matrix)
@@ -28,11 +26,3 @@ class AbsoluteSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖ > {self.delta:g}"
-
-    @property
-    def largest_threshold(self) -> float:
-        return self.delta
-
-    @property
-    def least_threshold(self) -> float:
-        return self.delta

@@ -40,20 +40,8 @@ class CombinedSettings(PolicySettings):
     def weight(self) -> Rows | None:
         return self.rule.weight
 
-    @property
-    def threshold_decay_per_s(self) -> float:
-        return self.rule.threshold_decay_per_s
-
     def at_origin(self, t_s: float) -> Self:
         return self.model_copy(update={"rule": self.rule.at_origin(t_s)})
-
-    @property
-    def largest_threshold(self) -> float:
-        return self.rule.largest_threshold
-
-    @property
-    def least_threshold(self) -> float | None:
-        return self.rule.least_threshold
 
     def check(self, n: int, why: str) -> None:
         try:

@@ -4,32 +4,28 @@ This is the combined rule of Garcia & Antsaklis's earlier work (the paper's refe
 if the controller receives nothing for T_max, an update was lost. The rule's error bound holds.
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from noack.trigger.combined import CombinedSettings
-from noack.trigger.mixed import MixedSettings
 from noack.trigger.trigger_rule import TriggerRule
 
 
 class DeadlineSettings(CombinedSettings):
     """Any rule with a deadline: an event at the latest ``interval_s`` after the last one."""
 
+    example_keys: ClassVar = {
+        "interval_s": 1.0,
+        "rule": {"policy": "mixed", "sigma": 0.1, "epsilon": 0.05},
+    }
+
     policy: Literal["deadline"]
 
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="deadline", rule=MixedSettings.example(n), interval_s=1.0)
-
     def combined(self, rule: TriggerRule, interval_ns: int) -> TriggerRule:
-        return with_deadline(rule, interval_ns)
+        return rule._replace(
+            longest_ns=min(rule.longest_ns, interval_ns),
+            shortest_ns=min(rule.shortest_ns, interval_ns),
+        )
 
     @property
     def description(self) -> str:
         return f"{self.rule.description}, or {self.interval_s:g} s after the last event"
-
-
-def with_deadline(rule: TriggerRule, interval_ns: int) -> TriggerRule:
-    """Return a rule with an event at the latest this time after the last one."""
-    return rule._replace(
-        longest_ns=min(rule.longest_ns, interval_ns), shortest_ns=min(rule.shortest_ns, interval_ns)
-    )

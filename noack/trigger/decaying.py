@@ -7,7 +7,7 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 """
 
 import math
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from noack.settings.section import NonNegative, Positive
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
@@ -19,6 +19,8 @@ _LEAST_BETA = 1e-300
 class DecayingSettings(WeightedSettings):
     """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
 
+    example_keys: ClassVar = {"beta": 0.5, "alpha_per_s": 0.25}
+
     policy: Literal["decaying"] = "decaying"
     beta: Positive
     """β, in the units of ‖W x‖."""
@@ -26,10 +28,6 @@ class DecayingSettings(WeightedSettings):
     """α, per second."""
     floor: NonNegative = 0.0
     """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(beta=0.5, alpha_per_s=0.25)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         W = self.weight_matrix
@@ -40,21 +38,9 @@ class DecayingSettings(WeightedSettings):
     def description(self) -> str:
         return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
 
-    @property
-    def threshold_decay_per_s(self) -> float:
-        return self.alpha_per_s
-
     def at_origin(self, t_s: float) -> Self:
         beta = max(self.beta * math.exp(-self.alpha_per_s * t_s), _LEAST_BETA)
         return self.model_copy(update={"beta": beta})
-
-    @property
-    def largest_threshold(self) -> float:
-        return max(self.beta, self.floor)
-
-    @property
-    def least_threshold(self) -> float:
-        return self.floor
 
 
 def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:

@@ -8,12 +8,11 @@ arrives. From the same state on, events are never earlier than those of the stat
 updates are lost, the same holds as for the relative rule.
 """
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
 from noack.trigger.trigger_rule import DynamicVariable, TriggerRule, quadratic_form
 
@@ -22,6 +21,8 @@ class DynamicSettings(LyapunovFunctionSettings):
     """Transmit when η + θw ≤ 0, η̇ = −λη + w, w = σxᵀQx − 2xᵀPBKe_s (Girard 2015)."""
 
     at_start_only: ClassVar = ("eta_0",)
+
+    example_keys: ClassVar = {"sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "eta_0": 1.0}
 
     policy: Literal["dynamic"]
     sigma: Annotated[FiniteFloat, Field(gt=0, lt=1)]
@@ -33,13 +34,17 @@ class DynamicSettings(LyapunovFunctionSettings):
     eta_0: Annotated[FiniteFloat, Field(ge=0, le=1e15)] = 0.0
     """η at the start."""
 
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="dynamic", sigma=0.5, theta_s=0.5, decay_per_s=0.5, eta_0=1.0)
-
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         P, Q = self.lyapunov_function(model)
-        return dynamic_rule(self, P, Q, model.B @ model.K)
+        n, cross = len(P), P @ (model.B @ model.K)
+        w = np.zeros((2 * n, 2 * n))
+        w[:n, :n] = self.sigma * Q
+        w[:n, n:] = -cross
+        w[n:, :n] = -cross.T
+        # Events do not reset η.
+        eta = DynamicVariable(self.decay_per_s, quadratic_form(w), self.eta_0)
+        compared = quadratic_form(-self.theta_s * w)
+        return TriggerRule(compared, dynamic_variable=eta, weight=self.weight_matrix)
 
     @property
     def description(self) -> str:
@@ -47,15 +52,3 @@ class DynamicSettings(LyapunovFunctionSettings):
             f"η + {self.theta_s:g} w ≤ 0, dη/dt = −{self.decay_per_s:g} η + w, "
             f"w = {self.sigma:g} xᵀQx − 2 xᵀPBK e_s"
         )
-
-
-def dynamic_rule(settings: DynamicSettings, P: Matrix, Q: Matrix, BK: Matrix) -> TriggerRule:
-    """Return the rule with these matrices, (n, n) each. Events do not reset η."""
-    n, cross = len(P), P @ BK
-    w = np.zeros((2 * n, 2 * n))
-    w[:n, :n] = settings.sigma * Q
-    w[:n, n:] = -cross
-    w[n:, :n] = -cross.T
-    eta = DynamicVariable(settings.decay_per_s, quadratic_form(w), settings.eta_0)
-    compared = quadratic_form(-settings.theta_s * w)
-    return TriggerRule(compared, dynamic_variable=eta, weight=settings.weight_matrix)

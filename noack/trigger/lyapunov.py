@@ -9,12 +9,11 @@ an event again. So no minimum inter-event time is known under losses: the rule n
 dwell time.
 """
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from noack.core.linear_systems import Matrix
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
 from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, empty_map, state_map
 
@@ -24,26 +23,20 @@ class LyapunovSettings(LyapunovFunctionSettings):
 
     events_may_accumulate: ClassVar = True
 
+    example_keys: ClassVar = {"rate_per_s": 0.3}
+
     policy: Literal["lyapunov"]
     rate_per_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)]
     """ρ."""
 
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="lyapunov", rate_per_s=0.3)
-
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         P, _ = self.lyapunov_function(model)
-        factor = np.ascontiguousarray(np.linalg.cholesky(P).T)
-        return lyapunov_rule(factor, self.rate_per_s, self.weight_matrix)
+        factor = np.ascontiguousarray(np.linalg.cholesky(P).T)  # V(x) = ‖L x‖²
+        form = QuadraticForm(state_map(len(P), factor), empty_map(len(P)))
+        return TriggerRule(
+            form, rate_per_s=self.rate_per_s / 2, from_event=True, weight=self.weight_matrix
+        )
 
     @property
     def description(self) -> str:
         return f"V(x) > V(x(t_k)) e^(−{self.rate_per_s:g} (t−t_k))"
-
-
-def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None) -> TriggerRule:
-    """Return the rule of V(x) = ‖L x‖², (n, n), and ρ > 0."""
-    n = len(factor)
-    form = QuadraticForm(state_map(n, factor), empty_map(n))
-    return TriggerRule(form, rate_per_s=rate_per_s / 2, from_event=True, weight=weight)

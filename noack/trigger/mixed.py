@@ -7,7 +7,7 @@ events may accumulate near the origin. σ = 0 is send-on-delta. With ε > 0 stab
 and the minimum inter-event time positive for bounded states.
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -19,15 +19,13 @@ from noack.trigger.trigger_rule import QuadraticForm, TriggerRule, error_map, st
 class MixedSettings(WeightedSettings):
     """Transmit when ‖e_s‖_W² > σ²‖x‖_W² + ε²."""
 
+    example_keys: ClassVar = {"sigma": 0.1, "epsilon": 0.05}
+
     policy: Literal["mixed"]
     sigma: Share
     """σ."""
     epsilon: Size
     """ε, in the units of ‖W x‖."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="mixed", sigma=0.1, epsilon=0.05)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         return mixed_rule(len(model.A), self.sigma, self.epsilon, self.weight_matrix)
@@ -35,14 +33,6 @@ class MixedSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖² > {self.sigma:g}² ‖x‖² + {self.epsilon:g}²"
-
-    @property
-    def largest_threshold(self) -> float:
-        return self.epsilon
-
-    @property
-    def least_threshold(self) -> float:
-        return self.epsilon
 
 
 def mixed_rule(n: int, sigma: float, epsilon: float, weight: Matrix | None) -> TriggerRule:

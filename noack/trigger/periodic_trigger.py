@@ -1,6 +1,6 @@
 """Time-triggered control: transmit every period, independently of the measurements."""
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule, no_form
@@ -9,13 +9,11 @@ from noack.trigger.trigger_rule import TriggerRule, no_form
 class PeriodicSettings(WeightedSettings):
     """Time-triggered: transmit every period."""
 
+    example_keys: ClassVar = {"period_s": 1.0}
+
     policy: Literal["periodic"]
     period_s: Interval
     """Period."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="periodic", period_s=1.0)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         period_ns = nanoseconds(self.period_s)

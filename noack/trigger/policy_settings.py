@@ -5,9 +5,10 @@ field ``policy``, and the behaviour that the settings describe;
 :mod:`noack.config.sections` finds it there.
 """
 
+import json
 import warnings
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self, get_args
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -15,7 +16,7 @@ from pydantic import Field, FiniteFloat
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.settings.section import Rows, ScenarioSection, require_shape
+from noack.settings.section import ReadTable, Rows, ScenarioSection, require_shape
 from noack.trigger.trigger_rule import Policy
 
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
@@ -36,6 +37,8 @@ class PolicySettings(ScenarioSection):
 
     events_may_accumulate: ClassVar[bool] = False
     """Whether events of this policy alone may accumulate where updates are lost."""
+    example_keys: ClassVar[ReadTable | None] = None
+    """Keys of the example, which :meth:`example` returns."""
     at_start_only: ClassVar[tuple[str, ...]] = ()
     """Keys that describe the start of a run and cannot change later."""
 
@@ -49,9 +52,12 @@ class PolicySettings(ScenarioSection):
             return None
 
     @classmethod
-    @abstractmethod
     def example(cls, n: int) -> Self | None:
         """Return settings for n states of size 1, for tests and benchmarks, if there are any."""
+        if cls.example_keys is None:
+            return None
+        (policy,) = get_args(cls.model_fields["policy"].annotation)
+        return cls.model_validate_json(json.dumps({"policy": policy, **cls.example_keys}))
 
     @abstractmethod
     def trigger_policy(self, model: ModelMatrices) -> Policy:
@@ -71,24 +77,9 @@ class PolicySettings(ScenarioSection):
         """Why exact simulation cannot apply the policy; None if it can."""
         return None
 
-    @property
-    def threshold_decay_per_s(self) -> float:
-        """α of a threshold that decays from the run's start on; 0 if there is none."""
-        return 0.0
-
     def at_origin(self, t_s: float) -> Self:
         """Return the settings of the same trigger with times counted from ``t_s`` on."""
         return self
-
-    @property
-    def largest_threshold(self) -> float:
-        """The largest constant that ‖e_s‖_W is compared with; 0 if there is none."""
-        return 0.0
-
-    @property
-    def least_threshold(self) -> float | None:
-        """The threshold of ‖e_s‖_W never falls below this; None: there is no such threshold."""
-        return None
 
     def check(self, n: int, why: str) -> None:
         """Require matrices of the right shapes for n states.
@@ -145,7 +136,7 @@ class LyapunovFunctionSettings(WeightedSettings):
         Raises:
             CallerError: the closed loop is not stable.
         """
-        from scipy.linalg import solve_continuous_lyapunov
+        from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
         A = model.A + model.B @ model.K
         if spectral_abscissa(A) >= 0:

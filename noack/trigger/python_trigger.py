@@ -6,13 +6,13 @@ rule: exact simulation and the theory do not cover it.
 
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.settings.user_files import ClassSettings, new_instance, read_only, user_code
+from noack.settings.user_files import ClassSettings, UserCode, new_instance, read_only, user_code
 from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_rule import CodedPolicy, TriggerDecision
 
@@ -31,10 +31,6 @@ class PythonTriggerSettings(ClassSettings, WeightedSettings):
     group: ClassVar = "noack.triggers"
 
     policy: Literal["python"]
-
-    @classmethod
-    def example(cls, n: int) -> None:
-        return
 
     def trigger_policy(self, model: ModelMatrices) -> CodedPolicy:
         return CodedPolicy(self.weight_matrix, partial(PythonTrigger, self), _BEYOND_EXACT)
@@ -86,7 +82,7 @@ class PythonTrigger:
         return TriggerDecision(left > right, left, right)
 
 
-def _sides(decision: Any) -> tuple[float, float]:
+def _sides(decision: UserCode) -> tuple[float, float]:
     """Return a result of ``test`` as two numbers to compare."""
     if isinstance(decision, bool | np.bool_):
         return float(decision), 0.0

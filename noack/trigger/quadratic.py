@@ -37,19 +37,17 @@ class QuadraticSettings(WeightedSettings):
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         period_ns = nanoseconds(self.period_s)
         return TriggerRule(
-            quadratic_form(np.array(self.Q)), floor=float(np.sqrt(self.epsilon)),
-            grid_ns=period_ns, weight=self.weight_matrix,
+            quadratic_form(np.array(self.Q)),
+            floor=float(np.sqrt(self.epsilon)),
+            grid_ns=period_ns,
+            weight=self.weight_matrix,
             longest_ns=self.heartbeat * period_ns if self.heartbeat else NEVER_NS,
-        )  # fmt: skip
+        )
 
     @property
     def description(self) -> str:
         heartbeat = f", or after {self.heartbeat} periods" if self.heartbeat else ""
         return f"zᵀQz > {self.epsilon:g}, sampled every {self.period_s:g} s{heartbeat}"
-
-    @property
-    def largest_threshold(self) -> float:
-        return self.epsilon
 
     def check(self, n: int, why: str) -> None:
         super().check(n, why)

@@ -3,7 +3,7 @@
 The mixed rule without its constant; see :mod:`noack.trigger.mixed`.
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from noack.trigger.mixed import mixed_rule
 from noack.trigger.policy_settings import ModelMatrices, Share, WeightedSettings
@@ -13,13 +13,11 @@ from noack.trigger.trigger_rule import TriggerRule
 class RelativeSettings(WeightedSettings):
     """Transmit when ‖e_s‖_W > σ‖x‖_W (Tabuada 2007)."""
 
+    example_keys: ClassVar = {"sigma": 0.2}
+
     policy: Literal["relative"]
     sigma: Share
     """σ."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="relative", sigma=0.2)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         return mixed_rule(len(model.A), self.sigma, 0.0, self.weight_matrix)
@@ -27,7 +25,3 @@ class RelativeSettings(WeightedSettings):
     @property
     def description(self) -> str:
         return f"‖e_s‖ > {self.sigma:g} ‖x‖"
-
-    @property
-    def least_threshold(self) -> float:
-        return 0.0

@@ -10,7 +10,7 @@ without being tested. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010;
 Gronwall's.)
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import model_validator
 
@@ -26,6 +26,11 @@ class SelfTriggeredSettings(WeightedSettings):
     This is the time at which ‖e_s‖_W could reach the paper's threshold, given
     d‖e_s‖_W/dt ≤ L‖e_s‖_W + a‖x(t_k)‖_W + b.
     """
+
+    example_keys: ClassVar = {
+        "beta": 0.5, "alpha_per_s": 0.25, "growth_per_s": 1.0, "mismatch_per_s": 1.0,
+        "shortest_s": 0.1, "longest_s": 5.0,
+    }  # fmt: skip
 
     policy: Literal["self_triggered"]
     beta: Positive
@@ -51,13 +56,6 @@ class SelfTriggeredSettings(WeightedSettings):
             raise ValueError("longest_s: must not be less than shortest_s")
         return self
 
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(
-            policy="self_triggered", beta=0.5, alpha_per_s=0.25, growth_per_s=1.0,
-            mismatch_per_s=1.0, shortest_s=0.1, longest_s=5.0,
-        )  # fmt: skip
-
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         forecast = Forecast(
             self.beta, self.alpha_per_s, self.floor,
@@ -72,11 +70,3 @@ class SelfTriggeredSettings(WeightedSettings):
     def description(self) -> str:
         threshold = decaying_text(self.beta, self.alpha_per_s, self.floor)
         return f"‖e_s‖ could reach {threshold}, as forecast at the last event"
-
-    @property
-    def largest_threshold(self) -> float:
-        return max(self.beta, self.floor)
-
-    @property
-    def least_threshold(self) -> float:
-        return self.floor

@@ -9,7 +9,7 @@ e_s grows from 0 at a bounded rate. A live sensor integrates by the trapezoidal 
 measurements; exact simulation integrates e_s itself.
 """
 
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
 from noack.trigger.trigger_rule import TriggerRule, error_form
@@ -18,13 +18,11 @@ from noack.trigger.trigger_rule import TriggerRule, error_form
 class SendOnAreaSettings(WeightedSettings):
     """Transmit when ∫‖e_s‖_W dt since the last event exceeds δ (Miskowicz)."""
 
+    example_keys: ClassVar = {"delta_s": 0.02}
+
     policy: Literal["send_on_area"]
     delta_s: Size
     """δ, in the units of ‖W x‖ times seconds."""
-
-    @classmethod
-    def example(cls, n: int) -> Self:
-        return cls(policy="send_on_area", delta_s=0.02)
 
     def trigger_policy(self, model: ModelMatrices) -> TriggerRule:
         form = error_form(len(model.A), self.weight_matrix)

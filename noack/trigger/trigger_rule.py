@@ -16,12 +16,12 @@ Exact simulation finds the first t (native/exact/).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_memory import CoreMemory
+from noack.core.core_memory import CoreMemory, Structure
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
@@ -98,6 +98,21 @@ class TriggerRule(NamedTuple):
         """α of a threshold that decays from the run's start on; 0 for other thresholds."""
         return 0.0 if self.from_event else self.rate_per_s
 
+    @property
+    def largest_threshold(self) -> float:
+        """The largest constant that a norm of z is compared with; 0 if there is none."""
+        forecast = () if self.forecast is None else (self.forecast.beta, self.forecast.floor)
+        return 0.0 if self.integrates else max(self.level, self.floor, *forecast)
+
+    @property
+    def least_threshold(self) -> float | None:
+        """The threshold of ‖e_s‖_W never falls below this; None: there is no such threshold."""
+        if self.forecast is not None:
+            return self.forecast.floor
+        up, n = self.form.up, self.form.up.shape[1] // 2
+        compares = np.array_equal(up, error_map(n, self.weight)) and not self.grid_ns
+        return self.floor if compares and not self.integrates else None
+
     def threshold(self, t_ns: float) -> float:
         """Return max(c e^{−ρt}, f)."""
         return max(self.level * math.exp(-self.rate_per_s * t_ns * 1e-9), self.floor)
@@ -147,6 +162,10 @@ class CodedPolicy:
     weight: Matrix | None
     new_trigger: Callable[[], "EventTrigger"]  # Returns a trigger that has not started
     why_no_rule: str  # What a user is told where a trigger rule is needed
+    fading_per_s: ClassVar = 0.0
+    largest_threshold: ClassVar = 0.0
+    least_threshold: ClassVar = None
+    """As those of a rule; the code's thresholds are not known."""
 
 
 Policy = TriggerRule | CodedPolicy
@@ -189,7 +208,7 @@ _NEVER_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
-def fill_rule(structure: Any, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
+def fill_rule(structure: Structure, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
     """Fill a ``noack_trigger_rule`` for n states; its matrices live in ``memory``.
 
     Raises:

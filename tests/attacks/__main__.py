@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._two_hosts import two_hosts
+from benchmarks.programs import two_hosts
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS

@@ -16,8 +16,7 @@ from typing import Any, Self
 
 import psutil
 
-from benchmarks._two_hosts import TwoHosts
-from benchmarks.soak.watch import udp_port
+from benchmarks.programs import TwoHosts, udp_port
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.resolution import loop_of
 from noack.protocol.record_tables import (

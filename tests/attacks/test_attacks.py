@@ -8,8 +8,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from benchmarks._report import MeasurementError
-from benchmarks._two_hosts import two_hosts
+from benchmarks.programs import two_hosts
+from benchmarks.report import MeasurementError
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses

@@ -1,28 +1,18 @@
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import goals, lateness, long_run, plants, startup
-from benchmarks.__main__ import all_benchmarks
-from benchmarks._report import MeasurementError, Rounds
-from benchmarks._runs import Line, execute, first_step_s
-from benchmarks._ticks import LOOPS
+from benchmarks import ends, latency, runs, simulation
+from benchmarks.bare_programs import LOOPS
+from benchmarks.programs import Line, execute, first_step_s
+from benchmarks.report import MeasurementError, Rounds
 from cosim.live.progress import progress_text
 from noack.runtime.control_messages import RunProgress
 
 ACCOUNT: dict[str, Any] = {
     "t_s": 0.0, "events": 1, "deliveries": 1, "longest_loss_burst": 0, "x_norm": 1.0, "live": None,
 }  # fmt: skip
-ROOT = Path(__file__).parents[2]
-
-
-def test_each_benchmark_is_declared_under_its_files_name() -> None:
-    names = {path.stem for path in (ROOT / "benchmarks").glob("[!_]*.py")}
-    declared = {benchmark.name for benchmark in all_benchmarks()}
-    assert declared == names - {"goals"}
-    assert {*goals.BENCHMARKS} <= declared
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -32,21 +22,21 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_complete_and_punctual_demo_reaches_all_goals() -> None:
-    verdicts = [row.holds for row in startup.demo_rows(summary()) if row.goal is not None]
+    verdicts = [row.holds for row in runs.demo_rows(summary()) if row.goal is not None]
     assert verdicts == [True, True, True]
 
 
 def test_a_missing_sample_or_too_many_late_steps_miss_their_goals() -> None:
     late = summary()["loops"][0]["lateness_us"]["plant"] | {"late_steps": 11}
-    rows = startup.demo_rows(summary(missing_samples=1, lateness_us={"plant": late}))
+    rows = [*runs.demo_rows(summary(missing_samples=1, lateness_us={"plant": late}))]
     assert [row.holds for row in rows[:3]] == [False, True, False]
 
 
 def test_quantiles_of_a_histogram_are_the_middle_of_the_bin_they_fall_in() -> None:
     histogram = {12: 98, 20: 1, 400: 1}
-    assert lateness.quantile_of(histogram, 0.5) == 12.5
-    assert lateness.quantile_of(histogram, 0.99) == 20.5
-    assert lateness.quantile_of(histogram, 1.0) == 400.5
+    assert latency.quantile_of(histogram, 0.5) == 12.5
+    assert latency.quantile_of(histogram, 0.99) == 20.5
+    assert latency.quantile_of(histogram, 1.0) == 400.5
 
 
 @pytest.mark.parametrize(
@@ -64,10 +54,10 @@ def test_lateness_is_judged_against_cyclictest(
     for sides in rounds.values():
         for kind in LOOPS:
             sides.add(kind, {"p50": 15.0, "p99": 24.0, "max": 90.0})
-    rounds[True].add(lateness.KERNEL, kernel)
+    rounds[True].add(latency.KERNEL, kernel)
     if ours is not None:
-        rounds[True].add(lateness.OURS, ours)
-    (judged,) = [row for row in lateness.rows_of(rounds) if row.goal is not None]
+        rounds[True].add(latency.LOOP, ours)
+    (judged,) = [row for row in latency.lateness_rows(rounds) if row.goal is not None]
     assert judged.holds is holds
     assert judged.value == 24.0
     assert note in judged.as_json().get("note", "")
@@ -89,21 +79,10 @@ def test_without_a_progress_line_there_is_no_first_step() -> None:
     assert first_step_s(100.0, [Line(101.0, "noack: no run")]) is None
 
 
-def test_startup_has_a_row_for_the_goal_and_one_for_the_peer() -> None:
-    rounds = Rounds()
-    for first_s, launch_s in ((1.0, 0.2), (1.2, 0.3), (5.0, 0.4)):
-        rounds.add(startup.OURS, {"first_s": first_s, "launch_s": launch_s})
-        rounds.add(startup.IMPORTS, {"first_s": 0.3})
-    goal, peer, launch = startup.rows_of(rounds)
-    assert (goal.value, goal.holds) == (1.2, False)
-    assert peer.ratio == pytest.approx(4.0)
-    assert launch.value == 0.3
-
-
 def test_the_end_of_a_long_run_is_judged_by_its_memory_and_its_additional_time() -> None:
-    short = long_run.End(4.0, 5.0, 200.0, {"claims": 1.0, "replay": 1.0})
-    ends = {60.0: short, 660.0: long_run.End(20.0, 17.0, 500.0, {"claims": 3.0, "replay": 1.2})}
-    peak, growth, _, speed, by_cpu, of_replay, claims, _ = long_run.rows_of(ends)
+    short = ends.End(4.0, 5.0, 200.0, {"claims": 1.0, "replay": 1.0})
+    of_runs = {60.0: short, 660.0: ends.End(20.0, 17.0, 500.0, {"claims": 3.0, "replay": 1.2})}
+    peak, growth, _, speed, by_cpu, of_replay, claims, _ = ends.rows_of(of_runs)
     assert (peak.value, peak.holds) == (500.0, False)
     assert growth.ratio == 2.5
     assert speed.value == 37.5
@@ -125,10 +104,10 @@ def test_standard_output_and_error_lines_are_separate() -> None:
 
 
 def test_a_plant_step_is_compared_with_its_period_and_a_linear_plant() -> None:
-    for name, scenario in plants.cases():
-        found = plants.timed(scenario, count=20, pace_ns=0, asked=False)
+    for name, scenario in simulation.plant_cases():
+        found = simulation.timed_steps(scenario, count=20, pace_ns=0, asked=False)
         assert len(found) == 20
-        p50, p99, share = plants.rows_of(name, scenario, found)
+        p50, p99, share = simulation.plant_rows(name, scenario, found)
         assert p50.peer is not None
         assert p50.value is not None
         assert p99.value is not None

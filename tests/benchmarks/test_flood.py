@@ -2,16 +2,14 @@
 
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
 
-from benchmarks._faulted_run import FaultedRun, recovery_s
-from benchmarks._flood import SEGMENTS, Flood, datagram, flood
-from benchmarks.flood import figures_of
+from benchmarks.bare_programs import SEGMENTS, Flood, command_of, flood, unwanted_datagram
+from benchmarks.faults import FaultedRun, figures_of, recovery_s
 from cosim.cli import find_scenario
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -58,17 +56,16 @@ def test_a_flood_is_distributed_evenly_over_the_ports_and_counted(
 
 
 def test_one_call_of_an_unlimited_flood_sends_separate_datagrams(ears: list[socket.socket]) -> None:
-    assert flood([ears[0].getsockname()[1]], 0.01, None).sent % SEGMENTS == 0
+    assert flood([ears[0].getsockname()[1]], 0.01, 0).sent % SEGMENTS == 0
     received = taken(ears[0])
     assert len(received) >= SEGMENTS
-    assert {len(data) for data in received} == {len(datagram())}
+    assert {len(data) for data in received} == {len(unwanted_datagram())}
 
 
 def test_the_flood_process_prints_the_number_sent() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks._flood", "--ports", "9", "--seconds", "0.05"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        command_of("flood", 0.05, 0, 9), capture_output=True, text=True, check=True
+    )
     assert '"sent": ' in done.stdout
 
 
@@ -91,10 +88,9 @@ def test_the_effects_of_a_flood_are_read_from_the_record(record: RunRecord) -> N
     flooded = changed(record, rows, reports={})
     run = FaultedRun(flooded, {"unintended_losses": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
     last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
-    assert figures_of(run) == pytest.approx({
-        "rate_hz": 12_345.0, "missed": 3, "lost": 5, "late_before_us": 50.0,
-        "late_during_us": 7050.0, "back_ms": 1e-6 * last_late_ns - 2000.0,
-    })  # fmt: skip
+    back_ms = 1e-6 * last_late_ns - 2000.0
+    expected = (12_345.0, 3, 5, 50.0, 7050.0, back_ms)
+    assert tuple(figures_of(run).values()) == pytest.approx(expected)
 
 
 def test_a_late_step_long_after_the_flood_does_not_count() -> None:

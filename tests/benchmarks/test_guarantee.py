@@ -3,24 +3,22 @@
 import numpy as np
 import pytest
 
-from benchmarks.guarantee import (
-    _REORDERING,
+from benchmarks.guarantees import (
     CAP,
     COMBINATIONS,
     EXPECTED,
+    REORDERING,
     Decider,
-    Limits,
     check_row,
     expected_row,
     network_rows,
-    outcomes_of,
-    violations,
 )
+from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
 @pytest.mark.parametrize("words", COMBINATIONS)
 def test_no_combination_is_violated_and_each_would_be_without_it(words: str) -> None:
-    for before in ("loss 50%", f"loss 30% {_REORDERING}"):
+    for before in ("loss 50%", f"loss 30% {REORDERING}"):
         row = check_row(f"{before} {words}", COMBINATIONS[words], 1_000_000)
         assert row.value == 0
         free = outcomes_of(Decider(f"{before} limit 1000000").decide())

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks._programs import provide
+from benchmarks.programs import provide
 
 
 @pytest.mark.parametrize(

@@ -5,24 +5,25 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from itertools import pairwise
 
 import pytest
 
-from benchmarks import _relay_load
-from benchmarks._relay_load import Built, Ends, Soak, built, sources
-from benchmarks._relay_ours import Ours
-from benchmarks._relay_process import (
+from benchmarks import relays
+from benchmarks.relays import (
+    Built,
+    Ends,
     Kind,
+    Sides,
+    built,
     c_relay,
-    in_turn,
+    new_soak,
     our_relay,
     running,
     socat,
-    start_all,
+    sources,
 )
-from benchmarks._report import MeasurementError, Rounds
+from benchmarks.report import MeasurementError
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="the load is Linux's"),
@@ -85,7 +86,7 @@ def test_all_send_methods_continue_the_numbering(ends: Ends) -> None:
 
 
 def test_datagrams_without_a_reply_are_marked(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_relay_load, "_PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(relays, "_PATIENCE_NS", 1_000_000)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         mine.bind(("127.0.0.1", 0))
         ends.connect(mine.getsockname()[1])
@@ -94,7 +95,7 @@ def test_datagrams_without_a_reply_are_marked(ends: Ends, monkeypatch: pytest.Mo
 
 
 def test_gaps_and_disorder_of_a_steady_load_are_counted(tools: Built) -> None:
-    ends, state = Ends(tools.load), Soak()
+    ends, state = Ends(tools.load), new_soak()
     numbers = [0, 1, 5, 6, 4, 9]  # 2 and 3 are missing, 4 is late, 7 and 8 are missing
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         for number in numbers:
@@ -109,7 +110,7 @@ def test_gaps_and_disorder_of_a_steady_load_are_counted(tools: Built) -> None:
 
 
 def test_a_steady_load_continues_its_numbering(ends: Ends) -> None:
-    state = Soak()
+    state = new_soak()
     for _ in range(3):
         ends.soak(state, 5, 70, 1000)
     ends.soak(state, 5, 0, 1000)
@@ -132,14 +133,14 @@ def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
     assert kind.name == name
     with running(kind, tools) as relay:
         assert relay.burst()["cpu_us"] > 0  # an incomplete burst raises
-        state = Soak()
+        state = new_soak()
         relay.ends.soak(state, 1, 0, 1000)
         assert state.received == 0
         assert (relay.ends.ping(20) > 0).all()
 
 
 def test_the_relays_counters_agree_with_sender_and_sink(tools: Built) -> None:
-    with running(our_relay("ours", Ours("loss 30% mansd 2 seed 3")), tools) as relay:
+    with running(our_relay("ours", "loss 30% mansd 2 seed 3"), tools) as relay:
         found = relay.ends.burst(relay.pid, 200, slack=2)
         totals = relay.totals()
     assert totals.arrived == 200
@@ -150,25 +151,24 @@ def test_the_relays_counters_agree_with_sender_and_sink(tools: Built) -> None:
 
 
 def test_a_relay_that_does_not_start_or_fails_is_reported_and_omitted(tools: Built) -> None:
-    kinds: dict[str, Kind | str] = {
-        "absent": "not installed",
-        "broken": Kind("broken", lambda to, port: [sys.executable, "-c", "exit('no reason')"]),
-        "C relay": c_relay(tools),
-    }
-    rounds = Rounds()
-    with ExitStack() as stack:
-        relays = start_all(kinds, tools, stack, rounds)
-        assert rounds.missing["absent"] == "not installed"
-        assert "said 'no reason'" in rounds.missing["broken"]
-        in_turn(relays, rounds, lambda relay: {"pid": relay.pid})
+    kinds: list[tuple[str, Kind | str]] = [
+        ("absent", "not installed"),
+        ("broken", Kind("broken", lambda *_: [sys.executable, "-c", "exit('no reason')"])),
+        ("C relay", c_relay(tools)),
+    ]
+    with Sides(kinds, tools) as sides:
+        missing = sides.rounds.missing
+        assert missing["absent"] == "not installed"
+        assert "said 'no reason'" in missing["broken"]
+        sides.in_turn(lambda relay: {relay.name: {"pid": relay.pid}})
 
-        def fail(relay: object) -> None:
+        def fail(relay: object) -> dict[str, dict[str, float]]:
             raise MeasurementError("lost")
 
-        in_turn(relays, rounds, fail)
-        assert relays == []
-    assert rounds.missing["C relay"] == "lost"
-    assert len(rounds.of("C relay", "pid")) == 1
+        sides.in_turn(fail)
+        assert sides.relays == []
+    assert missing["C relay"] == "lost"
+    assert len(sides.rounds.of("C relay", "pid")) == 1
 
 
 def test_without_a_compiler_there_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.__main__ import all_benchmarks, run
-from benchmarks._report import (
+from benchmarks.__main__ import (
+    BEGIN,
+    END,
+    OF_GOALS,
+    all_benchmarks,
+    rows_of_figures,
+    run,
+    write_docs,
+)
+from benchmarks.report import (
     Benchmark,
     Goal,
     Load,
@@ -19,7 +27,6 @@ from benchmarks._report import (
     compared,
     per_cpu_s,
 )
-from benchmarks.goals import BEGIN, BENCHMARKS, END, rows_of_figures, write_docs
 
 HALF = Goal("<=", 0.5)
 
@@ -73,11 +80,15 @@ def named(name: str, *rows: Row, done: list[str] | None = None) -> Benchmark:
     return Benchmark(name, name.title(), measure)
 
 
+def by_name(*benchmarks: Benchmark) -> dict[str, Benchmark]:
+    return {benchmark.name: benchmark for benchmark in benchmarks}
+
+
 def test_rows_and_reasons_are_printed_and_written_as_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, row = tmp_path / "rows.json", Row("a", 1.5, "s", goal=Goal("<", 3))
-    assert run([named("broken"), named("example", row)], ["--json", str(path)]) == 1
+    assert run(by_name(named("broken"), named("example", row)), ["--json", str(path)]) == 1
     rows = {found["name"]: found for found in json.loads(path.read_text())}
     assert rows["broken"]["value"] is None
     assert "no such program" in rows["broken"]["note"]
@@ -94,16 +105,14 @@ def test_options_are_passed_to_their_benchmark() -> None:
         seen.append(options.install)
         return []
 
-    def declare(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--install", action="store_true")
-
-    run([Benchmark("example", "An example", measure, declare)], ["--install"])
+    options = {"--install": {"action": "store_true"}}
+    run(by_name(Benchmark("example", "An example", measure, options)), ["--install"])
     assert seen == [True]
 
 
 def test_benchmarks_are_chosen_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     done: list[str] = []
-    benchmarks = [named(name, done=done) for name in "abc"]
+    benchmarks = by_name(*(named(name, done=done) for name in "abc"))
     assert run(benchmarks, ["c", "a"]) == run(benchmarks, []) == 0
     assert done == ["a", "c", "a", "b", "c"]
     with pytest.raises(SystemExit):
@@ -166,4 +175,4 @@ def test_the_goals_are_selected_in_their_order_and_written_into_the_page(tmp_pat
 
 
 def test_every_goal_is_of_a_benchmark() -> None:
-    assert set(BENCHMARKS) <= {benchmark.name for benchmark in all_benchmarks()}
+    assert set(OF_GOALS) <= all_benchmarks().keys()

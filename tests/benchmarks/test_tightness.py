@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.tightness import loop_named, row_of, triggers
+from benchmarks.guarantees import loop_named, row_of, triggers
 from cosim.analysis.adversary import Objective, find_worst
 from noack.config.sections import POLICIES
 

@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from controller_node.controller import Controller
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.linear_systems import product
 from noack.impairments.loss_guarantee import (
@@ -23,7 +21,7 @@ from noack.impairments.loss_guarantee import (
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import OneLoop, controller_of, machine, state_of
+from tests.machine_parts import OneLoop, machine, state_of
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])
@@ -205,37 +203,3 @@ def test_lost_first_updates_are_a_violation_without_a_known_start(
         assert str(lost) in notice.text or lost == 1
     # The flow has begun: a gap within the cap is no violation.
     assert notices(controller.handle(update(lost + 2, 7 * MS), 8 * MS)) == []
-
-
-def test_an_actuation_carries_the_state_that_it_was_computed_from() -> None:
-    """The state's time is sent, too; a newer update had advanced the model past a late tick."""
-    controller = new_controller(predictive=True, safe_input=np.full(3, 0.5))
-    message, _ = tick(controller)
-    assert message.vector.tolist() == [0.5, 0.5, 0.5, 0.0, 0.0]
-    controller.handle(update(0, 20 * MS), 21 * MS)
-    message, row = tick(controller)
-    assert (message.t_ns, row["t_ns"]) == (20 * MS, 3 * MS)
-    assert message.vector.tobytes() == np.append(row["u"], [1.0, -2.0]).tobytes()
-
-
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_controller_of_a_scenario_uses_the_model_not_the_plant(
-    content: dict[str, Any], mode: str
-) -> None:
-    content |= {"mode": mode, "controller": {"rate_hz": 2.0, "phase": 0.5}}
-    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
-    content["network"] |= {"initial_sync": "known_state", "mansd": 1}
-    controller = controller_of(resolve(validate(content, "here")))
-    assert controller.next_deadline_ns() == 250_000_000
-    message, _ = controller.on_timer(250_000_000)
-    assert isinstance(message, Message)
-    assert controller.next_deadline_ns() == 750_000_000
-    # ẍ = −x − 1.5 ẋ from (1, 0), by hand, or constant under a hold; u = −x − 1.5 ẋ.
-    w, t = math.sqrt(1 - 0.75**2), 0.25
-    decay = math.exp(-0.75 * t)
-    position = decay * (math.cos(w * t) + 0.75 / w * math.sin(w * t))
-    velocity = -decay / w * math.sin(w * t)
-    expected = -position - 1.5 * velocity if mode == "model" else -1.0
-    assert message.vector.item() == pytest.approx(expected, rel=1e-12)
-    assert notices(controller.handle(update(1, 0, [0.0, 0.0]), 0)) == []
-    assert len(notices(controller.handle(update(4, 0, [0.0, 0.0]), 0))) == 1

@@ -1,7 +1,7 @@
 """Every shipped scenario in virtual time, and the classic plants against their literature.
 
 The reactor and Tabuada's example are in ``simulation/continuous/test_published.py``, the cart-pole
-in ``tests/noack/plants/test_cart_pole.py``.
+in ``tests/noack/plants/test_physical_laws.py``.
 """
 
 import math

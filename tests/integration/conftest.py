@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from benchmarks.soak.watch import is_of, udp_port
+from benchmarks.programs import is_of, udp_port
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")

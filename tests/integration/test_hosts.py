@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks._report import MeasurementError
-from benchmarks._two_hosts import TwoHosts, two_hosts
+from benchmarks.programs import TwoHosts, two_hosts
+from benchmarks.report import MeasurementError
 from cosim.record.run_record import load_record, load_run
 from noack.config.scenario import phases_ns
 from noack.core.clock import NS_PER_S

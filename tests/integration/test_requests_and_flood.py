@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.bare_programs import command_of
 from cosim.cli import app
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import load_record
@@ -37,8 +38,8 @@ def set_parameters(*words: str) -> dict[str, Any]:
 def flood(running: Running) -> None:
     """Send as many datagrams as possible to every port of the loop."""
     ports = [str(running.udp_port(role)) for role in LOOP_ROLES]
-    command = [sys.executable, "-m", "benchmarks._flood", "--seconds", str(FLOOD_S)]
-    subprocess.run([*command, "--ports", *ports], check=True, stdout=subprocess.DEVNULL, timeout=60)
+    command = command_of("flood", FLOOD_S, 0, *ports)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=60)
 
 
 @on_linux

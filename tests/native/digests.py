@@ -14,7 +14,7 @@ from noack.config.scenario_file import load
 from noack.core.core_library import core
 from noack.core.errors import CallerError
 from tests.cosim.simulation.batch.exact import random_population, random_setting
-from tests.cosim.simulation.batch.test_policies import POLICIES
+from tests.trigger_rules import TABLES, random_rule
 
 FUNCTIONS = ("exp", "expm1", "log", "cube_root", "normal_cdf", "normal_score")
 
@@ -37,12 +37,12 @@ def _records() -> None:
 
 def _batches() -> None:
     """The paper's trigger with vectors of every size, and each policy with two states."""
-    for policy, n in [*(("", n) for n in (1, 2, 3, 4, 7, 20)), *((name, 2) for name in POLICIES)]:
+    for policy, n in [*(("", n) for n in (1, 2, 3, 4, 7, 20)), *((name, 2) for name in TABLES)]:
         rng = np.random.default_rng(n)
         setting = random_setting(rng, n, 2)
         trigger = setting.trigger
         if policy:
-            trigger = POLICIES[policy](rng, n, trigger.weight)
+            trigger = random_rule(policy, rng, n, trigger.weight)
         setting = replace(setting, trigger=trigger, most_events=200)
         rows, events = run_with_events(setting, random_population(rng, setting, 3))
         times = (run.event_s.tobytes() for run in events)

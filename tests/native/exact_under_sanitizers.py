@@ -10,8 +10,7 @@ from cosim.simulation.exact_simulation import ExactSimulation
 from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import random_population, random_setting
-from tests.cosim.simulation.batch.test_policies import POLICIES
-from tests.trigger_rules import area_rule, decaying_rule
+from tests.trigger_rules import TABLES, area_rule, decaying_rule, random_rule
 
 ANY_DOUBLE = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
 
@@ -21,14 +20,12 @@ def test_this_is_another_core_than_noacks() -> None:
 
 
 @settings(max_examples=60)
-@given(
-    st.integers(0, 2**32), st.integers(1, 20), st.integers(1, 3), st.sampled_from([*POLICIES, ""])
-)
+@given(st.integers(0, 2**32), st.integers(1, 20), st.integers(1, 3), st.sampled_from([*TABLES, ""]))
 def test_random_batches(seed: int, n: int, m: int, policy: str) -> None:
     rng = np.random.default_rng(seed)
     setting = random_setting(rng, n, m)
     if policy and n <= 6:
-        trigger = POLICIES[policy](rng, n, setting.trigger.weight) if n == 2 else setting.trigger
+        trigger = random_rule(policy, rng, n, setting.trigger.weight) if n == 2 else setting.trigger
         setting = setting.__class__(**{**vars(setting), "trigger": trigger, "most_events": 200})
     rows, events = run_with_events(setting, random_population(rng, setting, 2))
     assert [len(one.event_s) for one in events] == rows["transmissions"].tolist()

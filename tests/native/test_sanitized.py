@@ -68,7 +68,7 @@ def test_simulations_and_replays_run_clean() -> None:
     run_tests(
         "tests/cosim/analysis/test_replay.py", "-k", "numbers or exact or bit_for_bit or runs_end"
     )
-    run_tests("tests/cosim/analysis/adversary/test_policies.py", "-k", "machines or early")
+    run_tests("tests/cosim/analysis/adversary/test_worst_patterns.py", "-k", "machines or early")
 
 
 def test_the_live_driver_runs_clean() -> None:

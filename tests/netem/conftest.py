@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import Decisions, LinkSettings
+from tests.oracles.receiver import longest_burst, outcomes_of
 
 MOST = 1_000_000
 
@@ -69,19 +70,8 @@ def _longest_undelivered(decided: Decided) -> int:
     longest = []
     for flow in range(int(decided.flows.max(initial=0)) + 1):
         of_flow = decided.decisions[decided.flows == flow]
-        numbers = np.arange(len(of_flow))
-        assert (of_flow["packet"] == numbers).all()
-        times, leaving = [], []
-        for time, bit in (("release_ns", "bit"), ("copy_ns", "copy_bit")):
-            intact = (of_flow[time] >= 0) & (of_flow[bit] < 0)
-            times.append(of_flow[time][intact])
-            leaving.append(numbers[intact])
-        # Datagrams with equal release times leave in the order of arrival.
-        in_order = np.concatenate(leaving)[np.lexsort(list(map(np.concatenate, (leaving, times))))]
-        newest = np.maximum.accumulate(np.concatenate([[-1], in_order]))
-        counted = in_order[in_order > newest[:-1]]
-        gaps = np.diff(np.concatenate([[-1], counted, [len(of_flow)]])) - 1
-        longest.append(int(gaps.max()))
+        assert (of_flow["packet"] == np.arange(len(of_flow))).all()
+        longest.append(longest_burst(outcomes_of(of_flow)))
     return max(longest)
 
 

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
 from noack.config.resolution import resolve, tables_of
@@ -97,22 +96,6 @@ def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> N
         for messages, some in ((sent, rows), (sent_2, rows_2))
     )
     np.testing.assert_allclose(v, v_2, atol=1e-12)
-
-
-def test_the_plant_agrees_with_an_integrator_under_the_recorded_disturbance(
-    disturbed: dict[str, Any],
-) -> None:
-    scenario = resolved(disturbed)
-    rows, _ = steps_of(plant_of(scenario), scenario, 60)
-    x = np.array(scenario.plant.initial_state)
-    for k in range(59):
-        pushed, w = rows["u"][k] + rows["d"][k], rows["w"][k]
-
-        def derivative(t: float, z: np.ndarray, p: Any = pushed, w: Any = w) -> list[float]:
-            return [z[1] + w[0], p[0] + w[1]]
-
-        x = solve_ivp(derivative, (0, 0.01), x, rtol=1e-12, atol=1e-12).y[:, -1]
-        np.testing.assert_allclose(rows["x"][k + 1], x, atol=1e-10)
 
 
 def test_an_input_disturbance_acts_on_a_nonlinear_plant(content: dict[str, Any]) -> None:

@@ -1,20 +1,16 @@
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
-from noack.config.resolution import resolve, resolved_loops
+from noack.config.resolution import resolved_loops
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plants_of
-from tests.machine_parts import OneLoop, linear_plant, plant_of, state_of
+from tests.machine_parts import OneLoop, linear_plant, state_of
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])
@@ -38,26 +34,6 @@ def rows(outputs: Sequence[object], table: str) -> Any:
     """The table's rows in the form that is recorded."""
     found = [out.row for out in outputs if isinstance(out, Record) and out.table == table]
     return np.array(found, tables(2, 2)[table])
-
-
-@given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
-def test_the_plant_moves_as_an_integrator_does(inputs: list[tuple[float, float]]) -> None:
-    h_ns = 40_000_000
-    x = np.array([1.0, -0.5])
-    plant = linear_plant(A, B, x, h_ns, horizon_ns=10**9)
-    plant.handle(actuation(0, inputs[0]), 0)
-    (first,) = measured(plant.on_timer(0))
-    assert first.vector.tolist() == x.tolist()
-    for step, u in enumerate(inputs, 1):
-        solution = solve_ivp(
-            lambda t, z, u=u: A @ z + B @ u, (0, 0.04), x, method="DOP853", rtol=1e-12, atol=1e-12
-        )
-        x = solution.y[:, -1]
-        if step < len(inputs):
-            plant.handle(actuation(step, inputs[step]), step * h_ns - 1)
-        (message,) = measured(plant.on_timer(step * h_ns))
-        # Six integrations, each with local errors of 1e-12 that grow little in 40 ms.
-        np.testing.assert_allclose(message.vector, x, atol=1e-10)
 
 
 def test_late_steps_keep_their_length_and_are_caught_up() -> None:
@@ -107,21 +83,6 @@ def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
     assert taken["u"].tolist() == [[1.0, 0.0], [0.0, 5.0]]
 
 
-@pytest.mark.parametrize("every", [1, 2, 3, 7])
-def test_measurements_are_sent_every_given_number_of_steps(every: int) -> None:
-    plant, outputs = new_plant(measure_every=every), []
-    for step in range(20):
-        outputs += plant.on_timer(step * H_NS)
-    sent = measured(outputs)
-    assert {message.flow for message in sent} == {Flow.MEASUREMENT}
-    assert [message.t_ns for message in sent] == [k * H_NS for k in range(0, 20, every)]
-    # the sensor sees no gap
-    assert [message.sequence for message in sent] == list(range(len(sent)))
-    steps = rows(outputs, PLANT_STEP)
-    assert steps["sequence"].tolist() == list(range(20))
-    assert [m.vector.tolist() for m in sent] == steps["x"][::every].tolist()
-
-
 @pytest.mark.parametrize(("horizon_ns", "steps"), [(5 * H_NS, 6), (5 * H_NS + 1, 6), (6 * H_NS, 7)])
 def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
     plant, count = new_plant(horizon_ns), 0
@@ -137,27 +98,6 @@ def test_a_measurement_does_not_change_with_later_steps() -> None:
     (message,) = measured(plant.on_timer(0))
     plant.on_timer(H_NS)
     assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]
-
-
-def test_the_plant_of_a_scenario_is_the_true_plant_not_the_model(content: dict[str, Any]) -> None:
-    content["horizon_s"] = 0.3
-    content["plant"] = {
-        "draw": "given",
-        "A": [[-2.0, 0.0], [0.0, 0.5]],
-        "B": [[1.0], [0.0]],
-        "initial_state": [1.0, 2.0],
-        "rate_hz": 10.0,
-        "measure_every": 3,
-    }
-    plant = plant_of(resolve(validate(content, "here")))
-    plant.handle(actuation(0, [3.0]), 0)
-    sent = []
-    while (t_ns := plant.next_deadline_ns()) is not None:
-        sent += measured(plant.on_timer(t_ns))
-    assert [message.t_ns for message in sent] == [0, 300_000_000]
-    e = math.exp(-0.6)
-    expected = [e + 1.5 * (1 - e), 2 * math.exp(0.15)]
-    np.testing.assert_allclose(sent[1].vector, expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("noise", [False, True])

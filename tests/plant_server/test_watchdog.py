@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
+from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
 from tests.machine_parts import OneLoop, plant_of
 
@@ -106,45 +105,3 @@ def test_the_watchdog_reports_each_trip_once_with_its_duration(policy: str) -> N
     # the newest actuation, even if it is not applied
     assert driven.steps[80 * MS]["actuation"] == 0
     assert driven.u(50 * MS) == driven.u(130 * MS) == 2.0
-
-
-def test_the_model_policy_applies_the_input_that_the_controller_would_send() -> None:
-    """u = K e^{Ht} x_c at every step, from actuations of any age, including one that is too old."""
-    driven = Driven(plant_of(scenario("model")))
-    closed = np.array([[0.0, 1.0], [1.0, 0.5]]) + np.array([[0.0], [1.0]]) @ K
-    x_c = np.array([0.7, -0.2])
-    driven.take(0, 3 * MS, *(K @ x_c), *x_c)
-    driven.until(200 * MS)
-    for t_ns in range(60 * MS, 210 * MS, 10 * MS):
-        expected = K @ expm(closed * (t_ns - 3 * MS) * 1e-9) @ x_c
-        assert driven.u(t_ns) == pytest.approx(expected.item(), rel=1e-12)
-    late = np.array([-1.0, 0.5])
-    driven.take(1, 120 * MS, *(K @ late), *late)
-    driven.until(210 * MS)
-    expected = K @ expm(closed * 0.09) @ late
-    assert driven.u(210 * MS) == pytest.approx(expected.item(), rel=1e-12)
-    assert len(driven.notices) == 1  # it was too old on arrival
-
-
-def test_the_model_policy_with_a_hold_model_holds_the_input() -> None:
-    driven = Driven(plant_of(scenario("model", mode="zoh")))
-    driven.take(0, 3 * MS, 0.1, 0.3, -0.7)
-    driven.until(300 * MS)
-    assert {driven.u(t_ns) for t_ns in range(10 * MS, 310 * MS, 10 * MS)} == {0.1}
-
-
-def test_the_safe_input_is_continued_if_the_controller_had_no_state() -> None:
-    driven = Driven(plant_of(scenario("model")))
-    driven.take(0, 5 * MS, 0.25, 0.0, 0.0)
-    driven.until(200 * MS)
-    assert driven.u(200 * MS) == 0.25
-
-
-def test_the_state_carried_by_an_actuation_is_recorded() -> None:
-    plant = plant_of(scenario("model"))
-    message = Message(Flow.ACTUATION, 4, 5 * MS, np.array([0.5, 1.0, 2.0]))
-    (record,) = plant.handle(message, 6 * MS)
-    assert isinstance(record, Record)
-    row = np.array([record.row], tables(2, 1, predictive=True)[PLANT_ACTUATION])[0]
-    assert row["u"].tolist() == [0.5]
-    assert row["x_c"].tolist() == [1.0, 2.0]

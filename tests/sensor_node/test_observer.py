@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.config.resolution import assumed_model, resolve, steady_state, tables_of, true_model
+from noack.config.resolution import assumed_model, resolve, steady_state, true_model
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.core_library import core, ffi
@@ -23,7 +23,6 @@ from noack.observers.observer_settings import (
     unobservable_mode,
 )
 from noack.protocol.machine_interface import Notice, Output, Record, Start
-from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import OneLoop, machine, sensor_of
@@ -108,31 +107,6 @@ def test_the_kalman_filter_converges_to_the_observer_with_the_steady_gain() -> N
         np.testing.assert_allclose(kalman.x, steady.x, rtol=1e-8)
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
-    """e(t_k) = (I − L C) e^{AT} e(t_{k−1}), for any input in between."""
-    T_s = steps * H_NS * 1e-9
-    Ad_T = expm(A * T_s)
-    poles = (np.exp(-5 * T_s), np.exp(-8 * T_s))
-    L = observer_gain(Ad_T, C, tuple(map(complex, poles)))
-    error_matrix = (np.eye(2) - L @ C) @ Ad_T
-    np.testing.assert_allclose(np.sort(np.linalg.eigvals(error_matrix)), np.sort(poles), rtol=1e-9)
-    x = np.array([0.4, -1.0])
-    sensor = observing(L, [0.0, 0.5], steps)
-    error = estimates(sensor.handle(measurement(0, 0, [*C @ x, *np.zeros(steps)]), 0)) - x
-    rng = np.random.default_rng(2)
-    Ad, Bd, *_ = model()
-    for k in range(1, 20):
-        inputs = rng.normal(size=steps)
-        for u in inputs:
-            x = Ad @ x + Bd @ np.array([u])
-        received = measurement(k, k * steps * H_NS, [*C @ x, *inputs])
-        x_hat = estimates(sensor.handle(received, 0))
-        expected = error_matrix @ error
-        np.testing.assert_allclose(x_hat - x, expected, atol=1e-12)
-        error = x_hat - x
-
-
 def test_complex_poles_and_several_outputs_are_placed() -> None:
     Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
     wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
@@ -157,35 +131,6 @@ def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
     for u in (0.7, 0.7, 0.7, 0.7, -0.4):
         expected = Ad @ expected + Bd @ np.array([u])
     np.testing.assert_allclose(x, expected, rtol=1e-14)
-
-
-def test_the_trigger_works_on_the_estimate_and_the_update_carries_it(
-    observed: dict[str, Any],
-) -> None:
-    scenario = resolved(observed)
-    sensor, alone = sensor_of(scenario), sensor_of(resolved(_undisturbed(observed)))
-    types = tables_of(scenario)[SENSOR_MEASUREMENT]
-    rng = np.random.default_rng(3)
-    for k in range(60):
-        t_ns, y, u = k * H_NS, rng.normal(), rng.normal()
-        outputs = sensor.handle(measurement(k, t_ns, [y, u]), t_ns)
-        (record,) = [one for one in outputs if isinstance(one, Record)]
-        row = np.array([record.row], types)[0]
-        assert (row["y"].tolist(), row["u_applied"].tolist()) == ([y], [u])
-        # A sensor that measures x directly does the same with x̂.
-        expected = alone.handle(measurement(k, t_ns, row["x"].tolist()), t_ns)
-        for mine, others in zip(outputs, expected, strict=True):
-            if isinstance(mine, Message) and isinstance(others, Message):
-                assert mine._replace(vector=0) == others._replace(vector=0)  # type: ignore[arg-type]
-                assert mine.vector.tobytes() == others.vector.tobytes() == row["x"].tobytes()
-            elif isinstance(mine, Record) and isinstance(others, Record):
-                assert str(mine.row[:-2]) == str(others.row)
-    assert row["event"] >= NO_SEQUENCE
-
-
-def _undisturbed(observed: dict[str, Any]) -> dict[str, Any]:
-    plant = {key: value for key, value in observed["plant"].items() if key != "measurement"}
-    return {**{k: v for k, v in observed.items() if k != "observer"}, "plant": plant}
 
 
 def estimates(outputs: Sequence[Output]) -> Vector:

@@ -1,5 +1,7 @@
+"""The sensor's events, checked by hand; also with acknowledgements."""
+
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
-from noack.core.linear_systems import Matrix
+from noack.core.linear_systems import Matrix, transition
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import Sensor
-from tests.machine_parts import OneLoop, machine, sensor_of, state_of
-from tests.trigger_rules import decaying_rule
+from tests.machine_parts import OneLoop, machine, state_of
+from tests.trigger_rules import absolute_rule, decaying_rule
+from tests.wire_decoder import NO_VECTOR
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))
@@ -33,31 +34,6 @@ def updates(outputs: Sequence[Output]) -> list[Message]:
 def rows(outputs: Sequence[Output], n: int) -> Any:
     found = [output.row for output in outputs if isinstance(output, Record)]
     return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
-
-
-def feed(sensor: OneLoop, x: Callable[[float], float], until_s: float) -> list[Output]:
-    """Measure the scalar x(t) on the grid."""
-    outputs: list[Output] = []
-    for k in range(round(until_s * 1e9) // GRID_NS + 1):
-        outputs += sensor.handle(measurement(k, k * GRID_NS, [x(k * GRID_NS * 1e-9)]), k * GRID_NS)
-    return outputs
-
-
-def next_on_grid_ns(t_s: float) -> int:
-    """The first grid time after ``t_s``."""
-    return (math.floor(t_s * 1e9 / GRID_NS) + 1) * GRID_NS
-
-
-def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
-    """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
-    x0, beta = 2.0, 0.3
-    sensor = machine(Sensor(ZOH, decaying_rule(beta, 1.0, n=1), np.array([x0])))
-    sent = updates(feed(sensor, lambda t: x0 * math.exp(-t), 3.0))
-    expected = [next_on_grid_ns(math.log(1 + beta / x0))]
-    while expected[-1] <= 3_000_000_000:
-        expected.append(next_on_grid_ns(expected[-1] * 1e-9 + math.log(1 + beta / x0)))
-    assert [message.t_ns for message in sent] == expected[:-1]
-    assert len(sent) == 21  # 0.14 s apart
 
 
 def test_an_error_equal_to_the_threshold_is_no_event() -> None:
@@ -158,29 +134,55 @@ def test_the_sensor_acts_on_measurements_only() -> None:
     assert not sensor.on_timer(10**9)
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_sensor_of_a_scenario_uses_the_model_not_the_plant(
-    content: dict[str, Any], mode: str
+MS = 1_000_000
+H = np.array([[0.0, 1.0], [-2.0, -3.0]])
+ALWAYS = absolute_rule(1e-9)
+
+
+def acknowledgement(of: Message) -> Message:
+    return Message(Flow.ACKNOWLEDGEMENT, of.sequence, of.t_ns, NO_VECTOR)
+
+
+def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
+    sent = [output for output in outputs if isinstance(output, Message)]
+    (record,) = (output for output in outputs if isinstance(output, Record))
+    return sent, np.array([record.row], tables(2, 1, acknowledged=True)[record.table])[0]
+
+
+def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> OneLoop:
+    known = None if x0 is None else np.asarray(x0, dtype=float)
+    return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
+
+
+@pytest.mark.parametrize("periods", [1, 2, 5])
+def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_timeout(
+    periods: int,
 ) -> None:
-    content |= {"mode": mode}
-    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
-    content["network"]["initial_sync"] = "known_state"
-    content["trigger"] = {"beta": 1.0, "alpha_per_s": 0.5, "weight": [[2.0, 0.0], [0.0, 1.0]]}
-    sensor = sensor_of(resolve(validate(content, "here")))
-    (row,) = rows(sensor.handle(measurement(0, 10**9, [0.0, 0.0]), 10**9), 2)
-    # ẍ = u with u = −x − 1.5 ẋ from (1, 0), by hand for the closed loop, or constant under a hold.
-    w = math.sqrt(1 - 0.75**2)
-    modelled = [
-        math.exp(-0.75) * (math.cos(w) + 0.75 / w * math.sin(w)),
-        -math.exp(-0.75) / w * math.sin(w),
-    ]
-    expected = np.array(modelled if mode == "model" else [1.0, 0.0])
-    np.testing.assert_allclose(row["x_s"], expected, rtol=1e-12)
-    assert row["e_s_norm"] == pytest.approx(math.hypot(2 * expected[0], expected[1]), rel=1e-12)
-    assert row["threshold"] == pytest.approx(math.exp(-0.5), rel=1e-14)
+    one = waiting(periods * GRID_NS, x0=[0.0, 0.0])
+    sent = []
+    for k in range(1, 21):
+        sent += split(one.handle(measurement(k, k * GRID_NS, [float(k), 0.0]), k * GRID_NS))[0]
+    assert [message.t_ns // GRID_NS for message in sent] == list(range(1, 21, periods))
+    assert [message.vector[0] for message in sent] == [message.t_ns // GRID_NS for message in sent]
+    assert [message.sequence for message in sent] == list(range(len(sent)))
 
 
-def test_a_scenario_without_a_known_start_transmits_at_once(content: dict[str, Any]) -> None:
-    sensor = sensor_of(resolve(validate(content, "here")))
-    assert not sensor.machines[0].knows_state
-    assert len(updates(sensor.handle(measurement(0, 0, [1.0, 0.0]), 0))) == 1
+def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
+    one = waiting(GRID_NS, x0=[0.0, 0.0])
+    (first,), _ = split(one.handle(measurement(1, GRID_NS, [1.0, 0.0]), 0))
+    (second,), _ = split(one.handle(measurement(2, 2 * GRID_NS, [2.0, 0.0]), 0))
+    one.handle(acknowledgement(first), 2 * GRID_NS)
+    np.testing.assert_allclose(
+        state_of(one, "x_s"), transition(H, GRID_NS) @ [1.0, 0.0], rtol=1e-14
+    )
+    late = Message(Flow.MEASUREMENT, 3, 2 * GRID_NS + 1, np.array([9.0, 0.0]))
+    assert split(one.handle(late, 2 * GRID_NS + 1))[0] == []
+    one.handle(acknowledgement(second), 2 * GRID_NS + 2)
+    np.testing.assert_allclose(state_of(one, "x_s"), transition(H, 1) @ [2.0, 0.0], rtol=1e-14)
+
+
+def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
+    one = waiting(x0=[1.0, 1.0])
+    before = state_of(one, "x_s")
+    _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
+    assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()

@@ -40,7 +40,7 @@ from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import loop_of, setpoint_of
+from noack.config.resolution import loop_of, policy_of, setpoint_of
 from noack.config.runtime_parameters import text_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -468,7 +468,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     u is constant within a step. So ‖u − Kx‖ is at most the larger of its values at both ends, plus
     a term for the curvature of x: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu + Dw), w constant.
     """
-    alpha = own.scenario.trigger.threshold_decay_per_s
+    alpha = policy_of(own.scenario).fading_per_s
     largest, last = 0.0, np.zeros(0, own.tables[PLANT_STEP])
     for batch in own.source.batches(PLANT_STEP):
         steps = np.concatenate([last, batch])

@@ -181,6 +181,8 @@ class ObservedConditions(NamedTuple):
         found: list[AssumptionViolation] = []
         states = {} if states is None else states
         for rule in conditions.guarantee.rules:
+            if causes is not None and rule.name not in causes:
+                continue
             state = states.get(rule.name, rule.start)
             values, states[rule.name] = self.losses.values(rule, conditions.delay_s, state)
             if (excess := values.excess(rule.limit)) is not None:
@@ -201,11 +203,13 @@ class ObservedConditions(NamedTuple):
             lost = cause.endswith("lost")  # every value is a violation
             every[cause] = (series, -1.0 if lost else self.largest_clock_error_s)
         for cause, (series, limit) in every.items():
+            if causes is not None and cause not in causes:
+                continue
             if (excess := series.excess(limit)) is not None:
                 first_s, worst = excess
                 text = (_NO_INPUT if worst == np.inf else CAUSES[cause]).format(worst, limit)
                 found.append(AssumptionViolation(first_s, cause, worst, text))
-        return [one for one in found if causes is None or one.cause in causes]
+        return found
 
     def first_violation(
         self, conditions: NetworkConditions, causes: Collection[str] | None = None

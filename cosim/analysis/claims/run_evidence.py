@@ -38,10 +38,10 @@ from cosim.record.align import (
     EventFollower,
     SinceEvent,
     aligned_parts,
+    bounded_parts,
     identity_residual,
 )
 from cosim.record.run_record import RunRecord
-from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
@@ -59,7 +59,6 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.scenario_certificates import box, certify, own_plant
 from noack.theory.certificates.solution import Search, completed
-from noack.theory.paper.error_bounds import ErrorMonitor
 from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
@@ -127,16 +126,10 @@ class RunEvidence:
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
         scenario = self.record.scenario
-        monitor = ErrorMonitor(
-            self.record.loop.H, policy_of(scenario), scenario.timing.measurement_period_ns
-        )
         last_ns, follower = np.zeros(0, np.int64), EventFollower(scenario)
-        for part in aligned_parts(self.record):
+        for part, bounds in bounded_parts(self.record):
             rows, joined = part.rows, part.aligned
             common = shares_update(scenario, joined)
-            bounds = monitor.take(
-                rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], joined.received
-            )
             both = (np.where(common, one, np.nan) for one in (bounds.identity, bounds.printed))
             residual = identity_residual(scenario, joined, bounds.missed)
             event_ns = np.append(last_ns, rows["t_ns"][rows["event"] != NO_SEQUENCE])

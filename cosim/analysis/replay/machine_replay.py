@@ -21,6 +21,7 @@ from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
 from noack.config.parameter_changes import ParameterChange, settings_of
 from noack.config.scenario import Scenario, loops_of
+from noack.core.cached_method import cached_method
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
@@ -58,19 +59,20 @@ class InputReplay:
 
     Args:
         role: whose it is.
-        machine: new machines of one loop, or a new network.
+        machine: new machines, or a new network.
         sizes: entries of the vectors that the machine sends, by flow.
+        loop: the place of its loop among those of the machines.
     """
 
     def __init__(
-        self, role: str, machine: LoopMachines | Channel, sizes: Mapping[Flow, int]
+        self, role: str, machine: LoopMachines | Channel, sizes: Mapping[Flow, int], loop: int = 0
     ) -> None:
         self.difference: ReplayDifference | None = None
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
         width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
         self._core: Any = ffi.new("noack_input_replay *", {
-            "role": _ROLES[role], "before_ns": -(2**63), "sent_width": width,
+            "role": _ROLES[role], "before_ns": -(2**63), "sent_width": width, "loop": loop,
             ("channel" if self._is_network else "process"): machine.core,
         })  # fmt: skip
         self._sent = np.zeros((0, width), np.int64)
@@ -277,12 +279,36 @@ def _settings(data: bytes) -> dict[str, Any]:
         return {"": None}
 
 
-_MACHINES: Mapping[str, Callable[[Scenario, Start], LoopMachines | Channel]] = {
-    "plant": lambda loop, start: plants_of((loop,), start=start),
-    "sensor": lambda loop, start: sensors_of((loop,), start=start),
-    "netem": lambda scenario, start: channel_of(scenario, start, loops=len(loops_of(scenario))),
-    "controller": lambda loop, start: controllers_of((loop,), start=start),
+_MACHINES: Mapping[str, Callable[..., LoopMachines]] = {
+    "plant": plants_of,
+    "sensor": sensors_of,
+    "controller": controllers_of,
 }
+
+
+class SharedMachines:
+    """The first machines of several loops without changes of settings, which are made at once.
+
+    Args:
+        records: the records of the loops, each in memory as a whole.
+    """
+
+    def __init__(self, records: Sequence[RunRecord]) -> None:
+        self._loops = [
+            record
+            for record in records
+            if record.is_short and not any(record.count(one) for one in SETTINGS)
+        ]
+
+    def place(self, record: RunRecord) -> int | None:
+        """Return the place of a loop among the machines; None if they do not have it."""
+        numbers = [one.number for one in self._loops]
+        return numbers.index(record.number) if record.number in numbers else None
+
+    @cached_method
+    def of(self, role: str) -> LoopMachines:
+        """Return the machines of a role."""
+        return _MACHINES[role]([one.scenario for one in self._loops], start=Start(0))
 
 
 class MachineReplay:
@@ -291,10 +317,10 @@ class MachineReplay:
     Each machine gets its recorded inputs, up to the first gap, and its rows are compared.
     """
 
-    def __init__(self, role: str, record: RunRecord) -> None:
+    def __init__(self, role: str, record: RunRecord, shared: SharedMachines) -> None:
         self._tables = record.owned_by(role)
         self._begun = record.begun_lives(role)
-        self._lives = [_LifeReplay(role, record.scenario, life) for life in record.row_counts(role)]
+        self._lives = [_LifeReplay(role, record, life, shared) for life in record.row_counts(role)]
         self.newest: list[InputReplay] = []
         """The replays of the newest part; they have what was sent."""
 
@@ -320,8 +346,8 @@ class MachineReplay:
 class _LifeReplay:
     """The replay of one generation."""
 
-    def __init__(self, role: str, scenario: Scenario, life: Life) -> None:
-        self._role, self._scenario, self._life = role, scenario, life
+    def __init__(self, role: str, record: RunRecord, life: Life, shared: SharedMachines) -> None:
+        self._role, self._record, self._life, self._shared = role, record, life, shared
         self._run: InputReplay | None = None
         self._count = sum(life.rows.values())
         report = life.report
@@ -340,9 +366,7 @@ class _LifeReplay:
             return []
         order = self._in_order(owned)
         if self._run is None:
-            start = _start(self._life.generation, owned)
-            machine = _MACHINES[self._role](self._scenario, start)
-            self._run = InputReplay(self._role, machine, _sizes(self._role, self._scenario))
+            self._run = self._begin(owned)
         taken = self._run.replay(owned, order, self._before)
         self._stopped |= taken < len(order)
         self._compared += taken
@@ -350,11 +374,21 @@ class _LifeReplay:
             self._before[table] += len(rows)
         return [self._run]
 
+    def _begin(self, owned: Slice) -> InputReplay:
+        """Return the replay of a new machine."""
+        role, scenario, generation = self._role, self._record.scenario, self._life.generation
+        start, sizes = _start(generation, owned), _sizes(role, scenario)
+        if role == "netem":
+            channel = channel_of(scenario, start, loops=len(loops_of(scenario)))
+            return InputReplay(role, channel, sizes)
+        place = None if generation else self._shared.place(self._record)
+        if place is not None:
+            return InputReplay(role, self._shared.of(role), sizes, place)
+        return InputReplay(role, _MACHINES[role]((scenario,), start=start), sizes)
+
     def result(self) -> ProcessReplay:
-        generation, differs = (
-            self._life.generation,
-            None if self._run is None else self._run.difference,
-        )
+        generation = self._life.generation
+        differs = None if self._run is None else self._run.difference
         found = [one for one in (differs, self._damage) if one is not None]
         return ProcessReplay(
             process=f"{self._role} ({generation + 1})" if generation else self._role,

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.summary_model import ReplayDifference, SummaryPart
+from cosim.analysis.summary_model import ReplayDifference, ReplayPart, SummaryPart
 from noack.protocol.record_tables import entry_names
 
 Value = float | int | str | None
@@ -136,19 +136,19 @@ class Replay(SummaryPart):
         """The gaps of the record that the replay does not cover, in words."""
         return [gap for process in self.processes if (gap := process.gap)]
 
-    def verdict(self) -> dict[str, Any]:
+    def verdict(self) -> ReplayPart:
         """The result for the run's summary."""
-        found = self.first_difference
-        return {
-            "bit_exact": self.bit_exact,
-            "complete": not self.gaps,
-            "inputs": self.inputs,
-            "first_difference": None if found is None else found.model_dump(),
-        }
+        return ReplayPart(
+            bit_exact=self.bit_exact,
+            complete=not self.gaps,
+            inputs=self.inputs,
+            first_difference=self.first_difference,
+        )
 
     def document(self) -> dict[str, Any]:
         """The complete result for JSON."""
-        return self.verdict() | {"gaps": self.gaps} | self.model_dump()
+        verdict = self.verdict().model_dump(exclude={"error"})
+        return verdict | {"gaps": self.gaps} | self.model_dump()
 
 
 def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:

@@ -66,7 +66,7 @@ def reproduce(
         long: Repeat a run of more than a million steps, too.
         into: Keep the archived run and its repetition in this new folder.
     """
-    from cosim.studies.run_repetition import print_repetition, repeat_archive
+    from cosim.studies.run_archive import print_repetition, repeat_archive
 
     with cli.status("repeating"):
         found = repeat_archive(file, run_code=run_code, long=long, into=into)

@@ -166,8 +166,8 @@ def fidelity(
     """
     from cosim.analysis.fidelity import compute_fidelity
     from cosim.output.figure_files import save_figure
+    from cosim.output.run_figures import fidelity_figure
     from cosim.output.run_verdict import print_fidelity
-    from cosim.output.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)

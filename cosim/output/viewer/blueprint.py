@@ -28,6 +28,7 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal, cast
 from uuid import UUID
 
@@ -48,8 +49,19 @@ from cosim.output.palette import (
     Colour,
 )
 from cosim.output.palette import FORCED as FORCED_COLOUR
-from cosim.output.viewer.network_diagram import NetworkDiagram
-from cosim.output.viewer.pictures.picture import TIMELINE, Picture, Shape, label, lines, panel
+from cosim.output.viewer.network_diagram import DIAGRAM, NetworkDiagram
+from cosim.output.viewer.pictures.picture import (
+    PICTURE,
+    TIMELINE,
+    Picture,
+    Shape,
+    label,
+    lines,
+    panel,
+)
+
+Static = rr.TextDocument | rr.SeriesLines | rr.SeriesPoints | Shape
+"""Data that do not change during a run."""
 
 ABOUT = "about"
 LOG = "log"
@@ -73,9 +85,9 @@ def state_path(name: str) -> str:
     return f"state/{rr.escape_entity_path_part(name)}"
 
 
-def loop_path(name: str) -> str:
-    """Return the entity of a loop, in a recording of several; its name is escaped."""
-    return f"loops/{rr.escape_entity_path_part(name)}"
+def loop_folder(name: str) -> str:
+    """Return the folder of a loop's entities, in a recording of several; its name is escaped."""
+    return f"loops/{rr.escape_entity_path_part(name)}/"
 
 
 def lateness_path(process: str) -> str:
@@ -88,10 +100,76 @@ def clock_path(process: str) -> str:
     return f"clock/{rr.escape_entity_path_part(process)}"
 
 
-def styles(
-    state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
-) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
-    """Return name, colour and width of every series, by entity; logged once as static data."""
+@dataclass(frozen=True)
+class ShownLoop:
+    """What the viewer shows of a loop."""
+
+    about: str
+    """Markdown shown beside the plots."""
+    state_names: Sequence[str]
+    input_names: Sequence[str]
+    processes: Sequence[str] = ()
+    """Those whose lateness is shown; none in a simulated run."""
+    has_clocks: bool = False
+    """Whether the bounds of the clocks' errors are shown."""
+    picture: Picture | None = None
+    """Picture of the plant, if there is one."""
+    diagram: NetworkDiagram | None = None
+    """Diagram of the network, if there is one."""
+    folder: str = ""
+    """Entities of the loop are below it; it ends with a slash, or is empty."""
+    phase_ns: int = 0
+    """Time of the run at which the loop's own time is 0."""
+
+    def static(self) -> dict[str, Static]:
+        """Return what does not move, by entity: texts, styles of series, scenery, colour key."""
+        found: dict[str, Static] = {
+            ABOUT: rr.TextDocument(self.about, media_type="text/markdown"),
+            **_styles(self),
+        }
+        drawings = {COLOUR_KEY: colour_key(self.input_names)}
+        if self.picture is not None:
+            drawings[PICTURE] = self.picture.scenery()
+        if self.diagram is not None:
+            drawings[DIAGRAM] = self.diagram.scenery()
+        for parent, shapes in drawings.items():
+            found |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}
+        return {f"{self.folder}{entity}": shape for entity, shape in found.items()}
+
+    def panels(self) -> rrb.Container:
+        """Lay out the panels: picture, packets and texts on the left, curves on the right.
+
+        Plots have no legends, which would cover data; instead, a panel explains the colours.
+        """
+        drawings = [] if self.picture is None else [panel(self.picture)]
+        drawings += [] if self.diagram is None else [self.diagram.panel()]
+        states, texts = _states(self.state_names), _texts(self)
+        norms, inputs, intervals = _norms(), plot("Control input u", INPUT), _intervals()
+        if drawings:
+            shares = [*[4, 3][: len(drawings)], 3.6]
+            left: rrb.Container = rrb.Vertical(*drawings, texts, row_shares=shares)
+            below = rrb.Horizontal(norms, inputs)
+            right = rrb.Vertical(states, below, intervals, row_shares=[2, 1, 1])
+            shown = rrb.Horizontal(left, right, column_shares=[1, 1])
+        else:
+            left = rrb.Vertical(states, intervals, row_shares=[2, 1])
+            right = rrb.Vertical(norms, inputs, texts)
+            shown = rrb.Horizontal(left, right, column_shares=[2, 1])
+        move_below(shown, self.folder)
+        return shown
+
+    def small_picture(self) -> rrb.View:
+        """Return the panel of the picture, without its legend: the panel is small."""
+        assert self.picture is not None
+        view = panel(self.picture)
+        move_below(view, self.folder)
+        view.contents = ["$origin/**", "- $origin/legend/**"]
+        return view
+
+
+def _styles(shown: ShownLoop) -> dict[str, Static]:
+    """Return name, colour and width of every series, by entity."""
+    input_names, m = shown.input_names, len(shown.input_names)
     triple = rr.SeriesLines(
         names=["x plant", "x_s sensor model", "x_c controller model"],
         colors=[PLANT, SENSOR, CONTROLLER],
@@ -101,36 +179,33 @@ def styles(
     errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
-    found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
-        state_path(name): triple for name in state_names
+    lateness = {lateness_path(one): line for one, line in _of_processes(shown.processes).items()}
+    clocks = {clock_path(one): line for one, line in _of_processes(shown.processes).items()}
+    return {
+        **{state_path(name): triple for name in shown.state_names},
+        ERROR: rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4]),
+        ERROR_LOG10: rr.SeriesLines(names=errors, colors=colours, widths=widths),
+        SIZE_LOG10: rr.SeriesLines(
+            names=["certified from x(0)", "bound, given x at the last event", "‖x‖ plant"],
+            colors=[CERTIFIED, CERTIFIED, PLANT],
+            widths=[2.0, 1.0, 2.5],
+        ),
+        EVENT_CERTIFIED: rr.SeriesLines(names="certified minimum", colors=CERTIFIED, widths=1.5),
+        INPUT: rr.SeriesLines(
+            names=list(input_names),
+            colors=[input_colour(i) for i in range(m)],
+            # Inputs are often equal: the first ones are wider and stay visible.
+            widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
+        ),
+        EVENT_STEM: _stem("sent", SENSOR),
+        EVENT: _mark("sent", SENSOR, "circle", 4.0),
+        RECEPTION_STEM: _stem("received", CONTROLLER),
+        RECEPTION: _mark("received", CONTROLLER, "circle", 4.0),
+        FORCED: _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0),
+        DROP: _mark("lost", LOST, "cross", 5.0),
+        **lateness,
+        **(clocks if shown.has_clocks else {}),
     }
-    found[ERROR] = rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4])
-    found[ERROR_LOG10] = rr.SeriesLines(names=errors, colors=colours, widths=widths)
-    found[SIZE_LOG10] = rr.SeriesLines(
-        names=["certified from x(0)", "bound, given x at the last event", "‖x‖ plant"],
-        colors=[CERTIFIED, CERTIFIED, PLANT],
-        widths=[2.0, 1.0, 2.5],
-    )
-    found[EVENT_CERTIFIED] = rr.SeriesLines(names="certified minimum", colors=CERTIFIED, widths=1.5)
-    m = len(input_names)
-    found[INPUT] = rr.SeriesLines(
-        names=list(input_names),
-        colors=[input_colour(i) for i in range(m)],
-        # Inputs are often equal: the first ones are wider and stay visible.
-        widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
-    )
-    found[EVENT_STEM] = _stem("sent", SENSOR)
-    found[EVENT] = _mark("sent", SENSOR, "circle", 4.0)
-    found[RECEPTION_STEM] = _stem("received", CONTROLLER)
-    found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
-    found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
-    found[DROP] = _mark("lost", LOST, "cross", 5.0)
-    return found | {lateness_path(one): line for one, line in _of_processes(processes).items()}
-
-
-def clock_styles(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
-    """Return name, colour and width of the bounds of the clocks' errors, by entity."""
-    return {clock_path(one): line for one, line in _of_processes(processes).items()}
 
 
 def _of_processes(processes: Sequence[str]) -> dict[str, rr.SeriesLines]:
@@ -158,23 +233,6 @@ def _mark(
     return rr.SeriesPoints(names=name, colors=colour, markers=marker, marker_sizes=size)
 
 
-def layout(
-    state_names: Sequence[str],
-    input_names: Sequence[str],
-    processes: Sequence[str],
-    horizon_s: float,
-    *,
-    picture: Picture | None = None,
-    diagram: NetworkDiagram | None = None,
-    clocks: bool = False,
-) -> rrb.Blueprint:
-    """Lay out the panels of a run; see :func:`panels`."""
-    shown = panels(
-        state_names, input_names, processes, picture=picture, diagram=diagram, clocks=clocks
-    )
-    return over_time(shown, horizon_s)
-
-
 def over_time(shown: rrb.Container, horizon_s: float) -> rrb.Blueprint:
     """Return the layout of panels that share the time axis of a run."""
     return rrb.Blueprint(
@@ -184,52 +242,19 @@ def over_time(shown: rrb.Container, horizon_s: float) -> rrb.Blueprint:
     )
 
 
-def panels(
-    state_names: Sequence[str],
-    input_names: Sequence[str],
-    processes: Sequence[str],
-    *,
-    picture: Picture | None = None,
-    diagram: NetworkDiagram | None = None,
-    clocks: bool = False,
-) -> rrb.Container:
-    """Lay out the panels: picture, packets and texts on the left, curves on the right.
-
-    With ``clocks`` the bounds of the clocks' errors are among the texts. Plots have no legends,
-    which would cover data; instead, a panel explains the colours.
-    """
-    texts = _texts(input_names, lateness=bool(processes), clocks=clocks)
-    drawings = [] if picture is None else [panel(picture)]
-    drawings += [] if diagram is None else [diagram.panel()]
-    if drawings:
-        left = rrb.Vertical(*drawings, texts, row_shares=[*[4, 3][: len(drawings)], 3.6])
-        curves = rrb.Vertical(
-            _states(state_names),
-            rrb.Horizontal(_norms(), _inputs()),
-            _intervals(),
-            row_shares=[2, 1, 1],
-        )
-        return rrb.Horizontal(left, curves, column_shares=[1, 1])
-    return rrb.Horizontal(
-        rrb.Vertical(_states(state_names), _intervals(), row_shares=[2, 1]),
-        rrb.Vertical(_norms(), _inputs(), texts),
-        column_shares=[2, 1],
-    )
-
-
-def below(shown: rrb.Container | rrb.View, folder: str) -> None:
+def move_below(shown: rrb.Container | rrb.View, folder: str) -> None:
     """Let panels show the entities below a folder instead of those at the root."""
     if isinstance(shown, rrb.View):
-        shown.origin = f"{folder}/{shown.origin}"
+        shown.origin = f"{folder}{shown.origin}"
         given = shown.contents
         paths = [given] if isinstance(given, str) else [*cast(Sequence[str], given)]
-        shown.contents = [one if one.startswith("$") else f"/{folder}{one}" for one in paths]
+        shown.contents = [p if p.startswith("$") else f"/{folder}{p.lstrip('/')}" for p in paths]
         overrides = shown.visualizer_overrides
-        shown.visualizer_overrides = {f"{folder}/{path}": one for path, one in overrides.items()}
+        shown.visualizer_overrides = {f"{folder}{path}": one for path, one in overrides.items()}
         return
     for part in shown.contents:
         if isinstance(part, (rrb.Container, rrb.View)):
-            below(part, folder)
+            move_below(part, folder)
 
 
 def _intervals() -> rrb.Container:
@@ -247,19 +272,18 @@ def _norms() -> rrb.Container:
     )
 
 
-def _inputs() -> rrb.View:
-    return plot("Control input u", INPUT)
-
-
-def _texts(input_names: Sequence[str], *, lateness: bool, clocks: bool) -> rrb.Container:
+def _texts(shown: ShownLoop) -> rrb.Container:
     """Return the tabs: the colour key, the text about the run, lateness, clocks, the log."""
-    return rrb.Tabs(
-        ColourKey(input_names).panel(),
-        rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-        *([plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
-        *([plot("Clock error [µs]", "clock", ["$origin/**"])] if clocks else []),
-        log_view(),
-    )
+    everything = ["$origin/**"]
+    timing = [plot("Lateness [µs]", "lateness", everything)] if shown.processes else []
+    timing += [plot("Clock error [µs]", "clock", everything)] if shown.has_clocks else []
+    key, text = colour_key_panel(shown.input_names), about_view()
+    return rrb.Tabs(key, text, *timing, log_view())
+
+
+def about_view() -> rrb.View:
+    """Return the panel of the text about the run."""
+    return rrb.TextDocumentView(origin=ABOUT, name="About this run")
 
 
 def log_view() -> rrb.View:
@@ -353,38 +377,28 @@ def input_colour(i: int) -> palette.Colour:
     return palette.SERIES[i % len(palette.SERIES)]
 
 
-class ColourKey:
-    """Samples of lines and marks, with their names.
+def _key_rows(input_names: Sequence[str]) -> list[Sequence[_Entry]]:
+    """Return the rows of the key; a single input needs no entry."""
+    names = input_names if len(input_names) > 1 else ()
+    inputs = [(name, input_colour(i), _STROKE) for i, name in enumerate(names)]
+    most = _MOST_IN_A_ROW
+    return [*_ROWS, *(inputs[i : i + most] for i in range(0, len(inputs), most))]
 
-    Args:
-        input_names: names of the control inputs; a single input needs no entry.
-    """
 
-    def __init__(self, input_names: Sequence[str]) -> None:
-        names = input_names if len(input_names) > 1 else ()
-        inputs = [(name, input_colour(i), _STROKE) for i, name in enumerate(names)]
-        self._rows = [
-            *_ROWS,
-            *(inputs[i : i + _MOST_IN_A_ROW] for i in range(0, len(inputs), _MOST_IN_A_ROW)),
-        ]
+def colour_key_panel(input_names: Sequence[str]) -> rrb.Spatial2DView:
+    """Return the panel that explains the colours."""
+    high = len(_key_rows(input_names)) * _HIGH
+    bounds = rrb.VisualBounds2D(x_range=[0.0, _WIDE], y_range=[-0.4, high])
+    return rrb.Spatial2DView(origin=COLOUR_KEY, name="Colours", visual_bounds=bounds)
 
-    def panel(self) -> rrb.Spatial2DView:
-        """The view of the key."""
-        return rrb.Spatial2DView(
-            origin=COLOUR_KEY,
-            name="Colours",
-            visual_bounds=rrb.VisualBounds2D(
-                x_range=[0.0, _WIDE], y_range=[-0.4, len(self._rows) * _HIGH]
-            ),
-        )
 
-    def scenery(self) -> Mapping[str, Shape]:
-        """The samples and names, by entity."""
-        found: dict[str, Shape] = {}
-        for i, row in enumerate(self._rows):
-            for j, (name, colour, sample) in enumerate(row):
-                x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
-                moved = [(x + dx, y + dy) for dx, dy in sample]
-                found[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
-                found[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
-        return found
+def colour_key(input_names: Sequence[str]) -> Mapping[str, Shape]:
+    """Return samples of lines and marks, with their names, by entity."""
+    found: dict[str, Shape] = {}
+    for i, row in enumerate(_key_rows(input_names)):
+        for j, (name, colour, sample) in enumerate(row):
+            x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
+            moved = [(x + dx, y + dy) for dx, dy in sample]
+            found[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
+            found[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
+    return found

@@ -1,14 +1,14 @@
 """The recording of a run for the viewer, as a rerun file that is written while the run goes on.
 
-:class:`RecordingFile` writes the file, :class:`RunView` the signals, events, packets and log of a
-loop, :class:`LoopView` those of one of several loops. The recording is only for viewing: the run's
-data are in the Parquet files, and only similar versions of rerun can read a recording.
+:class:`RecordingFile` writes the file, :class:`LoopView` the signals, events, packets and log of a
+loop. The recording is only for viewing: the run's data are in the Parquet files, and only similar
+versions of rerun can read a recording.
 """
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S, NetworkDiagram
-from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
+from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S
+from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, joined
 from cosim.record.align import AlignedRun
 from cosim.record.run_directory import Kind
 from noack.config.scenario import Scenario
@@ -68,12 +67,12 @@ class RecordingFile:
             reason = why(error) if isinstance(error, OSError) else str(error)
             raise ViewError(f"{path}: cannot create the recording: {reason}") from None
 
-    def describe(self, title: str, static: dict[str, Any]) -> None:
+    def describe(self, title: str, static: Mapping[str, rr.AsComponents]) -> None:
         """Set the recording's title and its static data, by entity."""
         self._stream.send_recording_name(title)
         self.add_static(static)
 
-    def add_static(self, static: dict[str, Any]) -> None:
+    def add_static(self, static: Mapping[str, rr.AsComponents]) -> None:
         """Add static data, by entity."""
         for entity, shape in static.items():
             self._stream.log(entity, shape, static=True)
@@ -98,16 +97,11 @@ class RecordingFile:
         except RuntimeError as error:
             raise ViewError(f"{self.path}: cannot write the recording: {error}") from None
 
-    def send_stems(self, entity: str, t_ns: Nanoseconds, height: Floats) -> None:
-        """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
-        line = np.stack((np.zeros_like(height), height, np.full_like(height, np.nan)), axis=1)
-        self.send(entity, np.repeat(t_ns, 3), line.ravel())
-
-    def log(self, t_ns: int, level: str, text: str) -> None:
+    def log(self, t_ns: int, level: str, text: str, folder: str = "") -> None:
         """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
         line = f"{t_ns / 1e9:8.3f} s  {text}"
         columns = rr.TextLog.columns(text=[line], level=[level])
-        self.send_columns(bp.LOG, np.array([t_ns], dtype=np.int64), columns)
+        self.send_columns(f"{folder}{bp.LOG}", np.array([t_ns], dtype=np.int64), columns)
 
     def flush(self) -> None:
         """Pass buffered data to the operating system."""
@@ -181,82 +175,41 @@ _FRAMES_AT_ONCE = 12
 """Frames per batch; a batch needs more than a kilobyte for each moving entity."""
 
 
-class RunView(RecordingFile):
-    """Writes ``recording.rrd``. Every method takes a batch of one kind, ordered in time.
+class LoopView:
+    """Writes what is shown of one loop. Every method takes a batch of one kind, ordered in time.
 
-    Times are int64 nanoseconds of simulated time since the run's epoch.
+    Times are int64 nanoseconds of simulated time since the loop's start.
 
     Args:
-        path: the file; replaced if it exists.
-        run_id: identity of the recording, unique among runs.
-        title: name of the recording.
-        about: Markdown shown beside the plots.
-        state_names: names of the n coordinates of x.
-        input_names: names of the m coordinates of u.
-        processes: names of the processes whose lateness is shown; none in a simulated run.
-        horizon_s: length of the run, and of the plots' time axis.
-        picture: picture of the plant, if there is one.
-        diagram: diagram of the network, if there is one.
-        live: live viewer, which shows the file while it is written.
-        indexed: see :class:`RecordingFile`.
-        clocks: whether the bounds of the clocks' errors are shown.
-
-    Raises:
-        ViewError: the file cannot be created.
+        file: the recording.
+        shown: what is shown; its static data are written here.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        run_id: str,
-        title: str,
-        about: str,
-        state_names: Sequence[str],
-        input_names: Sequence[str],
-        processes: Sequence[str],
-        horizon_s: float,
-        picture: Picture | None = None,
-        diagram: NetworkDiagram | None = None,
-        live: LiveView | None = None,
-        indexed: bool = True,
-        clocks: bool = False,
-    ) -> None:
-        names = (state_names, input_names, processes)
-        layout = bp.layout(*names, horizon_s, picture=picture, diagram=diagram, clocks=clocks)
-        super().__init__(path, run_id, layout, indexed=indexed)
-        self._live = live
-        static = self._begin(about, *names, picture, diagram)
-        self.describe(title, static | (bp.clock_styles(processes) if clocks else {}))
-        if live is not None:
-            live.show(path)
-
-    def _begin(
-        self,
-        about: str,
-        state_names: Sequence[str],
-        input_names: Sequence[str],
-        processes: Sequence[str],
-        picture: Picture | None,
-        diagram: NetworkDiagram | None,
-    ) -> dict[str, Any]:
-        """Start with empty batches; return the static data, by entity."""
-        self._states = [bp.state_path(name) for name in state_names]
-        self._lateness = {name: bp.lateness_path(name) for name in processes}
-        self._picture, self._diagram = picture, diagram
+    def __init__(self, file: RecordingFile, shown: bp.ShownLoop) -> None:
+        self._file, self._shown = file, shown
+        self._states = [bp.state_path(name) for name in shown.state_names]
         self._frame = -1
         self._waiting: list[tuple[Nanoseconds, Frames]] = []
-        static: dict[str, Any] = {bp.ABOUT: rr.TextDocument(about, media_type="text/markdown")}
-        static |= bp.styles(state_names, input_names, processes)
-        drawings = (
-            (PICTURE, picture),
-            (DIAGRAM, diagram),
-            (bp.COLOUR_KEY, bp.ColourKey(input_names)),
-        )
-        for parent, drawing in drawings:
-            shapes = {} if drawing is None else drawing.scenery()
-            static |= {f"{parent}/{entity}": shape for entity, shape in shapes.items()}
-        return static
+        file.add_static(shown.static())
+
+    def _send(self, entity: str, t_ns: Nanoseconds, values: Floats) -> None:
+        at_ns = np.asarray(t_ns) + self._shown.phase_ns
+        self._file.send(f"{self._shown.folder}{entity}", at_ns, values)
+
+    def _send_columns(
+        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        at_ns = np.asarray(t_ns) + self._shown.phase_ns
+        self._file.send_columns(f"{self._shown.folder}{entity}", at_ns, columns)
+
+    def _send_stems(self, entity: str, t_ns: Nanoseconds, height: Floats) -> None:
+        """Add lines from 0 to each height (k,) at times (k,), with a gap after each."""
+        line = np.stack((np.zeros_like(height), height, np.full_like(height, np.nan)), axis=1)
+        self._send(entity, np.repeat(t_ns, 3), line.ravel())
+
+    def log(self, t_ns: int, level: str, text: str) -> None:
+        """Add one line to the loop's log; ``level`` is one of rerun's, such as INFO or WARN."""
+        self._file.log(t_ns + self._shown.phase_ns, level, text, self._shown.folder)
 
     def samples(self, aligned: AlignedRun, e_c_bounds: Floats, x_bounds: Floats) -> None:
         """Add k samples.
@@ -270,37 +223,37 @@ class RunView(RecordingFile):
         t_ns = aligned.t_ns
         triples = np.stack([aligned.x, aligned.x_s, aligned.x_c], axis=2)
         for i, entity in enumerate(self._states):
-            self.send(entity, t_ns, triples[:, i, :])
+            self._send(entity, t_ns, triples[:, i, :])
         measured = (aligned.e_s_norm, aligned.threshold, aligned.e_c_norm)
         norms = np.column_stack([e_c_bounds[:, 0], *measured, e_c_bounds[:, 1]])
         # On a linear scale, a certified bound would flatten everything else.
-        self.send(bp.ERROR, t_ns, norms[:, :4])
-        self.send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
+        self._send(bp.ERROR, t_ns, norms[:, :4])
+        self._send(bp.ERROR_LOG10, t_ns, _log10(norms, aligned.threshold))
         sizes = np.column_stack([x_bounds, np.linalg.norm(aligned.x, axis=1)])
-        self.send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
+        self._send(bp.SIZE_LOG10, t_ns, _log10(sizes, aligned.threshold))
 
     def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
         """Add states at times (k,) to the plant's picture, at its frame rate."""
-        if self._picture is None:
+        if self._shown.picture is None:
             return
-        frame = t_ns // round(NS_PER_S / self._picture.rate_hz)
+        frame = t_ns // round(NS_PER_S / self._shown.picture.rate_hz)
         new = np.diff(frame, prepend=self._frame) > 0
         if not new.any():
             return
         self._frame = int(frame[-1])
         self._waiting.append((t_ns[new], frames.at(new)))
         if sum(len(times) for times, _ in self._waiting) >= _FRAMES_AT_ONCE:
-            self._draw()
+            self.draw()
 
-    def _draw(self) -> None:
-        """Write the waiting frames."""
-        if self._picture is None or not self._waiting:
+    def draw(self) -> None:
+        """Write the waiting frames of the picture."""
+        if self._shown.picture is None or not self._waiting:
             return
         t_ns = np.concatenate([times for times, _ in self._waiting])
         frames = joined([frames for _, frames in self._waiting])
         self._waiting = []
-        for entity, columns in self._picture.frames(frames).items():
-            self.send_columns(f"{PICTURE}/{entity}", t_ns, columns)
+        for entity, columns in self._shown.picture.frames(frames).items():
+            self._send_columns(f"{PICTURE}/{entity}", t_ns, columns)
 
     def packets(
         self,
@@ -311,29 +264,29 @@ class RunView(RecordingFile):
         reverse: bool = False,
     ) -> None:
         """Add packets (p,) to the network's diagram; see :meth:`NetworkDiagram.add`."""
-        if self._diagram is not None:
-            self._diagram.add(t_ns, release_ns, fate, reverse=reverse)
+        if self._shown.diagram is not None:
+            self._shown.diagram.add(t_ns, release_ns, fate, reverse=reverse)
 
     def travel(self, until_ns: int) -> None:
         """Animate the packets up to a time by which all of them were added."""
-        if self._diagram is None:
+        if self._shown.diagram is None:
             return
-        for entity, moving in self._diagram.advance(until_ns).items():
-            self.send_columns(f"{DIAGRAM}/{entity}", moving.t_ns, moving.columns)
+        for entity, moving in self._shown.diagram.advance(until_ns).items():
+            self._send_columns(f"{DIAGRAM}/{entity}", moving.t_ns, moving.columns)
 
     def certified_interval(self, interval_s: float, until_ns: int) -> None:
         """Draw the certified minimum inter-event time, from 0 to ``until_ns``."""
-        self.send(bp.EVENT_CERTIFIED, np.array([0, until_ns]), np.full(2, interval_s))
+        self._send(bp.EVENT_CERTIFIED, np.array([0, until_ns]), np.full(2, interval_s))
 
     def inputs(self, t_ns: Nanoseconds, u: Floats) -> None:
         """Add the control input u (k, m) at times (k,)."""
-        self.send(bp.INPUT, t_ns, u)
+        self._send(bp.INPUT, t_ns, u)
 
     def broadcasts(self, t_ns: Nanoseconds, interval_s: Floats) -> None:
         """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,), NaN (drawn 0) for none."""
         interval_s = np.nan_to_num(interval_s)
-        self.send_stems(bp.EVENT_STEM, t_ns, interval_s)
-        self.send(bp.EVENT, t_ns, interval_s)
+        self._send_stems(bp.EVENT_STEM, t_ns, interval_s)
+        self._send(bp.EVENT, t_ns, interval_s)
 
     def receptions(
         self, t_ns: Nanoseconds, interval_s: Floats, forced: npt.NDArray[np.bool_]
@@ -345,79 +298,23 @@ class RunView(RecordingFile):
         """
         interval_s = np.nan_to_num(interval_s)
         forced = np.asarray(forced, dtype=bool)
-        self.send_stems(bp.RECEPTION_STEM, t_ns, interval_s)
-        self.send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
-        self.send(bp.FORCED, t_ns[forced], interval_s[forced])
+        self._send_stems(bp.RECEPTION_STEM, t_ns, interval_s)
+        self._send(bp.RECEPTION, t_ns[~forced], interval_s[~forced])
+        self._send(bp.FORCED, t_ns[forced], interval_s[forced])
 
     def drops(self, t_ns: Nanoseconds) -> None:
         """Add the times (k,) at which an update was lost."""
-        self.send(bp.DROP, t_ns, np.zeros(len(t_ns)))
+        self._send(bp.DROP, t_ns, np.zeros(len(t_ns)))
 
     def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
         """Add a process's lateness in µs (k,) at times (k,), if it is shown."""
-        if process in self._lateness:
-            self.send(self._lateness[process], t_ns, lateness_us)
+        if process in self._shown.processes:
+            self._send(bp.lateness_path(process), t_ns, lateness_us)
 
     def clock_errors(self, process: str, t_ns: Nanoseconds, error_us: Floats) -> None:
         """Add bounds of the error of a process's clock in µs (k,) at times (k,); NaN: lost."""
-        if process in self._lateness:
-            self.send(bp.clock_path(process), t_ns, error_us)
-
-    def close(self) -> None:
-        """Write the waiting data and the file's footer; a second call does nothing.
-
-        Raises:
-            ViewError: the file could not be written in full.
-        """
-        try:
-            self._draw()
-        finally:
-            super().close()
-            if self._live is not None:
-                self._live.finish()
-                self._live = None
-
-
-class LoopView(RunView):
-    """Shows one of several loops in their common recording, below the entity ``loops/NAME``.
-
-    Args:
-        whole: the recording.
-        name: name of the loop.
-        phase_ns: time of the run at which the loop's own time is 0.
-        about, state_names, input_names, picture, diagram: as those of :class:`RunView`.
-    """
-
-    def __init__(
-        self,
-        whole: RecordingFile,
-        name: str,
-        phase_ns: int,
-        *,
-        about: str,
-        state_names: Sequence[str],
-        input_names: Sequence[str],
-        picture: Picture | None = None,
-        diagram: NetworkDiagram | None = None,
-    ) -> None:
-        self._whole, self._folder, self._phase_ns = whole, bp.loop_path(name), phase_ns
-        self._live = None
-        static = self._begin(about, state_names, input_names, (), picture, diagram)
-        whole.add_static({f"{self._folder}/{entity}": shape for entity, shape in static.items()})
-
-    def send_columns(
-        self, entity: str, t_ns: Nanoseconds, columns: Iterable[rr.ComponentColumn]
-    ) -> None:
-        """Add columns of an entity of the loop at times (k,) of the loop."""
-        times_ns = np.asarray(t_ns) + self._phase_ns
-        self._whole.send_columns(f"{self._folder}/{entity}", times_ns, columns)
-
-    def flush(self) -> None:
-        """Nothing: the recording of all loops is flushed as a whole."""
-
-    def close(self) -> None:
-        """Write the waiting data; the recording stays open."""
-        self._draw()
+        if process in self._shown.processes:
+            self._send(bp.clock_path(process), t_ns, error_us)
 
 
 def _log10(norms: Floats, threshold: Floats) -> Floats:

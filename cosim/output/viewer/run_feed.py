@@ -22,8 +22,7 @@ from cosim.analysis.network_summary import (
     places,
     times_inside,
 )
-from cosim.output.viewer.recording import RunView
-from cosim.output.viewer.run_recording import ERROR, SIZE, NetworkRecording
+from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
@@ -32,6 +31,7 @@ from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (
+    CLOCK_TABLES,
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     LOOP,
@@ -49,32 +49,8 @@ _LONGEST_NS = 2**50
 """Longer than any run; 2**13 loops have keys of 63 bits."""
 
 
-def feed_of(
-    scenario: Scenario, view: RunView | NetworkRecording, warn: Callable[[str], None]
-) -> "LoopFeed | NetworkFeed":
-    """Return what passes the rows of a run to its recording."""
-    if isinstance(view, NetworkRecording):
-        return NetworkFeed(scenario, view, warn)
-    return LoopFeed(scenario, view)
-
-
-class LoopFeed:
-    """Passes the rows of a run of one loop to its recording."""
-
-    def __init__(self, scenario: Scenario, view: RunView) -> None:
-        (loop,) = resolved_loops(scenario)
-        self._feed, self._phases_ns = ViewFeed(loop, view), phases_ns(scenario)
-        self._types = [tables_of(loop)]
-        self.log, self.advance = self._feed.log, self._feed.advance
-
-    def add(self, table: str, rows: Rows) -> None:
-        """Add rows that follow the previously added ones."""
-        for _, own in rows_by_loop(table, rows, self._phases_ns, self._types):
-            self._feed.add(table, own)
-
-
-class NetworkFeed:
-    """Passes the rows of loops that share a network to their recording.
+class RunFeed:
+    """Passes the rows of a run to its recording.
 
     Args:
         scenario: the scenario of the run.
@@ -82,18 +58,17 @@ class NetworkFeed:
         warn: called with a line about what is not shown.
     """
 
-    def __init__(
-        self, scenario: Scenario, view: NetworkRecording, warn: Callable[[str], None]
-    ) -> None:
+    def __init__(self, scenario: Scenario, view: RunRecording, warn: Callable[[str], None]) -> None:
         loops = resolved_loops(scenario)
         self._view, self._warn = view, warn
         self._wall_ns = NS_PER_S * scenario.speed
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
-        self._together = _AllLoops(scenario, loops, view)
+        self._together = _AllLoops(scenario, loops, view) if view.is_shared else None
         self._feeds = {
-            number: ViewFeed(loops[number], one, certified=False)
+            number: ViewFeed(loops[number], one, certified=not view.is_shared)
             for number, one in view.views.items()
         }
+        self._tables = SHOWN if view.is_shared else (*SHOWN, *CLOCK_TABLES)
         self._waiting: dict[str, list[Rows]] = {}
         self._due: list[int] = []
         self._handed_ns = self._shown_ns = 0
@@ -101,13 +76,17 @@ class NetworkFeed:
 
     def add(self, table: str, rows: Rows) -> None:
         """Add rows that follow the previously added ones."""
-        self._together.add(table, rows)
-        if self._feeds and table in SHOWN and len(rows):
+        if self._together is not None:
+            self._together.add(table, rows)
+        if self._feeds and table in self._tables and len(rows):
             self._waiting.setdefault(table, []).append(rows)
 
     def log(self, notice: Mapping[str, Any]) -> None:
         """Add a line of the run's log, with the name of its loop; also to that of the loop."""
         loop, text, t_ns = notice.get(LOOP), str(notice["text"]), int(notice["t_ns"])
+        if self._together is None:
+            self._feeds[0].log(notice)
+            return
         if loop is not None and loop < len(self._view.names):
             text, t_ns = f"{self._view.names[loop]}: {text}", t_ns + self._phases_ns[loop]
             if loop in self._feeds:
@@ -115,9 +94,17 @@ class NetworkFeed:
         self._view.log(t_ns, log_level(notice), text)
 
     def advance(self, *, final: bool = False) -> None:
-        """Pass on what is complete, as far as there is time; at the end, everything."""
+        """Pass on what is complete, as far as there is time; at the end, everything.
+
+        The recording of a single loop is that of the run: all of it is passed on.
+        """
+        if self._together is None:
+            self._hand_out()
+            self._feeds[0].advance(final=final)
+            self._view.flush()
+            return
         if not final:
-            self._watch_lag()
+            self._watch_lag(self._together.newest_ns)
             if time.monotonic() < self._next_s:
                 return
         began_s = time.thread_time()
@@ -146,11 +133,13 @@ class NetworkFeed:
             ):
                 if loop in self._feeds:
                     self._feeds[loop].add(table, rows)
-        self._handed_ns, self._due = self._together.newest_ns, [*self._feeds]
+        self._due = [*self._feeds]
+        if self._together is not None:
+            self._handed_ns = self._together.newest_ns
 
-    def _watch_lag(self) -> None:
+    def _watch_lag(self, newest_ns: int) -> None:
         """Name a lag of the loops in detail; give them up if it grows."""
-        lag_s = (self._together.newest_ns - self._shown_ns) / self._wall_ns
+        lag_s = (newest_ns - self._shown_ns) / self._wall_ns
         if not self._feeds or lag_s < _NAMED_S:
             return
         if lag_s > _PATIENCE_S:
@@ -167,9 +156,7 @@ class NetworkFeed:
 class _AllLoops:
     """Shows the norms and shares of all loops, and the network, interval by interval."""
 
-    def __init__(
-        self, scenario: Scenario, loops: Sequence[Scenario], view: NetworkRecording
-    ) -> None:
+    def __init__(self, scenario: Scenario, loops: Sequence[Scenario], view: RunRecording) -> None:
         self._view, self._horizon_ns = view, scenario.timing.horizon_ns
         self._periods_ns = np.array([loop.timing.controller_period_ns for loop in loops])
         self._loops = [loop_of(loop) for loop in loops]

@@ -1,6 +1,7 @@
-"""The recording of a run of loops that share a network: all of them together, some in detail.
+"""The recording of a run: its loops in detail and, if there are several, all of them together.
 
-Entities besides those of the loops, which are below ``loops/NAME`` (:mod:`blueprint`):
+Entities of a loop (:mod:`blueprint`) are below ``loops/NAME``; those of the only loop are at the
+root. What is shown of several loops together:
 
 =================  ==========================================================================
 ``about``          Markdown text about the run (static)
@@ -48,15 +49,8 @@ from cosim.output.palette import CONTROLLER, LOST, NETWORK, SERIES
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.network_diagram import NetworkDiagram
-from cosim.output.viewer.pictures.picture import panel, picture_of
-from cosim.output.viewer.recording import (
-    LoopView,
-    Nanoseconds,
-    RecordingFile,
-    RunView,
-    ViewError,
-    about,
-)
+from cosim.output.viewer.pictures.picture import picture_of
+from cosim.output.viewer.recording import LoopView, Nanoseconds, RecordingFile, ViewError, about
 from cosim.output.viewer.table_feed import ViewFeed, log_level
 from cosim.record.run_directory import RECORDING_FILE, Kind, file_of_loop
 from cosim.record.run_record import RecordedRun, RunRecord
@@ -75,19 +69,24 @@ _RANGE = 100.0
 """Errors above the usual largest one by this factor have the same colour: a loop may diverge."""
 _ROW_PIXELS = 600
 """Least height of the map in pixels."""
+_INDEXED_S = 120.0
+"""Recordings of runs up to this wall time get an index, which needs memory."""
+_SPARE_BYTES = 4 * 2**20
+"""Free space without which no recording is written from a record."""
 
 
-class NetworkRecording(RecordingFile):
-    """Writes the recording.
+class RunRecording(RecordingFile):
+    """Writes the recording of a run.
 
     Args:
         run: the scenario of the run.
-        run_dir: its directory.
-        run_id: its identity.
+        path: the file; replaced if it exists.
+        run_id: identity of the recording, unique among runs.
         shown: the loops that are shown in detail, by their numbers: resolved scenarios.
-        worst: the worst loop; None in a run that goes on.
         kind: live or simulated.
+        worst: the worst loop; None in a run that goes on.
         live: live viewer, which shows the file while it is written.
+        at_once: whether the run has ended, and its whole record is written.
 
     Raises:
         ViewError: the file cannot be created.
@@ -96,34 +95,39 @@ class NetworkRecording(RecordingFile):
     def __init__(
         self,
         run: Scenario,
-        run_dir: Path,
+        path: Path,
         run_id: int,
         shown: Mapping[int, Scenario],
+        kind: Kind = "live",
         *,
-        worst: WorstLoop | None,
-        kind: Kind,
+        worst: WorstLoop | None = None,
         live: LiveView | None = None,
+        at_once: bool = False,
     ) -> None:
-        self.names = loop_names(run)
-        animated = len(shown) <= _ANIMATED and not is_long(run)
-        pages = {
-            number: _LoopPage(self.names[number], loop, animated=animated)
+        self.names, phases = loop_names(run), phases_ns(run)
+        self.is_shared = len(self.names) > 1
+        animated = len(shown) <= _ANIMATED and not (at_once and is_long(run))
+        loops = {
+            number: _shown_loop(
+                loop,
+                kind,
+                bp.loop_folder(self.names[number]) if self.is_shared else "",
+                phases[number] if self.is_shared else 0,
+                animated=animated,
+            )
             for number, loop in shown.items()
         }
-        layout = bp.over_time(_layout([*pages.values()], len(self.names), worst), run.horizon_s)
-        path, indexed = run_dir / RECORDING_FILE, live is None
-        super().__init__(path, f"{run_id:016x}", layout, indexed=indexed)
+        panels = {self.names[number]: loop for number, loop in loops.items()}
+        layout = _layout(panels, len(self.names), worst) if self.is_shared else loops[0].panels()
+        indexed = at_once or run.horizon_s <= _INDEXED_S * run.speed
+        over_time = bp.over_time(layout, run.horizon_s)
+        super().__init__(path, f"{run_id:016x}", over_time, indexed=indexed)
         self._live, self._usual = live, float(np.finfo(float).tiny)
-        self._describe(run, worst)
-        phases = phases_ns(run)
-        self.views = {
-            number: LoopView(
-                self, page.name, phases[number], about=about(shown[number], kind),
-                state_names=page.loop.state_names, input_names=page.loop.input_names,
-                picture=page.picture, diagram=page.diagram,
-            )
-            for number, page in pages.items()
-        }  # fmt: skip
+        if self.is_shared:
+            self._describe(run, worst)
+        else:
+            self.describe(f"{run.name} ({shown[0].mode})", {})
+        self.views = {number: LoopView(self, loop) for number, loop in loops.items()}
         """The views of the shown loops, by their numbers."""
         if live is not None:
             live.show(path)
@@ -189,7 +193,7 @@ to the right.
         """Write the waiting data and the file's footer; a second call does nothing."""
         try:
             for view in self.views.values():
-                view.close()
+                view.draw()
         finally:
             super().close()
             if self._live is not None:
@@ -197,33 +201,27 @@ to the right.
                 self._live = None
 
 
-class _LoopPage:
-    """What the panels of a loop show."""
-
-    def __init__(self, name: str, scenario: Scenario, *, animated: bool) -> None:
-        self.name = name
-        self.loop = loop_of(scenario)
-        self.picture = picture_of(scenario)
-        self.diagram = NetworkDiagram(*scenario.network.flows[1:]) if animated else None
-
-    def panels(self) -> rrb.Container:
-        """Return the panels of the loop alone."""
-        names = (self.loop.state_names, self.loop.input_names, ())
-        found = bp.panels(*names, picture=self.picture, diagram=self.diagram)
-        bp.below(found, bp.loop_path(self.name))
-        found.name = self.name
-        return found
-
-    def pictured(self) -> rrb.View:
-        """Return the panel of the loop's picture, without the legend: the panel is small."""
-        view = panel(self.picture)
-        bp.below(view, bp.loop_path(self.name))
-        view.contents = ["$origin/**", "- $origin/legend/**"]
-        view.name = self.name
-        return view
+def _shown_loop(
+    scenario: Scenario, kind: Kind, folder: str, phase_ns: int, *, animated: bool
+) -> bp.ShownLoop:
+    """Describe what is shown of a loop; lateness only if the processes have no other loop."""
+    loop, is_timed = loop_of(scenario), kind == "live" and not folder
+    return bp.ShownLoop(
+        about(scenario, kind),
+        loop.state_names,
+        loop.input_names,
+        processes=LOOP_ROLES if is_timed else (),
+        has_clocks=is_timed and scenario.clocks is not None,
+        picture=picture_of(scenario),
+        diagram=NetworkDiagram(*scenario.network.flows[1:]) if animated else None,
+        folder=folder,
+        phase_ns=phase_ns,
+    )
 
 
-def _layout(pages: Sequence[_LoopPage], count: int, worst: WorstLoop | None) -> rrb.Container:
+def _layout(
+    loops: Mapping[str, bp.ShownLoop], count: int, worst: WorstLoop | None
+) -> rrb.Container:
     """Lay out a page of all ``count`` loops, and one for each that is shown."""
     kind = "" if count <= len(SERIES) else ", quantiles over the loops"
     plots = [
@@ -231,20 +229,19 @@ def _layout(pages: Sequence[_LoopPage], count: int, worst: WorstLoop | None) -> 
         bp.plot("Datagrams in the network", QUEUE),
         bp.plot(f"Share of the link [%]{kind}", SHARE),
     ]
-    of_map = rrb.Spatial2DView(origin=MAP, name="log10 ‖e_c‖ of each loop, a row, over time")
-    left: rrb.Container
-    if count <= PICTURED:
-        left = rrb.Grid(
-            *(page.pictured() for page in pages), grid_columns=math.ceil(math.sqrt(count))
-        )
-    else:
-        left = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", SIZE), row_shares=[2, 1])
-    text = rrb.TextDocumentView(origin=bp.ABOUT, name="About this run")
-    everything = rrb.Horizontal(left, rrb.Vertical(*plots), name="all loops")
-    own = [page.panels() for page in pages]
-    if len(own) == 1 < count and worst is not None:
-        own[0].name = f"worst loop: {pages[0].name}"
-    return rrb.Tabs(everything, *own, bp.log_view(), text, active_tab=0)
+    pages, left = list[rrb.Container](), list[rrb.View]()
+    for name, loop in loops.items():
+        pages.append(loop.panels())
+        pages[-1].name = f"worst loop: {name}" if len(loops) == 1 and worst is not None else name
+        left.append(loop.small_picture())
+        left[-1].name = name
+    columns = math.ceil(math.sqrt(count))
+    pictures: rrb.Container = rrb.Grid(*left, grid_columns=columns)
+    if count > PICTURED:
+        of_map = rrb.Spatial2DView(origin=MAP, name="log10 ‖e_c‖ of each loop, a row, over time")
+        pictures = rrb.Vertical(of_map, bp.plot(f"log10 ‖x‖{kind}", SIZE), row_shares=[2, 1])
+    everything = rrb.Horizontal(pictures, rrb.Vertical(*plots), name="all loops")
+    return rrb.Tabs(everything, *pages, bp.log_view(), bp.about_view(), active_tab=0)
 
 
 def _series(names: Sequence[str]) -> rr.SeriesLines:
@@ -280,54 +277,14 @@ def map_pixels(errors: Reals) -> NDArray[np.uint8]:
     return np.asarray(pixels.repeat(high, axis=0).repeat(wide, axis=1), np.uint8)
 
 
-_INDEXED_S = 120.0
-"""Recordings of runs up to this wall time get an index, which needs memory."""
-
-_SPARE_BYTES = 4 * 2**20
-"""Free space without which no recording is written from a record."""
-
-
-def open_view(
+def open_recording(
     scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None
-) -> RunView | NetworkRecording:
+) -> RunRecording:
     """Create the recording of a run, which is written while the run goes on."""
-    loops = resolved_loops(scenario)
-    if len(loops) > 1:
-        shown = dict(enumerate(loops)) if len(loops) <= PICTURED else {}
-        return NetworkRecording(
-            scenario, run_dir, run_id, shown, worst=None, kind="live", live=live
-        )
-    return loop_view(loops[0], run_dir / RECORDING_FILE, run_id, live)
-
-
-def loop_view(
-    scenario: Scenario,
-    path: Path,
-    run_id: int,
-    live: LiveView | None = None,
-    kind: Kind = "live",
-    *,
-    at_once: bool = False,
-) -> RunView:
-    """Create the recording of one loop; it is written afterwards, at once or during the run."""
-    loop = loop_of(scenario)
-    return RunView(
-        path,
-        run_id=f"{run_id:016x}",
-        title=f"{scenario.name} ({scenario.mode})",
-        about=about(scenario, kind),
-        state_names=loop.state_names,
-        input_names=loop.input_names,
-        processes=LOOP_ROLES if kind == "live" else (),
-        horizon_s=scenario.horizon_s,
-        picture=picture_of(scenario),
-        diagram=None
-        if at_once and is_long(scenario)
-        else NetworkDiagram(*scenario.network.flows[1:]),
-        live=live,
-        clocks=scenario.clocks is not None and kind == "live",
-        indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
-    )
+    loops = dict(enumerate(resolved_loops(scenario)))
+    shown = loops if len(loops) <= PICTURED else {}
+    run = scenario if len(loops) > 1 else loops[0]
+    return RunRecording(run, run_dir / RECORDING_FILE, run_id, shown, live=live)
 
 
 def write_view(
@@ -344,32 +301,34 @@ def write_view(
     Raises:
         ViewError: the recording cannot be written.
     """
-    require_space(run_dir)
-    run_id = secrets.randbits(64)  # the viewer knows recordings by it
     if loop is None and len(run.loops) > 1:
-        _write_network_view(run, summary, run_dir, run_id, loops_over_time(run, known))
-        return
-    write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop), run_id)
+        _write_network_view(run, summary, run_dir, loops_over_time(run, known))
+    else:
+        write_loop_view(run.loop(loop), run_dir / file_of_loop(RECORDING_FILE, loop))
 
 
-def write_loop_view(record: RunRecord, path: Path, run_id: int) -> None:
+def write_loop_view(record: RunRecord, path: Path) -> None:
     """Write the recording of one loop; that of a long run shows extremes only."""
     require_space(path.parent)
-    with loop_view(record.scenario, path, run_id, None, record.kind, at_once=True) as view:
-        _feed_record(record, view, path.parent)
+    scenario, kind = record.scenario, record.kind
+    with RunRecording(scenario, path, _new_id(), {0: scenario}, kind, at_once=True) as recording:
+        _feed_record(record, recording)
+
+
+def _new_id() -> int:
+    """Return an identity, by which the viewer knows a recording."""
+    return secrets.randbits(64)
 
 
 def _write_network_view(
-    run: RecordedRun, summary: RunSummary, run_dir: Path, run_id: int, over_time: LoopsOverTime
+    run: RecordedRun, summary: RunSummary, run_dir: Path, over_time: LoopsOverTime
 ) -> None:
-    worst = worst_loop(summary.loops)
-    few = len(run.loops) <= PICTURED
-    records = {
-        number: run.loops[number] for number in (range(len(run.loops)) if few else [worst.number])
-    }
-    loops = {number: record.scenario for number, record in records.items()}
-    with NetworkRecording(
-        run.scenario, run_dir, run_id, loops, worst=worst, kind=run.kind
+    require_space(run_dir)
+    worst, count, path = worst_loop(summary.loops), len(run.loops), run_dir / RECORDING_FILE
+    numbers = range(count) if count <= PICTURED else [worst.number]
+    loops = {number: run.loops[number].scenario for number in numbers}
+    with RunRecording(
+        run.scenario, path, _new_id(), loops, run.kind, worst=worst, at_once=True
     ) as whole:
         flying = summary.network.in_flight
         largest = np.array(flying.max_by_interval, np.float64)
@@ -383,18 +342,19 @@ def _write_network_view(
         whole.share(((ends_s - ends_s[0] / 2) * NS_PER_S).astype(np.int64), shares)
         for notice in run.network.notices:
             whole.log(int(notice["t_ns"]), log_level(notice), str(notice["text"]))
-        for number, record in records.items():
-            _feed_record(record, whole.views[number], run_dir)
+        for number in numbers:
+            _feed_record(run.loops[number], whole, number)
 
 
-def _feed_record(record: RunRecord, view: RunView, run_dir: Path) -> None:
-    """Pass a record to a view, part by part, while there is space in its folder."""
+def _feed_record(record: RunRecord, recording: RunRecording, number: int = 0) -> None:
+    """Pass a loop's record to its view, part by part, while there is space in the folder."""
     columns = record.slice_columns if is_long(record.scenario) else None
-    feed = ViewFeed(record.scenario, view, columns)
+    feed = ViewFeed(record.scenario, recording.views[number], columns)
     for i, part in enumerate(record.slices()):
-        require_space(run_dir)
+        require_space(recording.path.parent)
         if i:
             feed.advance()
+            recording.flush()
         for table, rows in part.items():
             feed.add(table, rows)
     for notice in record.notices:

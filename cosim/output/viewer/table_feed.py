@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cosim.analysis.value_reduction import decimate_all
 from cosim.output.viewer.pictures.picture import Frames
-from cosim.output.viewer.recording import RunView
+from cosim.output.viewer.recording import LoopView
 from cosim.record.align import (
     AlignedRun,
     ControllerTrack,
@@ -85,7 +85,7 @@ class ViewFeed:
     def __init__(
         self,
         scenario: Scenario,
-        view: RunView,
+        view: LoopView,
         columns: int | None = None,
         *,
         certified: bool = True,
@@ -159,7 +159,6 @@ class ViewFeed:
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
         for table in self._clock_tables:
             self._clock_errors(table, self._take(table, None))
-        self._view.flush()
 
     def _clock_errors(self, table: str, rows: Rows) -> None:
         if len(rows):

@@ -75,8 +75,9 @@ def pareto_figure(
             Line(x=xs[front], y=ys[front], colour=colour, steps="post", dash=dash),
         ]  # fmt: skip
     means_x, means_y = ([e.mean for pair in series.values() for e in pair[k]] for k in (0, 1))
-    return one_panel("pareto", Panel(items=items, x=_axis(x, means_x), y=_axis(y, means_y)),
-                     _HEIGHT_IN)  # fmt: skip
+    return one_panel(
+        "pareto", Panel(items=items, x=_axis(x, means_x), y=_axis(y, means_y)), _HEIGHT_IN
+    )
 
 
 def undominated(x: Vector, y: Vector) -> NDArray[np.intp]:
@@ -133,9 +134,11 @@ def heat_map_figure(
     scale = None
     if len(known):
         scale = ColourScale(
-            low=known.min(), high=known.max(), label=METRICS[metric].label,
+            low=known.min(),
+            high=known.max(),
+            label=METRICS[metric].label,
             logarithmic=METRICS[metric].logarithmic and _far(known),
-        )  # fmt: skip
+        )
     axes = [
         Axis(label=_name(name), ticks=dict(enumerate(map(plain, labels))), grid=False)
         for name, labels in (x, y)
@@ -220,14 +223,17 @@ def _heat_map(
 
 
 def _distribution(
-    summary: CampaignSummary, found: Sequence[GridPointResult],
-    wanted: campaign_file.Distribution, store: Store,
-) -> tuple[FigureDescription, str]:  # fmt: skip
+    summary: CampaignSummary,
+    found: Sequence[GridPointResult],
+    wanted: campaign_file.Distribution,
+    store: Store,
+) -> tuple[FigureDescription, str]:
     series = {
         label: runs_at(one.point, store)[0][wanted.metric]
         for label, group in _series(summary, found, tuple(wanted.where)).items()
-        for one in group if wanted.metric in one.estimates
-    }  # fmt: skip
+        for one in group
+        if wanted.metric in one.estimates
+    }
     return distribution_figure(series, wanted.metric), (
         f"{_title(wanted.metric)}: the share of runs in which it is at most so much"
     )
@@ -241,10 +247,11 @@ def _series(
     groups: dict[str, list[GridPointResult]] = {}
     for one in found:
         label = ", ".join(
-            one.point.labels[axis.name] if axis.numbers is None
+            one.point.labels[axis.name]
+            if axis.numbers is None
             else f"{axis.called} = {one.point.labels[axis.name]}"
             for axis in rest
-        )  # fmt: skip
+        )
         groups.setdefault(label, []).append(one)
     return groups
 

@@ -423,6 +423,6 @@ def load(path: Path) -> Campaign:
     return toml_file.validated(Campaign, toml_file.read(path, Campaign), str(path))
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> dict[str, object]:
     """Return the JSON Schema of campaign files, for editors."""
     return toml_file.json_schema(Campaign)

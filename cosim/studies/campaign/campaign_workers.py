@@ -98,7 +98,7 @@ def _rounding() -> str:
 class Work(Protocol):
     """Computes the draws of a grid point; sent to another process with each chunk."""
 
-    def run(self, draws: range) -> NDArray[Any]:
+    def run(self, draws: range) -> NDArray[np.void]:
         """Compute consecutive draws; one row each."""
         ...
 
@@ -116,7 +116,7 @@ class Chunk(NamedTuple):
         return range(self.start, self.stop)
 
 
-Finished = tuple[Chunk, NDArray[Any]]
+Finished = tuple[Chunk, NDArray[np.void]]
 Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
 """Computes chunks, given the work of each grid point; yields results in any order."""
 
@@ -176,7 +176,7 @@ def _client(connect: Any, address: str) -> Any:
     raise PeerError(f"--scheduler {address}: Dask's client does not start; the machine is too busy")
 
 
-def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDArray[Any]:
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str] | None) -> NDArray[np.void]:
     """Compute consecutive draws in another process, or on another machine.
 
     Raises:
@@ -281,7 +281,7 @@ def _windowed(
 ) -> Iterator[Finished]:
     """Keep a limited number of chunks in flight, so that memory use stays bounded."""
     rest = iter(chunks)
-    in_flight: dict[Future[NDArray[Any]], Chunk] = {}
+    in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(in_flight), 0)):
             with interrupts_held():

@@ -55,14 +55,16 @@ class Store:
         text, number = pa.dictionary(pa.int16(), pa.string()), pa.float64()
         axes = points[0].values.items()
         self.row_type = row_type(points)
-        self._schema = pa.schema([
-            *((name, text if isinstance(value, str) else number) for name, value in axes),
-            ("draw", pa.int64()),
-            *(
-                (name, pa.from_numpy_dtype(self.row_type[name]))
-                for name in self.row_type.names or ()
-            ),
-        ])  # fmt: skip
+        self._schema = pa.schema(
+            [
+                *((name, text if isinstance(value, str) else number) for name, value in axes),
+                ("draw", pa.int64()),
+                *(
+                    (name, pa.from_numpy_dtype(self.row_type[name]))
+                    for name in self.row_type.names or ()
+                ),
+            ]
+        )
 
     def chunks(self, point: int) -> Iterator[Chunk]:
         """Return all chunks of a point."""
@@ -91,13 +93,13 @@ class Store:
         pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
         write_whole(self._path(chunk), buffer.getvalue())
 
-    def columns(self, point: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    def columns(self, point: int, names: Sequence[str]) -> dict[str, NDArray[np.generic]]:
         """Return columns of all runs at a point, by draw, (draws,) each.
 
         Raises:
             MachineError: a file cannot be read.
         """
-        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+        parts: dict[str, list[NDArray[np.generic]]] = {name: [] for name in names}
         for chunk in self.chunks(point):
             path = self._path(chunk)
             try:
@@ -195,7 +197,7 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
     return made_by
 
 
-def _identity(campaign: Campaign) -> dict[str, Any]:
+def _identity(campaign: Campaign) -> dict[str, object]:
     """Return the settings on which the results depend."""
     content = campaign.model_dump(
         mode="json",

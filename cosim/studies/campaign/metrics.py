@@ -10,7 +10,7 @@ enforce the guarantee.
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,9 @@ METRICS: Mapping[Metric, Description] = {
 }
 
 
-def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> dict[Metric, Vector]:
+def measured(
+    columns: Mapping[str, NDArray[np.generic]], certified: float | None
+) -> dict[Metric, Vector]:
     """Return all metrics of k runs.
 
     A time is infinite if its event does not happen. All metrics of a failed run are infinite.

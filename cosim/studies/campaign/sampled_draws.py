@@ -28,6 +28,7 @@ from cosim.simulation.batch import ROW
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
+from noack.config.resolution import policy_of
 from noack.config.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -103,7 +104,7 @@ class SampledWork:
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         joined = align_tables(record)
-        decay_per_s = record.scenario.trigger.threshold_decay_per_s
+        decay_per_s = policy_of(record.scenario).fading_per_s
         scaled = joined.e_c_norm * np.exp(decay_per_s * joined.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydantic_core import to_json
@@ -59,7 +59,7 @@ class CapacityResult(NamedTuple):
     capacities: Sequence[PolicyCapacity]
     live: Sequence[LivePoint]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return the results for JSON."""
         plan = self.plan
         return {

@@ -112,8 +112,10 @@ def policies_of(kinds: Sequence[Kind]) -> dict[str, dict[str, Any]]:
         return {"mode": mode, "loops": loops}
 
     return {
-        PERIODIC: settings("zoh", periodic=True), ZOH: settings("zoh"), MODEL: settings("model"),
-    }  # fmt: skip
+        PERIODIC: settings("zoh", periodic=True),
+        ZOH: settings("zoh"),
+        MODEL: settings("model"),
+    }
 
 
 def sampling_period_s(loop: Scenario) -> float:
@@ -321,10 +323,11 @@ def periodic_loops(scenario: Scenario, kinds: Sequence[Kind]) -> float:
     queue = bottleneck(scenario)
     loops = sum(kind.given for kind in kinds)
     needed_bps = sum(
-        kind.given * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0])))
+        kind.given
+        * int(queue.line_bits(datagram_bytes(kind.scenario.model.dimensions[0])))
         / kind.period_s
         for kind in kinds
-    )  # fmt: skip
+    )
     return queue.rate_bps * loops / needed_bps
 
 

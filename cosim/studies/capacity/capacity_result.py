@@ -28,7 +28,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +57,10 @@ from noack.core.linear_systems import Matrix, Vector
 LATE, COST_FACTOR = 0.01, 2.0
 Limit = Literal["guarantee", "deadline", "cost"]
 LIMITS: Mapping[Limit, Metric] = {
-    "guarantee": "loops_guarantee_used", "deadline": "updates_late", "cost": "cost",
-}  # fmt: skip
+    "guarantee": "loops_guarantee_used",
+    "deadline": "updates_late",
+    "cost": "cost",
+}
 """The limits and their metrics."""
 
 
@@ -91,17 +93,19 @@ class PolicyCapacity(NamedTuple):
         names = [name for name, capacity in self.limits.items() if capacity.median == first]
         return ", ".join(names) if np.isfinite(first) else ""
 
-    def document(self, plan: CapacityPlan) -> dict[str, Any]:
+    def document(self, plan: CapacityPlan) -> dict[str, object]:
         """Return the capacity for JSON, also as a multiple of the given mixture if it is finite."""
         median = self.any_limit.median
         known = math.isfinite(median)
         return {
-            "policy": self.policy, "disturbance": self.disturbance,
-            **self.any_limit._asdict(), "limited_by": self.limited_by,
+            "policy": self.policy,
+            "disturbance": self.disturbance,
+            **self.any_limit._asdict(),
+            "limited_by": self.limited_by,
             "limits": {name: capacity._asdict() for name, capacity in self.limits.items()},
             "factor": plan.factor(median) if known else None,
             "loops_by_kind": plan.composition(median) if known else None,
-        }  # fmt: skip
+        }
 
 
 def capacities(plan: CapacityPlan, summary: CampaignSummary, store: Store) -> list[PolicyCapacity]:
@@ -137,11 +141,13 @@ def capacity_of(
         reached["cost"] = cost >= (COST_FACTOR * finite.mean() if len(finite) else 0.0)
         reached["cost"][0] = np.isinf(cost[0])  # it is the reference, however costly
     else:
-        reached["cost"] = np.logical_or.reduce([
-            values(column)
-            >= COST_FACTOR * np.stack([runs[unshared(count)][column] for count in plan.counts])
-            for column in plan.cost_columns
-        ])  # fmt: skip
+        reached["cost"] = np.logical_or.reduce(
+            [
+                values(column)
+                >= COST_FACTOR * np.stack([runs[unshared(count)][column] for count in plan.counts])
+                for column in plan.cost_columns
+            ]
+        )
     draws = {limit: carried(plan.counts, flags) for limit, flags in reached.items()}
     limits = {limit: Capacity.estimate(found) for limit, found in draws.items()}
     worst = np.min(np.stack([*draws.values()]), axis=0)
@@ -178,7 +184,7 @@ class LivePoint(NamedTuple):
         ends = self.simulated.items()
         return [name for name, (low, high) in ends if not low <= self.values[name] <= high]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return the point for JSON."""
         return {**self._asdict(), "run_dir": str(self.run_dir), "outside": self.outside}
 

@@ -9,7 +9,7 @@ the quantile itself must meet its limit, with all draws the upper end of its int
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -216,9 +216,10 @@ class Search:
         while True:
             limits = self.limits.bounds.items()
             known = [
-                trial for trial in self.trials
+                trial
+                for trial in self.trials
                 if all(trial.bounds.get(name, 0.0) <= limit for name, limit in limits)
-            ]  # fmt: skip
+            ]
             sent = np.array([t.measured.transmissions for t in known])
             settling_s = np.array([t.measured.settling_s for t in known])
             front = [known[i] for i in undominated(sent, settling_s)]
@@ -351,7 +352,7 @@ class DesignResult:
                 missed.append(f"{certified(name, self.best.bounds[name])} ({limit:g} allowed)")
         return f"no design meets the limits; the closest has {' and '.join(missed)}, at {at}"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """Return the result as JSON."""
         limits = asdict(self.limits)
         limits["under"] = "schedule" if limits.pop("schedule") else "paper"
@@ -373,10 +374,10 @@ class DesignResult:
             "front": [self._row(trial) for trial in self.front],
         }
 
-    def _row(self, trial: Trial) -> dict[str, Any]:
+    def _row(self, trial: Trial) -> dict[str, object]:
         number, alpha_per_s, beta = trial.candidate
         family = self.space.families[number]
-        chosen = {"gain": family.gain, "weight": family.weight}
+        chosen: dict[str, object] = {"gain": family.gain, "weight": family.weight}
         return chosen | {"alpha_per_s": alpha_per_s, "beta": beta} | trial.measured._asdict()
 
 

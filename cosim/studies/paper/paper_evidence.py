@@ -127,8 +127,9 @@ def _growth(scenario: Scenario, draws: int) -> Numbers:
         norms = [np.linalg.norm([state.x for state in run.before], axis=1) for run in runs]
         rises = [np.diff(n[run.delivered]) > 0 for n, run in zip(norms, runs, strict=True)]
         found[mode] = {
-            "stretches": sum(map(len, rises)), "growing": sum(int(one.sum()) for one in rises)
-        }  # fmt: skip
+            "stretches": sum(map(len, rises)),
+            "growing": sum(int(one.sum()) for one in rises),
+        }
     return found
 
 
@@ -162,10 +163,12 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
         "theorem_2": {
             "draws": len(theorems),
             "negative": sum(row["negative"] for row in theorems),
-            **{name: [f(row[name] for row in theorems) for f in (min, max)]
-               for name in ("first_s", "inter_event_s")},
+            **{
+                name: [f(row[name] for row in theorems) for f in (min, max)]
+                for name in ("first_s", "inter_event_s")
+            },
         },
-    }  # fmt: skip
+    }
 
 
 def _theorem_2(resolved: Scenario, constants: Constants) -> list[Numbers]:

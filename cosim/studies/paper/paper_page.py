@@ -16,12 +16,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from cosim.output.figure_description import FigureDescription
 from cosim.output.figure_files import save_figure
-from cosim.output.signal_figures import states_figure
+from cosim.output.run_figures import Trajectory, Transmissions, states_figure
 from cosim.simulation.continuous import run_continuous, timeless
-from cosim.studies.campaign.campaign_claims import CONFIRMED_FROM, PARTLY_FROM, share_text
 from cosim.studies.campaign.campaign_figures import figures
-from cosim.studies.campaign.campaign_summary import runs_at
-from cosim.studies.campaign.finished_campaign import FinishedCampaign
+from cosim.studies.campaign.campaign_report import FinishedCampaign
+from cosim.studies.campaign.campaign_summary import CONFIRMED_FROM, PARTLY_FROM, runs_at, share_text
 from cosim.studies.campaign.metrics import METRICS, Metric, quartiles
 from cosim.studies.paper.paper_evidence import MODES, evidence, resolved_draw
 from netem.channel import UPDATE_LINK
@@ -77,8 +76,10 @@ def write_page(done: FinishedCampaign, folder: Path) -> tuple[Document, list[Pat
     found, inner = numbers(done), make_folder(folder)
     draw, scenario = found["representative"], _base(done)
     described = {one.name: one for one in figures(done.summary, done.store)}
-    described |= {policy.lower(): draw_figure(scenario, draw, mode)
-                  for policy, mode in zip(POLICIES, MODES, strict=True)}  # fmt: skip
+    described |= {
+        policy.lower(): draw_figure(scenario, draw, mode)
+        for policy, mode in zip(POLICIES, MODES, strict=True)
+    }
     written = [
         write_whole(folder / "paper.md", render(found)),
         write_whole(inner / "paper.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n"),
@@ -144,19 +145,11 @@ def draw_figure(scenario: Scenario, draw: int, mode: str) -> FigureDescription:
     link = LinkState(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
     link.start_flow(0, 0)
     fates = np.array([link.decide(0, 1, 0).fate for _ in event_s], dtype=np.int64)
-    return states_figure(
-        mode=resolved.mode,
-        t_s=samples.t_s,
-        x=samples.x,
-        x_s=samples.x_s,
-        x_c=samples.x_c,
-        state_names=run.system.loop.state_names,
-        broadcast_s=event_s,
-        dropped=~effective(fates),
-        received_s=event_s[effective(fates)],
-        forced=fates[effective(fates)] == Fate.FORCED,
-        title=f"draw {draw}",
-    )
+    arrived = effective(fates)
+    sent = Transmissions(event_s, ~arrived, event_s[arrived], fates[arrived] == Fate.FORCED)
+    names = run.system.loop.state_names
+    states = Trajectory(names, samples.t_s, samples.x, samples.x_s, samples.x_c)
+    return states_figure(resolved.mode, f"draw {draw}", states, sent)
 
 
 def render(found: Document) -> str:

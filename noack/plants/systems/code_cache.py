@@ -22,7 +22,8 @@ from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
-CALLED_BY_CODE: Mapping[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+Function = Callable[..., Any]
+CALLED_BY_CODE: Mapping[str, bool] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """numba's options of a function that only compiled code calls. It is compiled without the entries
 for Python and C, each of which would hold its code once more."""
 
@@ -90,7 +91,7 @@ def _require_own(path: Path, status: os.stat_result) -> None:
         raise PermissionError(f"{path} belongs to another user")
 
 
-def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
+def is_kept(folder: Path | None, function: Function) -> bool:
     """Return whether a folder has the compiled code of a function for this computer."""
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
@@ -108,17 +109,17 @@ def _forget_old(folder: Path, name: str) -> None:
             shutil.rmtree(other, ignore_errors=True)
 
 
-def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def compiler(folder: Path | None, **options: str | bool) -> Callable[[Function], Function]:
     """Return a compiler of functions that caches in a folder, if there is one.
 
     Without a folder numba must not cache at all: it could load code of other sources elsewhere.
     """
     numba: Any = importlib.import_module("numba")  # an extra of noack, and slow to import
     if folder is None:
-        compiling: Callable[[Callable[..., Any]], Any] = numba.njit(**options)
+        compiling: Callable[[Function], Function] = numba.njit(**options)
         return compiling
 
-    def compile_and_keep(function: Callable[..., Any]) -> Any:
+    def compile_and_keep(function: Function) -> Any:
         numba.config.CACHE_DIR = str(folder)
         dispatcher = numba.njit(function, cache=True, **options)
         dispatcher.compile = _one_at_a_time(dispatcher.compile, folder / ".lock")
@@ -127,10 +128,10 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
     return compile_and_keep
 
 
-def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any], Any]:
+def _one_at_a_time(compiling: Function, lock: Path) -> Function:
     """Allow one process to compile at a time; the others then read the cache. Delay Ctrl-C."""
 
-    def compile_alone(signature: Any) -> Any:
+    def compile_alone(signature: object) -> object:
         with ExitStack() as stack:
             with suppress(OSError):  # without file locks every process compiles
                 stack.enter_context(locked(lock, wait=True))

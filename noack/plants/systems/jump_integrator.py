@@ -17,8 +17,9 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 
-Rates = Any
-"""Equations, as described above."""
+Rates = Any  # equations, as described above
+Model = Any  # handed to them
+Parameters = Any  # handed to them
 DONE = 0
 TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
@@ -76,10 +77,10 @@ def buffers(states: int, values: int) -> Work:
 
 def advance(
     rates: Rates,
-    model: Any,
+    model: Model,
     z: Vector,
     v: Vector,
-    parameters: Any,
+    parameters: Parameters,
     duration_s: float,
     tolerances: tuple[float, float],
     work: Work,
@@ -134,10 +135,10 @@ def advance(
 
 def attempt(
     rates: Rates,
-    model: Any,
+    model: Model,
     z: Vector,
     v: Vector,
-    parameters: Any,
+    parameters: Parameters,
     step_s: float,
     tolerances: tuple[float, float],
     work: Work,
@@ -171,7 +172,13 @@ def margin(signs: Vector, values: Vector) -> float:
 
 
 def locate(
-    rates: Rates, model: Any, z: Vector, v: Vector, parameters: Any, step_s: float, work: Work
+    rates: Rates,
+    model: Model,
+    z: Vector,
+    v: Vector,
+    parameters: Parameters,
+    step_s: float,
+    work: Work,
 ) -> float:
     """Return the part of the step until just after the first change of a sign, at most 1.
 

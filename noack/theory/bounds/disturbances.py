@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from noack.config.resolution import assumed_model, loop_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.core.linear_systems import Matrix, discretise
 from noack.theory.bounds.contraction import largest_gains, spectral_norm, times
 from noack.theory.bounds.enclosure import NotDecayingError, factors
 from noack.theory.bounds.gains import Forcing, NormalForcing
@@ -104,18 +104,6 @@ def bound_forcing(resolved: Scenario, B: Matrix) -> Forcing | None:
     return Forcing(np.hstack(columns), np.array(durations_s), at_input, of_normal)
 
 
-def noise_bound(resolved: Scenario) -> Vector:
-    """Return the bound of each entry of the bounded part of the noise v, y = C x + v, (p,)."""
-    given = resolved.plant.measurement.noise_bound
-    return np.zeros(resolved.message_sizes.outputs) if given is None else np.array(given)
-
-
-def noise_deviations(resolved: Scenario) -> Vector:
-    """Return the standard deviation of each entry of the normal part of the noise, (p,)."""
-    given = resolved.plant.measurement.noise_std
-    return np.zeros(resolved.message_sizes.outputs) if given is None else np.array(given)
-
-
 class EstimationError:
     """The estimation error of a resolved scenario whose plant is A (n, n), B (n, m)."""
 
@@ -124,8 +112,7 @@ class EstimationError:
         self._loop, self._resolved = loop, resolved
         self._weight = np.eye(loop.n) if loop.weight is None else loop.weight
         self._period_s = period_ns / NS_PER_S
-        self._noise = noise_bound(resolved)
-        self._noise_deviations = noise_deviations(resolved)
+        self._noise_deviations, self._noise = resolved.plant.measurement.noise(loop.n)
         self._model = model = assumed_model(resolved)
         Ad, Bd = discretise(A, B, period_ns)
         n = loop.n
@@ -213,7 +200,7 @@ class EstimationError:
 
     @cached_property
     def _settled_covariance(self) -> Matrix:
-        from scipy.linalg import solve_discrete_lyapunov
+        from scipy.linalg import solve_discrete_lyapunov  # slow to import
 
         F, added = self._covariances[-1]
         _contraction(F)
@@ -384,7 +371,7 @@ def _contraction(step: Matrix) -> tuple[Matrix, float]:
     Raises:
         NotDecayingError: there is none.
     """
-    from scipy.linalg import solve_discrete_lyapunov
+    from scipy.linalg import solve_discrete_lyapunov  # slow to import
 
     reason = "the observer's error does not decay as fast as the bounds"
     if not np.abs(np.linalg.eigvals(step)).max() < 1:

@@ -420,7 +420,7 @@ class PlantGains:
     @cached_property
     def _deviations(self) -> Matrix:
         """S with S Sᵀ the stationary covariance of x under the normal disturbances."""
-        from scipy.linalg import solve_discrete_lyapunov
+        from scipy.linalg import solve_discrete_lyapunov  # slow to import
 
         normal = self._forcing.normal
         assert normal is not None

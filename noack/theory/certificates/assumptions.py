@@ -10,7 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import LoopMatrices, SteadyState, loop_of, steady_state
+from noack.config.resolution import (
+    LoopMatrices,
+    SteadyState,
+    loop_of,
+    policy_of,
+    steady_state,
+)
 from noack.config.scenario import Scenario
 from noack.config.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.core.clock import NS_PER_S
@@ -120,7 +126,7 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         if not np.isfinite(estimation.radius):
             why = "no steady state found: model and covariances differ by too many magnitudes"
         checked.append(_checked("the observer's error decays", "(I − LC)e^(ÂT)", decays, why))
-    least = resolved.trigger.least_threshold
+    least = policy_of(resolved).least_threshold
     if least is not None and (decays or resolved.observer is None):
         checked.append(_above_noise(loop, least, estimation))
     return checked
@@ -267,7 +273,7 @@ def certificate_assumptions(
     trigger's rule says about e_s, or empty. ``kept`` is the probability that a run keeps a
     guarantee that nothing enforces, if it is known.
     """
-    alpha = resolved.trigger.threshold_decay_per_s
+    alpha = policy_of(resolved).fading_per_s
     slower = 0.0 if constants is None else constants.rate_per_s
     why = promise or "not where it does not transmit"
     checked = [_checked("the trigger bounds ‖e_s‖", "certificate", bool(promise), why)]

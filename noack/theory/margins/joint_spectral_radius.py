@@ -125,7 +125,9 @@ def _connected(system: SwitchedSystem, accuracy: float, most_vertices: int) -> J
         if not searched:  # if a longer cycle grows faster, the polytopes cannot be completed
             searched, before = True, cycle.growth
             upper, vertices = min((upper, vertices), (quadratic_norms(system).upper, 0))
-            cycle = max(cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=_growth)
+            cycle = max(
+                cycle, _best_cycle(system, balanced, _LONG_SEARCH), key=lambda one: one.growth
+            )
             if cycle.growth > before * (1 + accuracy / 2):
                 continue
         accuracy *= _COARSER
@@ -167,10 +169,6 @@ def _best_cycle(system: SwitchedSystem, balanced: SwitchedSystem, search: _Cycle
         return cycle
     # The original matrices have smaller radii.
     return cycle._replace(growth=max(cycle.growth, growth_bounds(system, cycle.path)[0]))
-
-
-def _growth(cycle: Cycle) -> float:
-    return cycle.growth
 
 
 def _largest(system: SwitchedSystem) -> float:
@@ -225,8 +223,9 @@ def remembering(system: SwitchedSystem, classes: int) -> SwitchedSystem:
         ends.setdefault(edge.target, []).append(number)
     kinds = {
         number: index * classes // len(members)
-        for members in ends.values() for index, number in enumerate(members)
-    }  # fmt: skip
+        for members in ends.values()
+        for index, number in enumerate(members)
+    }
     return SwitchedSystem(tuple(
         Edge(edge.source * classes + kind, edge.target * classes + kinds[number], *edge[2:])
         for number, edge in enumerate(system.edges) for kind in range(classes)
@@ -295,7 +294,7 @@ class _Search:
 
     def improve(self, numbers: NDArray[np.int64]) -> None:
         """Minimise the maximum over some edges: a smooth one that becomes sharper and sharper."""
-        from scipy.optimize import minimize
+        from scipy.optimize import minimize  # slow to import
 
         groups = list(self._grouped(numbers.tolist()))
         for sharpness in _SHARPNESS:

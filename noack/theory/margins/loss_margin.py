@@ -133,8 +133,9 @@ def _merged(bursts: list[Burst]) -> list[Burst]:
         lowest.setdefault(classes[node], node)
     return [
         burst._replace(target=lowest[classes[burst.target]])
-        for node in lowest.values() for burst in leaving[node]
-    ]  # fmt: skip
+        for node in lowest.values()
+        for burst in leaving[node]
+    ]
 
 
 class Stability(NamedTuple):
@@ -206,7 +207,7 @@ class LossMargin:
             self.shortest_ns = longest_ns if same else min(self.shortest_ns, longest_ns)
             self.longest_ns = longest_ns
         is_periodic = self.shortest_ns == self.longest_ns
-        self._unit_ns = unit_ns = self.longest_ns if is_periodic else _step_ns(resolved)
+        self._unit_ns = unit_ns = self.longest_ns if is_periodic else timing.measurement_period_ns
         self._times = EventTimes(self.shortest_ns // unit_ns, self.longest_ns // unit_ns)
         times = LoopTimes(
             timing.plant_period_ns,
@@ -308,7 +309,7 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
     Raises:
         CallerError: there is no longest time.
     """
-    rule, step_ns = rule_of(resolved), _step_ns(resolved)
+    rule, step_ns = rule_of(resolved), resolved.timing.measurement_period_ns
     if rule.longest_ns == NEVER_NS:
         raise CallerError(
             f'trigger.policy = "{resolved.trigger.policy}": the margin needs a longest time '
@@ -320,10 +321,6 @@ def intervals_ns(resolved: Scenario) -> tuple[int, int]:
         return longest_ns, longest_ns
     least_ns = max(rule.idle_ns, 0.0 if rule.forecast is None else rule.shortest_ns, step_ns)
     return min(-int(-least_ns // step_ns) * step_ns, longest_ns), longest_ns
-
-
-def _step_ns(resolved: Scenario) -> int:
-    return resolved.timing.measurement_period_ns
 
 
 def update_delay_ns(resolved: Scenario) -> int:

@@ -114,7 +114,7 @@ def strongly_connected(edges: Sequence[Edge]) -> list[SwitchedSystem]:
 
     The growth of all infinite paths is that of those within one part.
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_array  # slow to import
     from scipy.sparse.csgraph import connected_components
 
     sources, targets = [edge.source for edge in edges], [edge.target for edge in edges]

@@ -202,12 +202,8 @@ class _Inequalities:
         for drive, area in zip(drives, recent, strict=True):
             bound = bound + (1.0 if self._by_tests else 1 - self._share) * area * drive
         if self._by_tests:
-            return (
-                bound
-                + self._share
-                * _sum_of_sups(error.kernels[output], delay_s, self._conditions.spacing_s)
-                * _A
-            )
+            sups = _sum_of_sups(error.kernels[output], delay_s, self._conditions.spacing_s)
+            return bound + self._share * sups * _A
         for drive, kernel in zip(drives, self._all_drive, strict=True):
             bound = bound + self._share * kernel.through(C).integral() * drive
         return bound

@@ -135,7 +135,7 @@ def ended_well(run_dir: Path) -> RunEnding:
 def test_a_run_that_cannot_be_replayed_fails(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def crash(record: object) -> None:
+    def crash(*_: object) -> None:
         raise RuntimeError("a mistake of ours")
 
     monkeypatch.setattr(cosim.live.finalize, "replay", crash)
@@ -186,7 +186,7 @@ def test_a_run_with_more_rows_than_were_reported_fails(run_dir: Path) -> None:
 def test_an_interrupted_replay_leaves_a_summary(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(record: object) -> None:
+    def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cosim.live.finalize, "replay", interrupted)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -21,17 +22,19 @@ from cosim.analysis.network_summary import (
     quantiles,
     worst_loop,
 )
-from cosim.analysis.summary_model import ExitPart, read_summary
+from cosim.analysis.summary_model import ExitPart, ReplayPart, read_summary
 from cosim.cli import app
-from cosim.live.finalize import reopen
+from cosim.live.finalize import finalize, reopen
 from cosim.output.figure_description import Heat
 from cosim.output.figure_drawing import draw
-from cosim.output.run_figures import error_map, norms_figure
+from cosim.output.network_figures import error_map, norms_figure
 from cosim.output.run_tables import loop_row, network_rows
 from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
-from cosim.record.run_record import load_record, load_run
+from cosim.record.run_directory import RunEnding, write_environment
+from cosim.record.run_record import RunRecord, load_record, load_run
 from noack.config.resolution import network_tables
+from noack.core.errors import ExitStatus
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP
 
@@ -85,6 +88,22 @@ def test_processes_finalise_the_loops_of_a_long_run_alike(
     monkeypatch.setattr("cosim.live.finalize.cores", lambda: 2)
     assert noack("summary", run_dir).exit_code == 0
     assert path.read_text() == before
+
+
+def test_a_run_in_which_no_loop_sent_anything_has_not_failed(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(run_dir, again)
+    write_environment(again, "live")
+
+    def replayed(record: RunRecord, *_: object) -> ReplayPart:
+        return ReplayPart(bit_exact=None if record.is_network else True)
+
+    monkeypatch.setattr("cosim.live.finalize._replay", replayed)
+    summary = finalize(RunEnding(again, 0, ExitStatus.OK, "horizon"), report=False).summary
+    assert summary.network.replay == ReplayPart(bit_exact=None)
+    assert summary.exit.status == ExitStatus.OK
 
 
 def test_the_summary_adds_up(run_dir: Path) -> None:

@@ -12,8 +12,7 @@ from typer.testing import CliRunner, Result
 import noack
 from cosim.cli import app
 from cosim.measurement.chain_fits import ChainRates
-from cosim.measurement.measurement_outputs import trace_csv
-from cosim.measurement.measurement_page import measurement_figures, measurement_tables
+from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
 from cosim.measurement.network_measurement import (
     Measurement,
     MeasurementOptions,

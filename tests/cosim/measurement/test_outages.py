@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.measurement import outages as rule
-from cosim.measurement.chain_fits import ChainRates
+from cosim.measurement import chain_fits as rule
+from cosim.measurement.chain_fits import ChainRates, find_outages, fit_outages
 from cosim.measurement.loss_bursts import LossBursts, loss_bursts
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
-from cosim.measurement.outages import find_outages, fit_outages
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
+from cosim.output.signal_figures import ClockErrors, clock_figure
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
@@ -21,7 +22,6 @@ from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline, save_figure
 from cosim.output.figure_style import figure_width, rgb, settings
 from cosim.output.page_kit import PAGES
-from cosim.output.signal_figures import ClockErrors, clock_figure
 from noack.core.errors import CallerError
 from tests.cosim.output.conftest import HOSTILE
 from tests.cosim.output.test_palette import BACKGROUNDS, luminance

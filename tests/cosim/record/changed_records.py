@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from cosim.record.align import IdentityResidual, Reals, aligned_parts
+from cosim.record import align
+from cosim.record.align import Reals, bounded_parts
 from cosim.record.run_record import Rows, RunRecord
 
 NO_CHANGE: Mapping[str, Rows] = {}
@@ -36,5 +37,7 @@ def flipped(record: RunRecord, table: str, row: int, column: str, bit: int) -> R
 
 def identity_residual(record: RunRecord) -> Reals:
     """The residual of (I1) at each measurement of a run, (k,)."""
-    residual = IdentityResidual(record.scenario)
-    return np.concatenate([residual.take(part) for part in aligned_parts(record)])
+    parts = bounded_parts(record)
+    return np.concatenate(
+        [align.identity_residual(record.scenario, one.aligned, own.missed) for one, own in parts]
+    )

@@ -14,7 +14,6 @@ from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
 from cosim.output.certificates import Certificates
-from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
@@ -99,64 +98,6 @@ def test_without_losses_the_baseline_equals_the_ordinary_loop(mode: str) -> None
     assert one[CONTROLLER_DELIVERY].tobytes() == other[CONTROLLER_DELIVERY].tobytes()
     assert one[SENSOR_MEASUREMENT]["x_s"].tobytes() == other[SENSOR_MEASUREMENT]["x_s"].tobytes()
     assert len(one[SENSOR_ACKNOWLEDGEMENT]) == len(events(one))
-
-
-POLICIES = [
-    '{policy="relative", sigma=0.02}',
-    '{policy="lyapunov", rate_per_s=0.3}',
-    '{policy="periodic", period_s=0.2}',
-    '{policy="dwell", interval_s=0.1, rule={policy="absolute", delta=0.01}}',
-    '{policy="deadline", interval_s=1.0, rule={policy="absolute", delta=0.01}}',
-]
-
-
-@pytest.mark.parametrize("policy", POLICIES)
-def test_every_policy_continues_from_the_last_acknowledged_state(policy: str) -> None:
-    start = (f"trigger={policy}", "network.initial_sync=known_state", LOSSLESS)
-    one = simulate(acknowledged(*start, "network.acknowledgements={}"))
-    other = simulate(plain(*start))
-    assert len(events(one)) > 3
-    np.testing.assert_array_equal(events(one)["t_ns"], events(other)["t_ns"])
-    lossy = simulate(acknowledged(f"trigger={policy}"))
-    assert replay(lossy).bit_exact
-
-
-@pytest.mark.parametrize("overrides", [MESSY, (), ("network.initial_sync=known_state",)])
-def test_the_models_agree_whenever_all_acknowledgements_have_arrived(
-    overrides: tuple[str, ...],
-) -> None:
-    record = run_of(*overrides)
-    joined, answers = align_tables(record), record[SENSOR_ACKNOWLEDGEMENT]
-    rows = record[SENSOR_MEASUREMENT]
-    before = np.searchsorted(answers["input"], rows["input"])
-    known = np.append(NO_SEQUENCE, answers["sequence"])[before]
-    arrived = known == joined.received
-    # The update of an event is applied at the time of its sample, after the sample.
-    arrived &= rows["event"] == NO_SEQUENCE
-    assert 10 < arrived.sum() < len(rows)
-    scale = np.abs(joined.x).max()
-    np.testing.assert_allclose(joined.x_s[arrived], joined.x_c[arrived], rtol=0, atol=1e-12 * scale)
-    missed = (known < joined.received) & (rows["event"] == NO_SEQUENCE)
-    assert missed.any()
-    apart = np.abs(joined.x_s[missed] - joined.x_c[missed]).max(axis=1)
-    assert np.median(apart) > 1e-6 * scale
-
-
-@pytest.mark.parametrize("overrides", [(), MESSY])
-def test_the_sensor_waits_for_an_acknowledgement_or_the_timeout(overrides: tuple[str, ...]) -> None:
-    record = run_of(*overrides)
-    timeout_ns = record.scenario.timing.acknowledgement_timeout_ns
-    assert timeout_ns == 50_000_000
-    found, answers = events(record), record[SENSOR_ACKNOWLEDGEMENT]
-    too_soon = waited = 0
-    for one, following in pairwise(found):
-        between = (answers["input"] > one["input"]) & (answers["input"] < following["input"])
-        if one["event"] not in answers["sequence"][between]:
-            too_soon += following["t_ns"] - one["t_ns"] < timeout_ns
-            waited += following["t_ns"] - one["t_ns"] == timeout_ns
-        assert following["x"].tobytes() != one["x"].tobytes()  # the current state at that time
-    assert too_soon == 0
-    assert waited > 3
 
 
 def test_the_default_timeout_covers_the_delays_of_both_directions() -> None:

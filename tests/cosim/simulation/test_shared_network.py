@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
+from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.parameter_changes import LATE
 from noack.config.resolution import resolve
 from noack.config.scenario import loops_of, phases_ns
 from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, NETEM_SETTING, Fate
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
 from tests.cosim.record.changed_records import changed
 
@@ -126,8 +126,10 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
     found = replay(shared.network)
     assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
+    machines = SharedMachines(shared.loops)
     for record in shared.loops:
-        found = replay(record)
+        found = replay(record, machines)
+        assert found == replay(record)
         assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
         assert all(hop.compared > 20 for hop in found.messages)
     packets = shared.network[NETEM_PACKET].copy()
@@ -137,20 +139,11 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     head = bytearray(packets["head"][3].tobytes())
     head[6] = 1  # the number of another loop
     packets["head"][3] = bytes(head)
-    found = replay(changed(shared.loops[2], {NETEM_PACKET: packets}))
+    other = changed(shared.loops[2], {NETEM_PACKET: packets})
+    found = replay(other)
+    assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
-
-
-def test_a_change_concerns_every_loop(short: Content) -> None:
-    changes = [{"trigger.beta": 0.005}, {"trigger.beta": 0.5, "network.mansd": 1}]
-    short["changes"] = [{"at_s": 1.0 * i, "set": one} for i, one in enumerate(changes)]
-    shared = run(short, {"name": "a", "count": 3})
-    for record in shared.loops:
-        assert len(record[NETEM_SETTING]) == len(record["sensor_setting"]) == 2
-        assert not [one for one in record.notices if one["level"] == LATE]
-        assert replay(record).bit_exact
-    assert replay(shared.network).bit_exact
 
 
 def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -> None:

@@ -93,7 +93,11 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
         RunRecord(resolved, record.source, record.notices, reports, "live" if live else "simulated")
     )
     own = summarise(run.loop(), 0, "finished").to_json()
-    own |= {"replay": replay(record).verdict(), "claims": [CLAIM], "fidelity": FIDELITY}
+    own |= {
+        "replay": replay(record).verdict().model_dump(),
+        "claims": [CLAIM],
+        "fidelity": FIDELITY,
+    }
     end, loop = ExitPart(status=0, reason="finished"), LoopSummary.model_validate(own)
     summary = summarise_run(run.network, [loop], end).to_json()
     (folder / SUMMARY_FILE).write_text(json.dumps(summary))
@@ -194,7 +198,7 @@ def _read(run_dir: Path) -> None:
     record = finish_record(run_dir).loop() if cut_short else load_record(run_dir)
     json.loads(summarise(record, 0, "finished").model_dump_json())
     found = replay(record)
-    json.dumps(found.verdict())
+    found.verdict().model_dump_json()
     json.dumps(found.document())
     if cut_short:
         again = load_record(run_dir)  # a finalised record can be read

@@ -1,91 +1,36 @@
-"""Link settings that are refused, and the error messages."""
+"""Settings of a link that depend on each other, or on files."""
 
 import json
+import math
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
+import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from noack.impairments.kinds import AnyImpairment
+from noack.config.resolution import resolve
+from noack.config.scenario_file import dumps, load, validate
+from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-
-LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
-ONE: TypeAdapter[AnyImpairment] = TypeAdapter(AnyImpairment)
-
-LOSS_MISTAKES: list[tuple[dict[str, Any], str]] = [
-    ({"model": "bernoulli", "probability": 1.1}, "less than or equal to 1"),
-    ({"model": "bernoulli", "probability": 0.1, "correlation": 1.0}, "less than 1"),
-    ({"model": "bernoulli", "probability": 0.1, "correlaton": 0.5}, "not permitted"),
-    ({"model": "gilbert_elliott"}, "good_to_bad: give good_to_bad and bad_to_good, or mean_loss"),
-    ({"model": "gilbert_elliott", "mean_loss": 0.1}, "good_to_bad: give good_to_bad and"),
-    ({"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.1, "mean_loss": 0.1},
-     "mean_loss: goes instead of good_to_bad and bad_to_good"),
-    ({"model": "gilbert_elliott", "mean_loss": 0.1, "mean_burst": 2.0, "loss_in_bad": 0.5},
-     "mean_loss: mean_loss and mean_burst go with loss_in_good 0 and loss_in_bad 1"),
-    ({"model": "gilbert_elliott", "mean_loss": 0.9, "mean_burst": 2.0},
-     "mean_burst: so much loss needs longer bursts, at least mean_loss/(1 − mean_loss) = 9"),
-    ({"model": "gilbert_elliott", "mean_loss": 1.0, "mean_burst": 2.0}, "less than 1"),
-    ({"model": "four_state", "p13": 0.1, "p31": 0.7, "p32": 0.4}, "p31: p31 + p32 must not exceed"),
-    ({"model": "four_state", "p13": 0.6, "p31": 0.7, "p14": 0.5}, "p13: p13 + p14 must not exceed"),
-    ({"model": "periodic", "period": 4, "burst": 5}, "burst: must not exceed the period, 4"),
-    ({"model": "scripted", "lost": [3, 3]}, "lost: the numbers must ascend"),
-    ({"model": "scripted", "lost": [-1]}, "greater than or equal to 0"),
-    ({"model": "scripted", "lost": [1, 5], "repeat_every": 5},
-     "repeat_every: the script is longer, up to 5"),
-    ({"model": "trace"}, "Field required"),
-    ({"model": "gilbert"}, "does not match any of the expected tags"),
-]  # fmt: skip
-
-MISTAKES: list[tuple[dict[str, Any], str]] = [
-    ({"kind": "jitter"}, "does not match any of the expected tags"),
-    ({"kind": "delay", "delay_s": -0.1}, "greater than or equal to 0"),
-    ({"kind": "delay", "delay_s": float("nan")}, "finite number"),
-    ({"kind": "delay", "distribution": "empirical"},
-     "samples_s: an empirical distribution needs samples_s, or a file"),
-    ({"kind": "delay", "distribution": "empirical", "samples_s": [0.1, 0.2], "file": "a.txt"},
-     "samples_s: an empirical distribution needs samples_s, or a file"),
-    ({"kind": "delay", "samples_s": [0.1, 0.2]}, 'samples_s: goes with distribution = "empirical"'),
-    ({"kind": "delay", "distribution": "normal", "file": "a.txt"},
-     'samples_s: goes with distribution = "empirical"'),
-    ({"kind": "delay", "distribution": "empirical", "samples_s": [0.1]}, "at least 2 items"),
-    ({"kind": "rate", "rate_bps": 1, "queue": 1_000_000},
-     "rate_bps: a full queue of the longest packets would take more than a century"),
-    ({"kind": "blackout", "intervals_s": []}, "at least 1 item"),
-    ({"kind": "blackout", "intervals_s": [[2.0, 1.0]]},
-     "intervals_s: each must end after it begins, and before the next"),
-    ({"kind": "blackout", "intervals_s": [[1.0, 2.0], [1.5, 3.0]]},
-     "intervals_s: each must end after it begins, and before the next"),
-    ({"kind": "blackout", "intervals_s": [[1.0, 2.0]], "every_s": 1.5},
-     "every_s: the intervals last longer, until 2 s"),
-]  # fmt: skip
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_prediction import read_files
+from noack.protocol.record_tables import Fate
+from tests.oracles.link import Link
 
 
 def message(adapter: TypeAdapter[Any], content: Any) -> str:
     with pytest.raises(ValidationError) as caught:
         adapter.validate_json(json.dumps(content))
     return "\n".join(error["msg"] for error in caught.value.errors())
-
-
-@pytest.mark.parametrize(("content", "words"), LOSS_MISTAKES)
-def test_an_invalid_loss_model_is_refused_with_the_reason(
-    content: dict[str, Any], words: str
-) -> None:
-    assert words in message(LOSS, content)
-    assert words in message(ONE, {"kind": "loss", "loss": content})
-
-
-@pytest.mark.parametrize(("content", "words"), MISTAKES)
-def test_an_invalid_impairment_is_refused_with_the_reason(
-    content: dict[str, Any], words: str
-) -> None:
-    assert words in message(ONE, content)
-    assert words in message(TypeAdapter(LinkSettings), {"impairments": [content]})
 
 
 @pytest.mark.parametrize(
@@ -129,3 +74,146 @@ def test_the_longest_delay_is_the_sum_of_the_maximum_delays() -> None:
         )
     )
     assert settings.longest_delay_s == pytest.approx(0.11 + 0.04 + 0.5 + 0.1)
+
+
+def read_delay(folder: Path, **settings: Any) -> Delay:
+    delay = Delay(distribution="empirical", **settings)
+    (read,) = read_files(LinkSettings(impairments=(delay,)), folder).impairments
+    assert isinstance(read, Delay)
+    return read
+
+
+@pytest.mark.parametrize("repeat", [True, False])
+def test_a_trace_drops_the_packets_it_marks(repeat: bool, tmp_path: Path) -> None:
+    (tmp_path / "trace.txt").write_text("0100 1\n11\t0\r\n")
+    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="trace.txt", repeat=repeat)),))
+    link = Link(read_files(settings, tmp_path), 0, "test")
+    fates = [link.decide(0, 100, 0).fate for _ in range(20)]
+    marks = [int(mark) for mark in "01001110"]
+    assert fates == (marks * 3 if repeat else marks + [0] * 12)[:20]
+    assert Fate.DROPPED == 1
+
+
+def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
+    (tmp_path / "delays.txt").write_text("# from a ping\n0.01\n12.5ms\n\n300 us\n-5ns\n1e-3\n")
+    delay = read_delay(tmp_path, delay_s=0.02, file="delays.txt")
+    assert delay.samples_s == pytest.approx((0.01, 0.0125, 3e-4, -5e-9, 1e-3), rel=1e-15)
+    assert delay.file is None
+    assert delay.delay_s == 0.02
+
+
+def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None:
+    (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
+    delay = read_delay(tmp_path, delay_s=0.02, jitter_s=0.002, file="some.dist")
+    assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
+    # The quantiles are those of the table, shifted by the constant delay.
+    link = Link(LinkSettings(impairments=(delay,)), 0, "test")
+    drawn = sorted(link.decide(0, 100, 0).release_ns for _ in range(4001))
+    for quantile, expected_s in ((0, 0.018), (1000, 0.019), (2000, 0.02), (3000, 0.022)):
+        # A quantile of n draws has the standard error √(q(1 − q)/n)/density; the density is flat
+        # between knots, at least 1/(4 · 2 ms).
+        error_s = 5 * math.sqrt(0.25 / 4001) * 0.008
+        assert abs(drawn[quantile] * 1e-9 - expected_s) < max(error_s, 2e-5)
+
+
+TABLE = Path("/usr/lib/x86_64-linux-gnu/tc/paretonormal.dist")
+
+
+@pytest.mark.skipif(not TABLE.exists(), reason="tc's tables are not installed")
+def test_a_distribution_table_shipped_with_tc_is_read() -> None:
+    samples_s = read_delay(Path(), jitter_s=8.192, file=str(TABLE)).samples_s
+    assert samples_s is not None
+    assert len(samples_s) == 4096
+    assert all(abs(t_s * 1000 - round(t_s * 1000)) < 1e-9 for t_s in samples_s)
+
+
+def test_settings_without_files_are_unchanged(tmp_path: Path) -> None:
+    settings = LinkSettings(impairments=(Delay(delay_s=1.0), Rate(rate_bps=1000)), mansd=4)
+    assert read_files(settings, tmp_path) == settings
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "cannot be read: No such file or directory"),
+        (b"01x1", "has a 'x'; a trace is of 0 and 1, and white space"),
+        (b"01\xff", "has a 'ÿ'; a trace is of 0 and 1"),
+        (b" \n", "is empty; a trace has a 1 for each lost packet"),
+    ],
+)
+def test_a_mistake_in_a_trace_gets_one_line(
+    content: bytes | None, says: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / "t").write_bytes(content)
+    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
+    with pytest.raises(CallerError) as caught:
+        read_files(settings, tmp_path, "l.toml: link.0.reverse")
+    assert str(caught.value).startswith(
+        f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
+    )
+    with pytest.raises(CallerError) as caught:
+        read_files(settings, tmp_path)
+    assert str(caught.value).startswith(f"t: {says}")
+
+
+@pytest.mark.parametrize(
+    ("name", "jitter_s", "content", "says"),
+    [
+        ("t", 0.0, None, "cannot be read: No such file or directory"),
+        ("t", 0.0, "0.01\nslow\n", "line 2: slow: expected one delay, e.g. 0.0125 or 12.5ms"),
+        ("t", 0.0, "0.01\n1h\n", "line 2: 1h: expected one delay"),
+        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; expected 2 to 1000000"),
+        ("t", 0.0, "0.01\n4000\n", "has a delay beyond 3600 s"),
+        ("t", 0.001, "0.01\n0.02\n", "observed delays are taken as they are, and have no jitter"),
+        ("t.dist", 0.0, "1 2 3", "a distribution table is scaled by the jitter, which is 0"),
+        ("t.dist", 0.001, "1 2\n0.5", "line 2: 0.5: expected whole numbers, 8192 for 1"),
+    ],
+)
+def test_a_mistake_in_a_delay_file_gets_one_line(
+    name: str, jitter_s: float, content: str | None, says: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(CallerError) as caught:
+        read_delay(tmp_path, jitter_s=jitter_s, file=name)
+    assert str(caught.value).startswith(f"{name}: {says}")
+
+
+@pytest.fixture
+def scenario_with_files(content: dict[str, Any], tmp_path: Path) -> Path:
+    content["network"] = {
+        "mansd": 2,
+        "loss": {"model": "trace", "file": "files/trace.txt"},
+        "impairments": [{"kind": "delay", "distribution": "empirical", "file": "files/delays.txt"}],
+    }
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files/trace.txt").write_text("0011")
+    (tmp_path / "files/delays.txt").write_text("1ms\n2ms\n")
+    path = tmp_path / "some.toml"
+    path.write_text(tomli_w.dumps(content))
+    return path
+
+
+def test_a_loaded_scenario_no_longer_needs_its_files(scenario_with_files: Path) -> None:
+    scenario = load(scenario_with_files)
+    assert scenario.network.loss == ScriptedLoss(lost=(2, 3), repeat_every=4)
+    assert scenario.network.impairments == (
+        Delay(distribution="empirical", samples_s=(0.001, 0.002)),
+    )
+    for one in (scenario, resolve(scenario)):
+        assert validate(tomllib.loads(dumps(one)), "copy") == one
+
+
+def test_an_error_in_a_file_names_the_scenario_key(scenario_with_files: Path) -> None:
+    (scenario_with_files.parent / "files/trace.txt").unlink()
+    with pytest.raises(CallerError) as caught:
+        load(scenario_with_files)
+    assert str(caught.value) == (
+        f'{scenario_with_files}: network.loss.file = "files/trace.txt": '
+        "cannot be read: No such file or directory"
+    )
+    table = '{kind="delay",distribution="empirical",file="x"}'
+    overrides = ['network.loss={model="worst_case"}', f"network.impairments=[{table}]"]
+    with pytest.raises(CallerError, match=r'network\.impairments\.0\.file = "x": cannot be read'):
+        load(scenario_with_files, overrides)

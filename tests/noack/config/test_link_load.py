@@ -143,30 +143,6 @@ def test_the_bound_of_the_delay_covers_changes(content: dict[str, Any]) -> None:
     assert longest_s > 0.12  # the bound for the settings at the start is 0.1
 
 
-@settings(max_examples=15)
-@given(
-    loops=st.integers(1, 12),
-    queue=st.integers(1, 8),
-    load=st.sampled_from([0.5, 0.99, 1.0, 1.2, 2.0, 2.9]),
-    seed=st.integers(0, 2**32),
-    together=st.booleans(),
-)
-def test_no_load_exceeds_the_bound_of_the_delay(
-    loops: int, queue: int, load: float, seed: int, together: bool
-) -> None:
-    """Loops that transmit at once, or at random, as often as they may, with M = 3."""
-    rate_bps = int(loops * BITS / 0.05 / load) + 1
-    content = {
-        "name": "small", "horizon_s": 1.0, "model": {"name": "double_integrator"},
-        "plant": {"initial_state": [1.0, 0.0]}, "trigger": PERIODIC,
-        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.3}},
-    }  # fmt: skip
-    scenario = scenario_of(content, rate_bps, queue, {"name": "a", "count": loops})
-    (found,) = link_loads(scenario)
-    assert found.delay_bound_s is not None
-    assert longest_delay_s(scenario, loops, seed, together) <= found.delay_bound_s * (1 + 1e-9)
-
-
 def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -> float:
     """Return the longest delay of 200 updates of each loop, 50 ms apart or more."""
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The loops of a scenario: what they inherit, what they draw, and which mistakes are refused."""
+"""The loops of a scenario, also of files of their own: what they inherit and what they draw."""
 
 import hashlib
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario, loops_of, phases_ns
-from noack.config.scenario_file import completed, dumps, load, validate
+from noack.config.resolution import loop_of, resolve, resolve_run, resolved_loops
+from noack.config.scenario import Scenario, loop_names, loops_of, phases_ns
+from noack.config.scenario_file import completed, dumps, load, toml_text, validate
 from noack.core.errors import CallerError
 
 
@@ -92,41 +92,156 @@ def test_the_file_of_a_loop_is_found_beside_the_scenario(
     assert load(tmp_path / "again.toml") == scenario
 
 
-@pytest.mark.parametrize(
-    ("loops", "message"),
-    [
-        ([{"name": "a"}, {"name": "a"}],
-         'loops.1.name = "a": the name a is already given by loops.0'),
-        ([{"name": "a-2"}, {"name": "a", "count": 3}],
-         'loops.1.name = "a": the name a-2 is already given by loops.0'),
-        ([{"name": "a", "count": 0}], "loops.0.count = 0: should be greater than or equal to 1"),
-        ([{"name": "a", "count": 40_000}, {"name": "b", "count": 40_000}],
-         "loops.1.count = 40000: a run has at most 65535 loops"),
-        ([{"name": "a", "network": {"mansd": 1}}],
-         'loops.0.network = {"mansd": 1}: all loops share it; set it at the top level'),
-        ([{"name": "a", "scenario": 3}],
-         "loops.0.scenario = 3: should be the name of a scenario file, in quotes"),
-        ([{"name": "a", "scenario": "other.toml"}],
-         'loops.0.scenario = "other.toml": it is read where a scenario file is loaded; give tables '
-         "here"),
-        ([{"name": "a", "scenario": {"plant": {"initial_state": [1.0]}}}],
-         "loops.0.scenario.model: missing (the model that sensor and controller use: Â, B̂, and "
-         "the gain K of u = K x_c)"),
-        ([{"name": "a", "plant": {"initial_state": [1.0]}}],
-         "loops.0.plant.initial_state = [1.0]: expected 2 entries (one per state), found 1"),
-        ([{"name": "a", "trigger": {"bta": 1.0}}],
-         "loops.0.trigger.bta = 1.0: unknown key; did you mean beta?"),
-        ([], "loops = []: needs at least one entry"),
-    ],
-)  # fmt: skip
-def test_a_mistake_is_one_line(
-    content: dict[str, Any], loops: list[dict[str, Any]], message: str
-) -> None:
-    with pytest.raises(CallerError) as refused:
-        with_loops(content, *loops)
-    assert str(refused.value) == f"here: {message}"
+def test_a_file_is_not_read_where_tables_are_validated(content: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match="it is read where a scenario file is loaded"):
+        with_loops(content, {"name": "a", "scenario": "other.toml"})
 
 
 def test_only_single_loops_are_resolved(content: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match="it has 2 loops; give a scenario of one loop"):
         resolve(with_loops(content, {"name": "a"}, {"name": "b"}))
+
+
+PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
+OTHER = {
+    "name": "other",
+    "horizon_s": 3.0,
+    "speed": 2.0,
+    "mode": "zoh",
+    "model": {"A": [[-1.0]], "B": [[1.0]], "gain": [[-1.0]]},
+    "plant": {"initial_state": [2.0], "rate_hz": 50.0},
+    "trigger": {"policy": "periodic", "period_s": 0.1},
+    "seeds": {"plant": 9},
+    "ports": {"plant": 50_000},
+}
+
+
+def write(folder: Path, name: str, content: dict[str, Any]) -> Path:
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(toml_text(content))
+    return path
+
+
+def loaded(folder: Path, content: dict[str, Any], other: dict[str, Any], **entry: Any) -> Scenario:
+    """The first loop is the top level, the second one has a file in another folder."""
+    write(folder, "parts/other.toml", other)
+    loops = [{"name": "a"}, {"name": "b", "scenario": "parts/other.toml", **entry}]
+    return load(write(folder, "run.toml", content | {"loops": loops}))
+
+
+def test_a_loop_is_that_of_its_file_on_the_network_of_the_run(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    scenario = loaded(tmp_path, content, OTHER)
+    first, second = loops_of(scenario)
+    alone = load(write(tmp_path, "alone.toml", OTHER | {"network": content["network"]}))
+    for part in PARTS:
+        assert getattr(second, part) == getattr(alone, part)
+    assert second.network == first.network == scenario.network
+    assert (second.horizon_s, second.speed) == (scenario.horizon_s, scenario.speed)
+    assert (second.ports, second.seeds.loss) == (scenario.ports, scenario.seeds.loss)
+    assert second.seeds.plant != 9  # drawn from the seeds of the run
+
+
+def test_keys_of_the_entry_change_the_file(content: dict[str, Any], tmp_path: Path) -> None:
+    scenario = loaded(
+        tmp_path, content, OTHER, count=2, mode="model",
+        plant={"rate_hz": 100.0}, trigger={"period_s": 0.2},
+        controller={"kind": "linear", "rate_hz": 25.0}, seeds={"plant": 3},
+    )  # fmt: skip
+    assert loop_names(scenario) == ["a", "b-1", "b-2"]
+    loop = loops_of(scenario)[2]
+    assert (loop.plant.rate_hz, loop.plant.initial_state) == (100.0, (2.0,))
+    assert loop.trigger.model_dump(exclude_none=True) == {"policy": "periodic", "period_s": 0.2}
+    assert (loop.controller.rate_hz, loop.mode, loop.seeds.plant) == (25.0, "model", 3)
+
+
+def test_an_observer_of_the_top_level_is_not_that_of_the_file(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    content |= {"observer": {"kind": "luenberger", "poles_per_s": [-5.0, -6.0]}}
+    first, second = loops_of(loaded(tmp_path, content, OTHER))
+    assert first.observer is not None
+    assert second.observer is None
+
+
+def test_what_is_written_has_the_content_of_the_file(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    given = loaded(tmp_path, content, OTHER)
+    for scenario in (given, resolve_run(given)):
+        elsewhere = tmp_path / "elsewhere.toml"
+        elsewhere.write_text(dumps(scenario))
+        again = load(elsewhere)
+        assert again == scenario
+        for one, other in zip(resolved_loops(again), resolved_loops(given), strict=True):
+            assert one == other
+
+
+def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    np.savez(tmp_path / "parts/model.npz", A=[[-3.0]], B=[[1.0]], gain=[[-1.0]])
+    (tmp_path / "parts/trigger.py").write_text("class Trigger: ...")
+    other = OTHER | {
+        "model": {"file": "model.npz"},
+        "trigger": {"policy": "python", "name": "Trigger", "file": "trigger.py"},
+    }
+    loop = loops_of(loaded(tmp_path, content, other))[1]
+    assert loop.model.A == ((-3.0,),)
+    trigger: Any = loop.trigger
+    assert trigger.file == str(tmp_path / "parts/trigger.py")
+    assert len(trigger.sha256) == 64
+
+
+def test_a_shipped_scenario_is_found_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
+    content["network"] = {"mansd": 4, "loss": {"model": "bernoulli", "probability": 0.8}}
+    loops = [{"name": "mass", "scenario": "double_integrator"}]
+    (loop,) = loops_of(load(write(tmp_path, "run.toml", content | {"loops": loops})))
+    assert loop.model.name == "double_integrator"
+    assert resolve(loop).plant.draw == "given"
+
+
+NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
+
+
+def test_what_the_loops_share_is_that_of_the_run(content: dict[str, Any], tmp_path: Path) -> None:
+    theirs = {
+        "network": NETWORK | {"mansd": 3, "limit": 5}, "certificate": {"late_periods": 1},
+        "changes": [{"at_s": 1.0, "set": {"mansd": 1}}], "horizon_s": 99.0,
+    }  # fmt: skip
+    own = content | {"network": NETWORK}
+    assert loaded(tmp_path, own, OTHER | theirs) == loaded(tmp_path, own, OTHER)
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "message"),
+    [
+        ("parts/none.toml", {}, "no such file, nor a shipped scenario; `noack scenarios` lists"),
+        ("lane_folowing", {}, "nor a shipped scenario; did you mean lane_following?"),
+        ("x" * 5000, {}, "no such file, nor a shipped scenario"),
+        ("", {}, 'scenario = "": no such file, nor a shipped scenario'),
+        ("parts", {}, "cannot be read"),
+        ("parts/other.toml", {"loops": [{"name": "c"}]},
+         'loops.0.scenario = "parts/other.toml": that file has loops itself'),
+        ("parts/other.toml", {"plant": {"initial_state": [1.0, 2.0]}},
+         "run.toml: loops.0.plant.initial_state: expected 1 entries (one per state), found 2"),
+        ("parts/other.toml", {"trigger": {"policy": "periodic", "perod_s": 0.1}},
+         "other.toml: trigger.perod_s = 0.1: unknown key; did you mean period_s?"),
+        ("parts/other.toml", {"horizon": 3.0}, "other.toml: horizon = 3.0: unknown key"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_loops_file_is_named(
+    content: dict[str, Any], tmp_path: Path, name: str, other: dict[str, Any], message: str
+) -> None:
+    write(tmp_path, "parts/other.toml", OTHER | other)
+    run = write(tmp_path, "run.toml", content | {"loops": [{"name": "b", "scenario": name}]})
+    with pytest.raises(CallerError) as refused:
+        load(run)
+    assert message in str(refused.value)
+
+
+def test_a_ticket_carries_the_tables(content: dict[str, Any], tmp_path: Path) -> None:
+    """A ticket has all keys, also those without a value."""
+    scenario = loaded(tmp_path, content, OTHER)
+    assert validate(scenario.model_dump(mode="json"), "ticket") == scenario

@@ -27,23 +27,11 @@ from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import SystemFailedError
 from noack.protocol.machine_interface import GENERATION, Notice, Output, Start
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_rule import CodedPolicy, Forecast, Policy, TriggerDecision
+from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import OneLoop, SteppedMachines
-from tests.trigger_rules import (
-    absolute_rule,
-    area_rule,
-    decaying_rule,
-    dynamic_rule,
-    lyapunov_rule,
-    mixed_rule,
-    periodic_rule,
-    quadratic_rule,
-    self_triggered_rule,
-    with_deadline,
-    with_dwell_time,
-)
+from tests.trigger_rules import TABLES, random_rule
 from tests.wire_decoder import NO_VECTOR
 
 MS = 1_000_000
@@ -87,26 +75,9 @@ def chance(rng: Rng) -> bool:
 def policies(rng: Rng, n: int) -> list[Policy]:
     """A policy of each form."""
     W = np.eye(n) + 0.1 * rng.normal(size=(n, n)) if chance(rng) else None
-    form, root = rng.normal(size=(2 * n, 2 * n)), rng.normal(size=(n, n))
-    P, Q, BK = root @ root.T + np.eye(n), np.eye(n), rng.normal(size=(n, n))
     small = float(rng.choice([1e-6, 0.02, 0.5]))
-    absolute = absolute_rule(small, W, n)
-    interval_ns = int(rng.integers(1, 80)) * MS
-    forecast = Forecast(0.5, 0.25, small, *rng.uniform(0, 5, 3))
-    return [
-        decaying_rule(0.5, 0.25, small, W, n),
-        absolute,
-        mixed_rule(0.2, small, W, n),
-        quadratic_rule(form + form.T, interval_ns, small, 3 * chance(rng), W),
-        lyapunov_rule(np.linalg.cholesky(P).T, 0.7, W),
-        dynamic_rule(0.3, 0.1, 0.8 * chance(rng), P, Q, BK, eta_0=0.2),
-        periodic_rule(interval_ns, W, n),
-        with_deadline(absolute, interval_ns),
-        with_dwell_time(absolute, interval_ns),
-        self_triggered_rule(forecast, 1000, interval_ns, W, n),
-        area_rule(0.1 * small, W, n),
-        CodedPolicy(W, lambda: UserTrigger(small), "it is code"),
-    ]
+    rules = [random_rule(name, rng, n, W) for name in TABLES]
+    return [*rules, CodedPolicy(W, lambda: UserTrigger(small), "it is code")]
 
 
 @dataclass

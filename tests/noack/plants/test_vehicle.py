@@ -259,14 +259,6 @@ def test_equations_with_tyres_are_compiled(model: str, is_compiled: bool) -> Non
     assert compiled.is_compiled(model)
 
 
-def test_the_given_parameters_are_used() -> None:
-    slippery, grippy = numbered_parameters(2), numbered_parameters(2)
-    slippery.tire.p_dy1 *= 0.1
-    z = driving_states("std", grippy)[-1]
-    rates = [equations("std", p)(z, 0.0, 0.0) for p in (slippery, grippy)]
-    assert np.abs(rates[0] - rates[1]).max() > 0.1
-
-
 def test_equations_that_cannot_be_compiled_are_run_in_python(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from benchmarks._report import MeasurementError
-from benchmarks._two_hosts import TwoHosts, two_hosts
-from benchmarks.clock_offset_bound import MAIN, measured
+from benchmarks.hosts import MAIN, measured
+from benchmarks.programs import TwoHosts, two_hosts
+from benchmarks.report import MeasurementError
 
 DELAY_US = 5000
 
@@ -52,7 +52,7 @@ def test_the_true_offset_is_in_the_bound(
 
 def test_a_wrong_offset_is_not_in_the_bound(hosts: TwoHosts) -> None:
     """The check can fail: a drift beyond the assumed rate, of which the checks know nothing."""
-    wrong = MAIN._replace(client=("--rate-ppb", "0"))
+    wrong = MAIN._replace(settings={"rate_ppb": 0})
     found = measured(hosts, 1, 10**8, wrong, seconds=1.0, realtime=False)
     assert found["restarts"] > 0
     assert found["outside"] > 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks._driven_clocks import DrivenClocks
+from benchmarks.hosts import DrivenClocks
 from noack.config.run_sections import ClocksSection
 from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S, RunClock

@@ -10,7 +10,7 @@ from random import Random
 import numpy as np
 import pytest
 
-from benchmarks._driven_clocks import DrivenClocks
+from benchmarks.hosts import DrivenClocks
 from noack.core.clock import ClockOffset, Restart, RestartCause
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection

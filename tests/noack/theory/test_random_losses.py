@@ -1,12 +1,24 @@
-"""Moments under random losses: closed forms, Monte Carlo at events, and decay of every run."""
+"""Loops under random losses: moments and growth, by closed forms, all patterns, Monte Carlo."""
+
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
 from noack.impairments.loss_prediction import LossProcess
+from noack.impairments.markov_chain import Array
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
+from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.random_losses.mean_square_growth import (
+    mean_square_growth,
+    random_growth,
+    sure_growth,
+)
 from noack.theory.random_losses.moments import moment_at_events, moments
 from tests.noack.theory.exact_loops import loop_of
 from tests.oracles.lossy_loops import System, random_system
@@ -90,3 +102,101 @@ def scaled_errors(system: System, loop: ContinuousLoop, lost: np.ndarray) -> np.
         np.linalg.norm(system.weight @ one.e_c) * np.exp(system.alpha * one.t_s) / system.beta
         for one in run.before[1:EVENTS]
     ])  # fmt: skip
+
+
+LANE = Path(__file__).parents[3] / "scenarios" / "lane_periodic.toml"
+
+
+def losses(start: list[float], moves: list[list[float]], lost: list[float]) -> LossProcess:
+    return LossProcess(np.array(start), np.array(moves), np.array(lost))
+
+
+BURSTY = losses([0.8, 0.2], [[0.9, 0.1], [0.4, 0.6]], [0.05, 0.8])
+
+
+@pytest.mark.parametrize("p", [0.0, 0.2, 0.6, 1.0])
+def test_a_scalar_grows_as_the_mean_of_its_squares(p: float) -> None:
+    found = mean_square_growth([(np.array([[0.5]]), np.array([[1.4]]))], independent(p))
+    assert found == pytest.approx(((1 - p) * 0.25 + p * 1.96) ** 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("process", [independent(0.4), BURSTY], ids=["independent", "bursty"])
+def test_the_second_moment_of_all_patterns_grows_like_the_spectral_radius(
+    process: LossProcess,
+) -> None:
+    """With two slots; the sum over all patterns of 14 periods, divided by that of 12."""
+    rng = np.random.default_rng(3)
+    slots = [(rng.normal(size=(2, 2)), rng.normal(size=(2, 2))) for _ in range(2)]
+    fates = process.moves * (1 - process.lost), process.moves * process.lost
+
+    def second_moment(periods: int) -> float:
+        total = 0.0
+        for pattern in product([0, 1], repeat=periods):
+            weight: Array = process.start
+            matrix = np.eye(2)
+            for period, lost in enumerate(pattern):
+                weight, matrix = weight @ fates[lost], slots[period % 2][lost] @ matrix
+            total += float(weight.sum() * (matrix**2).sum())
+        return total
+
+    grown = (second_moment(12) / second_moment(10)) ** 0.25
+    assert mean_square_growth(slots, process) == pytest.approx(grown, rel=0.01)
+
+
+def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm() -> None:
+    """Jensen's bound, the root of the mean square, is above 1; nevertheless runs decay."""
+    p, delivered, lost = 0.5, 0.2, 2.0
+    between = [np.array([[delivered * lost**burst]]) for burst in range(40)]
+    exact = delivered ** (1 - p) * lost**p
+    found = sure_growth(between, p, between[-1], np.array([[lost]]))
+    assert found == pytest.approx(exact, rel=1e-6)
+    assert exact < 1 < mean_square_growth([(between[0], np.array([[lost]]))], independent(p))
+
+
+@pytest.mark.parametrize("listed", [1, 2, 3, 5, 40])
+def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
+    """They are likely here: of runs of random loops, and of a scalar, none grows faster."""
+    rng, p = np.random.default_rng(listed), 0.5
+    between = [np.array([[0.2 * 2.0**burst]]) for burst in range(listed)]
+    assert sure_growth(between, p, between[-1], np.array([[2.0]])) >= (0.2 * 2.0) ** 0.5
+    for _ in range(10):
+        delivered, lost = rng.normal(size=(2, 3, 3))
+        delivered[:, 1:] = 0.0  # z is the first entry: what follows a delivery depends on it alone
+        states = [np.linalg.matrix_power(lost, burst) @ delivered[:, :1] for burst in range(listed)]
+        bound = sure_growth([state[:1] for state in states], p, states[-1], lost)
+        z, total, periods = np.ones(3), 0.0, 4000
+        for is_lost in (rng.uniform(size=periods) < p).tolist():
+            z = (lost if is_lost else delivered) @ z
+            size = float(np.linalg.norm(z))
+            z, total = z / size, total + np.log(size)
+        assert np.exp(total / periods) <= bound * 1.03  # of 4,000 periods
+
+
+def test_a_long_run_of_the_lane_grows_no_faster_than_its_bound() -> None:
+    margin = LossMargin(resolve(load(LANE, ())))
+    p, rng = 0.7, np.random.default_rng(5)
+    found = random_growth(margin, independent(p))
+    maps = margin.loop.period(0, True), margin.loop.period(0, False)
+    z, total, periods = np.ones(len(maps[0])), 0.0, 5000
+    for lost in (rng.uniform(size=periods) < p).tolist():
+        z = maps[lost] @ z
+        size = float(np.linalg.norm(z))
+        z, total = z / size, total + np.log(size)
+    assert np.exp(total / periods) < found.almost_sure < 1 < found.mean_square
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.1])
+def test_the_maps_of_single_periods_compose_to_those_between_deliveries(delay_s: float) -> None:
+    delay = f'network.impairments=[{{kind="delay", delay_s={delay_s}}}]'
+    loop = LossMargin(resolve(load(LANE, (delay,)))).loop
+    n, m = 4, 2
+    x, x_c, u = np.eye(n), np.zeros((n, n)), np.zeros((m, n))
+    start = np.vstack([x, x if delay_s == 0 else x_c, u, u])
+    if delay_s:  # u belongs to x_c = 0, and the transmitted x is that of z
+        expected = loop.map(0, 2).middle[: 2 * n, :n]
+        kept = [*range(2 * n)]
+    else:
+        expected = loop.map(0, 2).middle[:, :n]
+        kept = [*range(n), *range(2 * n, 2 * n + m)]
+    steps = loop.period(0, False) @ loop.period(0, False) @ loop.period(0, True)
+    assert (steps @ start)[kept] == pytest.approx(expected, rel=1e-9, abs=1e-12)

@@ -1,11 +1,11 @@
 """Every policy at measurements, against the rules as they are stated; mistakes in settings.
 
-The exact simulator under every policy: tests/cosim/simulation/batch/test_policies.py; the search
-for the worst pattern: tests/cosim/analysis/adversary/test_policies.py.
+The table of all policies is in tests/trigger_rules.py. Here each is applied at measurements; in
+tests/cosim/simulation/batch/test_exact_events.py in continuous time; in
+tests/cosim/analysis/adversary/test_worst_patterns.py by the search for the worst pattern.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of, resolve, rule_of
-from noack.config.scenario_file import validate
+from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
 from noack.trigger.lyapunov import LyapunovSettings
@@ -22,27 +21,16 @@ from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import Forecast
 from tests.noack.trigger.core_trigger import CoreTrigger
 from tests.oracles.trigger_rules import Trigger
-from tests.trigger_rules import EXAMPLES, absolute_rule, self_triggered_rule
+from tests.trigger_rules import (
+    TABLES,
+    absolute_rule,
+    drawn,
+    rule_from,
+    self_triggered_rule,
+)
 
 Vector = NDArray[np.float64]
-DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
-RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
 N, MS, S = 2, 10**6, 10**9
-WEIGHT = [[2.0, 0.5], [0.0, 1.0]]
-FORM = [[-0.1, 0.0, 0.02, 0.0], [0.0, -0.1, 0.0, 0.01], [0.02, 0.0, 1.0, 0.1],
-        [0.0, 0.01, 0.1, 2.0]]  # fmt: skip
-TABLES: dict[str, dict[str, Any]] = {
-    **EXAMPLES,
-    "floor": EXAMPLES["decaying"] | {"floor": 0.4, "weight": WEIGHT},
-    "weighted mixed": EXAMPLES["mixed"] | {"sigma": 0.3, "weight": WEIGHT},
-    "weighted area": EXAMPLES["send_on_area"] | {"weight": WEIGHT},
-    "indefinite": EXAMPLES["quadratic"] | {"Q": FORM, "heartbeat": 6},
-    "late": EXAMPLES["deadline"] | {"interval_s": 0.2},
-    "dwell of periodic": EXAMPLES["dwell"]
-    | {"rule": {"policy": "periodic", "period_s": 0.07}, "interval_s": 0.1},
-    "late self-triggered": EXAMPLES["self_triggered"] | {"longest_s": 0.3, "weight": WEIGHT},
-}
-
 vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
 
 
@@ -60,16 +48,18 @@ def samples(seed: int, k: int) -> tuple[list[int], Vector]:
     return t_ns.tolist(), z
 
 
+def test_every_rule_is_in_the_table() -> None:
+    assert {table["policy"] for table in TABLES.values()} == POLICIES.keys() - {"python"}
+
+
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", TABLES)
-def test_the_core_decides_as_the_rule_is_stated(
-    content: dict[str, Any], name: str, seed: int
-) -> None:
-    table = TABLES[name]
-    scenario = resolve(validate(content | {"trigger": table}, "here"))
-    loop, start = loop_of(scenario), np.array([0.5, -0.3])
-    BK = loop.B_model @ loop.K
-    trigger, stated = CoreTrigger(rule_of(scenario), N), Trigger(table, loop.A_model + BK, BK)
+def test_the_core_decides_as_the_rule_is_stated(name: str, seed: int) -> None:
+    rng, start = np.random.default_rng(seed), np.array([0.5, -0.3])
+    table = drawn(TABLES[name], rng, N, np.array([[2.0, 0.5], [0.0, 1.0]]) if seed % 2 else None)
+    A, B, K = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[-1.0, -1.5]])
+    rule = rule_from(table, ModelMatrices(A, B, K))
+    trigger, stated = CoreTrigger(rule, N), Trigger(table, A + B @ K, B @ K)
 
     def begin(t_ns: int, x: Vector) -> None:
         trigger.start(t_ns, x)
@@ -123,36 +113,6 @@ def test_the_compared_error_has_the_bits_of_its_norm(e_s: Vector, x: Vector) -> 
     trigger.start(0, x)
     with np.errstate(over="ignore"):
         assert trigger.test(MS, x, e_s).left == exact_norm(e_s)
-
-
-def nested(rule: dict[str, Any]) -> dict[str, Any]:
-    inner = {"policy": "dwell", "interval_s": 0.1, "rule": rule}
-    return {"policy": "deadline", "interval_s": 1.0, "rule": inner}
-
-
-@pytest.mark.parametrize(
-    ("trigger", "expected"),
-    [
-        ({"policy": "absolute", "delta": 1e-300}, "trigger.delta = 1e-300: should be greater"),
-        ({"policy": "relative", "sigma": 1e300}, "trigger.sigma = 1e+300: should be less"),
-        ({"policy": "mixed", "sigma": 1.0, "epsilon": 1e200}, "trigger.epsilon = 1e+200: should"),
-        ({"policy": "lyapunov", "rate_per_s": 1e300}, "trigger.rate_per_s = 1e+300: should be"),
-        (DYNAMIC | {"decay_per_s": 1e6}, "trigger.decay_per_s = 1000000.0: should be less"),
-        (RULE, "trigger.period_s = 0.003: must be a whole number of the 0.002 s"),
-        (nested(RULE), "trigger.rule.rule.period_s = 0.003: must be a whole number"),
-        (
-            nested({"policy": "absolute", "delta": 1.0, "weight": [[1.0, 1.0], [1.0, 1.0]]}),
-            "trigger.rule.rule.weight = [[1.0, 1.0], [1.0, 1.0]]: W must be invertible",
-        ),
-    ],
-)
-def test_a_mistake_names_its_key(
-    content: dict[str, Any], trigger: dict[str, Any], expected: str
-) -> None:
-    with pytest.raises(CallerError) as found:
-        validate(content | {"trigger": trigger}, "here")
-    assert str(found.value).startswith(f"here: {expected}")
-    assert "\n" not in str(found.value)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -52,11 +52,11 @@ def test_of_few_loops_each_is_recorded_in_the_time_of_the_run(tmp_path: Path) ->
     largest = np.nanmax(over_time.errors, axis=1)
     np.testing.assert_allclose(10 ** np.nanmax(errors, axis=0), largest, rtol=1e-9)
     for loop, record in zip(loops, run.loops, strict=True):
-        folder = bp.loop_path(loop.name)
+        folder = bp.loop_folder(loop.name)
         aligned = align_tables(record)
-        t_ns, states = series(found, f"{folder}/{bp.state_path('angle')}")
+        t_ns, states = series(found, f"{folder}{bp.state_path('angle')}")
         np.testing.assert_array_equal(states[:, 0], aligned.x[:, 0])
-        assert any(one.startswith(f"{folder}/picture/") for one in found)
+        assert any(one.startswith(f"{folder}picture/") for one in found)
         assert np.ptp(t_ns - aligned.t_ns) == 0
     origins = of_views(read(tmp_path / RECORDING_FILE, "blueprint"), "ViewBlueprint:space_origin")
     assert {f"loops/p-{i}/picture" for i in (1, 2, 3)} < {one.strip("/") for one in origins}

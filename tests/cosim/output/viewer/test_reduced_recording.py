@@ -95,5 +95,5 @@ def test_no_recording_is_written_on_a_full_disk(
         "cosim.output.viewer.run_recording.disk_usage", lambda _: Mock(free=1 << 20)
     )
     with pytest.raises(ViewError, match="No space left"):
-        write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE, 1)
+        write_loop_view(simulate(scenario), tmp_path / RECORDING_FILE)
     assert not [*tmp_path.iterdir()]

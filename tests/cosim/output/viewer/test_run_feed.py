@@ -13,15 +13,14 @@ from cosim.analysis.network_summary import (
     times_inside,
 )
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.run_feed import NetworkFeed
+from cosim.output.viewer.run_feed import RunFeed
 from cosim.output.viewer.run_recording import (
     ERROR,
     MAP,
     QUEUE,
     SHARE,
     SIZE,
-    NetworkRecording,
-    open_view,
+    open_recording,
 )
 from cosim.record.align import align_tables
 from cosim.record.run_directory import RECORDING_FILE
@@ -47,9 +46,8 @@ def shown(folder: Path, count: int, *settings: str) -> tuple[RecordedRun, Chunks
     given = ["horizon_s=2.0", f'loops=[{{ name = "p", count = {count} }}]', *settings]
     run = simulate_loops(load(find_shipped("shared_bottleneck", "scenarios"), given))
     scenario, said = run.network.scenario, list[str]()
-    with open_view(scenario, folder, 9, None) as view:
-        assert isinstance(view, NetworkRecording)
-        feed = NetworkFeed(scenario, view, said.append)
+    with open_recording(scenario, folder, 9, None) as view:
+        feed = RunFeed(scenario, view, said.append)
         for table, rows in live_rows(run):
             feed.add(table, rows)
             feed.advance()
@@ -90,13 +88,13 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
 def test_few_loops_are_shown_in_detail(tmp_path: Path) -> None:
     run, found, _ = shown(tmp_path, 3)
     for record in run.loops:
-        folder = bp.loop_path(record.scenario.name)
+        folder = bp.loop_folder(record.scenario.name)
         aligned = align_tables(record)
-        t_ns, states = series(found, f"{folder}/{bp.state_path('angle')}")
+        t_ns, states = series(found, f"{folder}{bp.state_path('angle')}")
         assert np.ptp(t_ns - aligned.t_ns) == 0
         np.testing.assert_array_equal(states[:, 2], aligned.x_c[:, 0])
-        assert any(one.startswith(f"{folder}/picture/") for one in found)
-    assert f"{bp.loop_path('p-2')}/log" in found
+        assert any(one.startswith(f"{folder}picture/") for one in found)
+    assert f"{bp.loop_folder('p-2')}log" in found
 
 
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
@@ -110,4 +108,4 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     assert "in detail end here" in said[-1]
     assert len(series(found, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
-        series(found, f"{bp.loop_path('p-1')}/{bp.state_path('angle')}")
+        series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")

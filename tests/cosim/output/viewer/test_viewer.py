@@ -20,28 +20,28 @@ import rerun.chunk
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
+from cosim.output.viewer.blueprint import ShownLoop, over_time
 from cosim.output.viewer.live_viewer import (
     RECORDING,
     LiveView,
     RecordingServer,
-    has_display,
     view_recording,
 )
-from cosim.output.viewer.network_diagram import NetworkDiagram
-from cosim.output.viewer.pictures.lane_picture import LanePicture
-from cosim.output.viewer.pictures.picture import TIMELINE, Frames, Picture
-from cosim.output.viewer.recording import APPLICATION_ID, RunView, ViewError
+from cosim.output.viewer.pictures.picture import TIMELINE, Frames
+from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
+from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
+from cosim.shipped_files import find_shipped
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import Fate
 from tests.cosim.output.test_approved import compare
 from tests.integration.conftest import wait_for
 
-ROOT = Path(__file__).parents[4]
 Floats = NDArray[np.float64]
 
-STATES, INPUTS = ["V", "r", "psi", "Y_g"], ["u_1", "u_2"]
-PROCESSES = ["plant", "sensor", "netem", "controller"]
+STATES = ["V", "r", "psi", "Y_g"]
 STEP_NS = 2_000_000
 S = 1_000_000_000
 K = 100
@@ -51,44 +51,25 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def new_view(
-    path: Path,
-    states: list[str] | None = None,
-    live: LiveView | None = None,
-    *,
-    indexed: bool = True,
-    picture: Picture | None = None,
-    diagram: NetworkDiagram | None = None,
-) -> RunView:
-    return RunView(
-        path,
-        run_id="run-1",
-        title="a run",
-        about="# About\nα = 0.25",
-        state_names=states or STATES,
-        input_names=INPUTS,
-        processes=PROCESSES,
-        horizon_s=20.0,
-        picture=picture,
-        diagram=diagram,
-        live=live,
-        indexed=indexed,
-    )
+def new_view(path: Path, live: LiveView | None = None, horizon_s: float = 20.0) -> RunRecording:
+    given = load(find_shipped("lane_following", "scenarios"), [f"horizon_s={horizon_s}"])
+    scenario = resolve(given)
+    return RunRecording(scenario, path, 1, {0: scenario}, live=live)
 
 
 def times(first: int, k: int = K) -> NDArray[np.int64]:
     return (first + np.arange(k)) * STEP_NS
 
 
-def add_samples(view: RunView, batches: int, n: int = 4, first: int = 0) -> None:
+def add_samples(view: RunRecording, batches: int, n: int = 4) -> None:
     """Samples with values that encode their series, coordinate and step."""
-    for batch in range(first, first + batches):
+    for batch in range(batches):
         t_ns = times(batch * K)
         norm = t_ns.astype(np.float64) * 1e-9
         x: Floats = norm[:, None] + np.arange(n)
         bounds = np.stack([norm + 3, norm + 4], axis=1)
         found = aligned(t_ns, (x, x + 100, x + 200), (norm, norm + 1, norm + 2))
-        view.samples(found, bounds, bounds + 2)
+        view.views[0].samples(found, bounds, bounds + 2)
 
 
 def aligned(
@@ -116,14 +97,6 @@ def read(path: Path, kind: str = "recording") -> Chunks:
 
 def column(chunks: list[Any], name: str) -> list[Any]:
     return [value for c in chunks for value in c.to_record_batch().column(name).to_pylist()]
-
-
-def static(chunks: Chunks, entity: str, name: str) -> list[Any]:
-    ((value,),) = [
-        column([c], name) for c in chunks[entity]
-        if c.is_static and name in c.to_record_batch().schema.names
-    ]  # fmt: skip
-    return list(value)
 
 
 def of_views(layout: Chunks, name: str) -> list[str]:
@@ -202,12 +175,13 @@ def live() -> Iterator[LiveView]:
     view.close()
 
 
-@pytest.mark.parametrize("indexed", [True, False])
-def test_the_file_contains_every_sample_exactly(tmp_path: Path, indexed: bool) -> None:
+@pytest.mark.parametrize("horizon_s", [20.0, 200.0])
+def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float) -> None:
+    """Short recordings have an index, long ones none."""
     path = tmp_path / "recording.rrd"
-    with new_view(path, indexed=indexed) as view:
+    with new_view(path, horizon_s=horizon_s) as view:
         add_samples(view, 5)
-        view.inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+        view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
     chunks = read(path)
     for i, name in enumerate(STATES):
         t_ns, values = series(chunks, f"state/{name}")
@@ -238,8 +212,7 @@ def test_the_recording_shows_what_was_approved(path: Path) -> None:
     """Names, colours and texts of what is drawn, and the panels of the layout."""
     reader = rerun.chunk.RrdReader(path)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
-    assert (recording.application_id, recording.recording_id) == (APPLICATION_ID, "run-1")
-    assert layout.application_id == APPLICATION_ID
+    assert recording.application_id == layout.application_id == APPLICATION_ID
     shown = [
         f"{entity} {name}: {value}"
         for entity, chunks in sorted(read(path).items())
@@ -252,19 +225,6 @@ def test_the_recording_shows_what_was_approved(path: Path) -> None:
     compare("recording.txt", "\n".join(shown))
 
 
-def test_plots_have_no_legends(path: Path) -> None:
-    """A panel explains the colours."""
-    layout = read(path, "blueprint")
-    legends = [
-        visible
-        for entity, chunks in layout.items() if entity.endswith("/PlotLegend")
-        for visible in column(chunks, "PlotLegend:visible")
-    ]  # fmt: skip
-    plots = of_views(layout, "ViewBlueprint:class_identifier").count("TimeSeries")
-    # All except the hidden view with the shared properties of the plots.
-    assert legends == [[False]] * (plots - 1)
-
-
 def test_the_plots_show_the_whole_run_with_a_margin(path: Path) -> None:
     shared = read(path, "blueprint")["view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"]
     ((whole,),) = column(shared, "TimeAxis:view_range")
@@ -272,22 +232,17 @@ def test_the_plots_show_the_whole_run_with_a_margin(path: Path) -> None:
     assert 1.05 * 20 * S < whole["end"] < 1.1 * 20 * S
 
 
-@pytest.mark.parametrize("n", [1, 4, 17])
-def test_every_coordinate_has_a_panel(tmp_path: Path, n: int) -> None:
+@pytest.mark.parametrize("states", [["a"], ["a/b", "a b", "ψ"], [f"x{i}" for i in range(17)]])
+def test_every_coordinate_has_a_panel(tmp_path: Path, states: list[str]) -> None:
+    """Names with special characters give different entities, too."""
     path = tmp_path / "recording.rrd"
-    states = [f"x{i}" for i in range(n)]
-    with new_view(path, states) as view:
-        add_samples(view, 1, n)
+    shown = ShownLoop("", states, ["u"])
+    with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
+        LoopView(file, shown)
+    entities = {entity for entity in read(path) if entity.startswith("state/")}
+    assert len(entities) == len(states)
     origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
-    assert {f"state/{name}" for name in states} <= {o.removeprefix("/") for o in origins}
-    assert all(len(series(read(path), f"state/{name}")[0]) == K for name in states)
-
-
-def test_names_with_special_characters_give_different_entities(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    with new_view(path, ["a/b", "a b", "ψ"]) as view:
-        add_samples(view, 1, 3)
-    assert sum(entity.startswith("state/") for entity in read(path)) == 3
+    assert entities <= {o.removeprefix("/") for o in origins}
 
 
 @pytest.mark.parametrize("threshold", [0.1, 0.0, np.inf, np.nan])
@@ -298,7 +253,7 @@ def test_the_logarithm_of_a_reset_error_stays_in_range(tmp_path: Path, threshold
         x, e = np.zeros((3, 4)), np.array([0.1, 0.0, np.nan])
         none = np.full((3, 2), np.nan)
         found = aligned(times(0, 3), (x, x, x), (e, np.full(3, threshold), e))
-        view.samples(found, none, none)
+        view.views[0].samples(found, none, none)
     assert not np.isinf(series(read(path), "error/norm")[1]).any()
     _, values = series(read(path), "error/log10")
     floor = -4.0 if threshold == 0.1 else -12.0
@@ -310,7 +265,8 @@ def test_events_deliveries_losses_lateness_and_log_are_recorded(tmp_path: Path) 
     """Every event is a mark on a stem; the first has height 0."""
     path = tmp_path / "recording.rrd"
     t_ns = np.array([0, 300, 700], dtype=np.int64)
-    with new_view(path) as view:
+    with new_view(path) as recording:
+        view = recording.views[0]
         view.broadcasts(t_ns[:1], np.array([np.nan]))
         view.broadcasts(t_ns[1:], np.array([0.3, 0.4]))
         view.receptions(t_ns, np.array([np.nan, 0.3, 0.4]), np.array([False, True, False]))
@@ -436,17 +392,6 @@ def test_a_stalled_viewer_does_not_delay_the_recorder(tmp_path: Path, live: Live
     assert rows_of(path) == 500 * K
 
 
-def test_a_dead_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
-    path = tmp_path / "recording.rrd"
-    view = new_view(path, live=live)
-    assert live.pid is not None
-    os.killpg(live.pid, signal.SIGKILL)
-    add_samples(view, 5)
-    view.close()
-    live.close()
-    assert rows_of(path) == 5 * K
-
-
 def test_a_viewer_that_does_not_start_is_reported_and_the_run_is_recorded(
     tmp_path: Path, live: LiveView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -528,18 +473,6 @@ def test_a_browser_is_served_if_no_window_opens(
     live.close()
 
 
-@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="there is always a display")
-@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY", None])
-def test_a_display_is_detected_from_the_environment(
-    monkeypatch: pytest.MonkeyPatch, variable: str | None
-) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    if variable is not None:
-        monkeypatch.setenv(variable, ":0")
-    assert has_display() is (variable is not None)
-
-
 def test_other_host_names_and_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2 and more")
@@ -585,45 +518,23 @@ def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
         page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
         assert get(page)[0] == 200
         assert get(page + RECORDING) == (200, path.read_bytes())
+        processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
+        listening = [
+            one.laddr.ip
+            for process in processes
+            for one in process.net_connections("inet")
+            if one.status == psutil.CONN_LISTEN
+        ]
+        assert listening == ["127.0.0.1"] * 2  # the page with the recording, and rerun's own files
         child.send_signal(sent)
         assert child.wait() == status
         wait_for(lambda: not is_left(child.pid))
 
 
-def test_a_browser_is_served_with_a_display_if_no_window_is_wanted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On loopback only."""
-    pretend_window(tmp_path, monkeypatch, opens=True)
-    monkeypatch.setenv("DISPLAY", ":0")
-    path = tmp_path / "recording.rrd"
-    new_view(path).close()
-    with subprocess.Popen(
-        [sys.executable, "-m", "cosim.cli", "view", str(path), "--web"],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
-    ) as child:  # fmt: skip
-        try:
-            assert child.stdout is not None
-            page = next(word for word in child.stdout.readline().split() if "http" in word)
-            assert get(page + RECORDING) == (200, path.read_bytes())
-            processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
-            listening = [
-                address.laddr.ip
-                for process in processes
-                for address in process.net_connections("inet")
-                if address.status == psutil.CONN_LISTEN
-            ]
-            assert len(listening) == 2  # the page with the recording, and rerun's own files
-            assert set(listening) == {"127.0.0.1"}
-        finally:
-            child.send_signal(signal.SIGTERM)
-            assert child.wait() == ExitStatus.TERMINATED
-
-
 def test_a_picture_has_a_maximum_frame_rate_across_batches(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
-    picture = LanePicture(3, 2, forward_mps=-12.0)
-    with new_view(path, picture=picture, diagram=NetworkDiagram()) as view:
+    with new_view(path) as recording:
+        view = recording.views[0]
         for first in range(0, 1000, 37):
             t_ns = times(first, min(37, 1000 - first))
             x = np.tile(t_ns[:, None] * 1e-9, (1, 4))
@@ -636,8 +547,5 @@ def test_a_picture_has_a_maximum_frame_rate_across_batches(tmp_path: Path) -> No
     assert len(places) == 2 * 60  # of 2 s, out of 1000 samples
     # the lateral offset grows; +y points down in the viewer
     assert (np.diff(places[:, 1]) < 0).all()
-    assert static(chunks, "picture/plant/body", "LineStrips2D:colors")
     shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
     assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
-    origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
-    assert {"picture", "network", "log", "about"} <= {o.removeprefix("/") for o in origins}

@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.studies.campaign.campaign_claims import JudgedClaim, judge_claims, share_text
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_report import claims_table
-from cosim.studies.campaign.campaign_summary import summarise
+from cosim.studies.campaign.campaign_summary import JudgedClaim, judge_claims, share_text, summarise
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import Metric
 from noack.core.errors import CallerError

@@ -279,7 +279,7 @@ def test_a_repetition_that_is_terminated_leaves_no_folder(archive: Path, tmp_pat
     """The signal comes while the run is repeated."""
     code = (
         "import os, signal, sys, tempfile; tempfile.tempdir = sys.argv[2];"
-        "from cosim.studies import run_repetition as module;"
+        "from cosim.studies import run_archive as module;"
         "module.simulate_run = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM);"
         "from cosim.cli import app; app(['reproduce', sys.argv[1]])"
     )

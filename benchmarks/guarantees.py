@@ -1,0 +1,249 @@
+"""What is guaranteed: losses over very many decisions, certificates beside the worst losses."""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import Goal, Row, benchmark, compared, say
+from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
+from cosim.cli import find_scenario
+from netem.link_state import LinkState
+from netem.tc_words import settings_of
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load, validate
+from noack.core.linear_systems import Matrix
+from noack.impairments.loss_prediction import expected_loss
+from noack.theory.certificates.scenario_certificates import certify
+from noack.theory.certificates.weight import choose_weight
+from tests.oracles.receiver import Limits, Outcomes, longest_burst, outcomes_of, violations
+
+DECISIONS = 100_000_000
+_BATCH = 1_000_000
+REORDERING = "delay 5ms 5ms reorder 20% duplicate 5% corrupt 5%"
+COMBINATIONS: Mapping[str, Limits] = {
+    "mansd 4": Limits(((4, 5),)),
+    "atmost 3 in 10": Limits(((3, 10),)),
+    "atmost 20 in 100": Limits(((20, 100),)),
+    "mansd 4 recover 3": Limits(((4, 5),), 3),
+    "mansd 2 atmost 3 in 10 recover 2": Limits(((2, 3), (3, 10)), 2),
+}
+EXPECTED = ("loss 50% mansd 4", "loss 30% keep mansd 2", "loss 20% keep atmost 3 in 10 recover 2",
+            "loss 20% 50% keep mansd 3 atmost 3 in 10 corrupt 5%")  # fmt: skip
+COST_ROUNDS = 30
+_COSTED = 200_000
+CAP = 3
+_LOSS, _DELAY = "loss 30%", "delay 10ms 10ms distribution normal reorder 10% limit 1000000"
+_SPACING_NS = 2_000_000
+
+
+class Decider:
+    """Decides for a flow after the other, with this time between two datagrams."""
+
+    def __init__(self, words: str, spacing_ns: int = 10_000) -> None:
+        self._link, self._flow = LinkState(settings_of(words), 7, "relay", "forward"), 0
+        columns = np.zeros(_BATCH, np.int64), np.full(_BATCH, 72), np.arange(_BATCH) * spacing_ns
+        self._columns = columns
+
+    def decide(self, count: int = _BATCH) -> NDArray[Any]:
+        """Return the decisions for the first datagrams of the next flow."""
+        self._link.start_flow(0, self._flow)
+        self._link.core.in_flight = 0
+        self._flow += 1
+        return self._link.decide_many(*(column[:count] for column in self._columns))
+
+    def outcomes(self, count: int) -> list[Outcomes]:
+        """Return which datagrams are lost, of several flows."""
+        return [outcomes_of(self.decide()) for _ in range(count // _BATCH)]
+
+    def cost(self) -> Callable[[], float]:
+        """Return what measures nanoseconds per decision."""
+
+        def measured() -> float:
+            begun_ns = time.perf_counter_ns()
+            self.decide(_COSTED)
+            return (time.perf_counter_ns() - begun_ns) / _COSTED
+
+        measured()
+        return measured
+
+
+def check_row(words: str, limits: Limits, count: int) -> Row:
+    """Return the violations in a number of decisions."""
+    say(f"{count:,} decisions, {words}")
+    flows = Decider(f"{words} limit 1000000").outcomes(count)
+    note = f"{count:,} decisions, {np.mean(flows):.2%} lost"
+    found = sum(violations(lost, limits) for lost in flows)
+    return Row(f"{words}: violations", found, "", goal=Goal("==", 0), note=note)
+
+
+def expected_row(words: str, count: int) -> Row:
+    """Return the realised loss rate beside the expected one, which may be asked for (keep)."""
+    say(f"{count:,} decisions, {words}")
+    share = float(np.mean(Decider(words).outcomes(count)))
+    expected = expected_loss(settings_of(words)).rate or 0.0
+    note = f"{count:,} decisions: {share:.4%} lost, {expected:.4%} expected"
+    error = 100 * abs(share - expected)
+    return Row(f"{words}: error", error, "% of all", goal=Goal("<=", 0.1), note=note)
+
+
+def network_rows() -> Iterator[Row]:
+    """Yield the losses at the receiver of three networks with the same random numbers."""
+    held = f"mansd {CAP}"
+    drops = Decider(f"{_LOSS} {held}", _SPACING_NS).decide()["release_ns"] < 0
+    capped = Decider(_DELAY, _SPACING_NS).decide().copy()
+    capped["release_ns"][drops] = -1
+    networks = {
+        "no cap": Decider(f"{_LOSS} {_DELAY}", _SPACING_NS).decide().copy(),
+        f"cap {CAP} on drops only": capped,
+        held: Decider(f"{_LOSS} {_DELAY} {held}", _SPACING_NS).decide(),
+    }
+    for name, decisions in networks.items():
+        lost, dropped = outcomes_of(decisions), decisions["release_ns"] < 0
+        goal = Goal("<=", CAP) if name == held else None
+        yield Row(f"{name}: dropped", 100 * float(dropped.mean()), "%")
+        yield Row(f"{name}: dropped or out of order", 100 * float(lost.mean()), "%")
+        yield Row(f"{name}: longest loss burst", longest_burst(lost), "", goal=goal)
+    back_ns = networks[held]["hold_back_ns"]
+    back_ns = back_ns[back_ns > 0]
+    yield Row(f"{held}: held back", 100 * len(back_ns) / _BATCH, "%")
+    yield Row(f"{held}: held back by, median", float(np.median(back_ns)) / 1e6, "ms")
+
+
+@benchmark("guarantee", "Emulator: the guarantee over many decisions")
+def guarantee(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure costs and networks, then violations, then loss rates, over very many decisions.
+
+    Each combination is decided by the core, a million datagrams per flow. A check that uses nothing
+    of netem counts violations at the receiver: outcomes come from the times at which intact
+    datagrams leave. Costs alternate with those of the plain cap that allows as many consecutive
+    losses.
+
+    A reordering network is compared without a cap, with a cap on drops only, and with the
+    guarantee. A cap on drops only forces a datagram after m drops, and leaves the delays as they
+    are, as the loss models of quic-network-simulator and Rattan do. A datagram counts as lost if it
+    is dropped, or if a later one arrives before it.
+    """
+    for before in ("loss 50%", f"loss 50% {REORDERING}"):
+        for words in COMBINATIONS:
+            cap = f"mansd {settings_of(words).longest_burst}"
+            if words != cap:
+                ours, plain = (
+                    Decider(f"{before} {one} limit 1000000").cost() for one in (words, cap)
+                )
+                yield compared(f"{before} {words}: decision", "ns", ours,
+                               (f"{before} {cap}", plain), Goal("<=", 1.3),
+                               rounds=COST_ROUNDS)  # fmt: skip
+    yield from network_rows()
+    for words, limits in COMBINATIONS.items():
+        for before in ("loss 50%", f"loss 30% {REORDERING}"):
+            yield check_row(f"{before} {words}", limits, DECISIONS)
+    for words in EXPECTED:
+        yield expected_row(words, DECISIONS // 5)
+
+
+LOOPS = ("lane_following", "double_integrator", "unstable_pendulum", "f16_lateral")
+NODES, BEAM = 200_000, 64
+_SIGMA, _PERIOD_S, _DEADLINE_S = 0.005, 0.01, 0.02
+_ROUNDING = 1 + 1e-9
+QUANTITIES = {
+    Objective.ERROR: "e_c",
+    Objective.STATE: "x",
+    Objective.INTER_EVENT: "inter-event time",
+}
+
+
+def triggers(paper: Mapping[str, Any], weight: Matrix) -> dict[str, dict[str, Any]]:
+    """Return the settings of every policy by name; constant thresholds are a fifth of β."""
+    W, delta = {"weight": weight.tolist()}, 0.2 * paper["beta"]
+    square = weight.T @ weight
+    nothing = np.zeros_like(square)
+    Q = np.block([[-(_SIGMA**2) * square, nothing], [nothing, square]])
+    absolute = {"policy": "absolute", "delta": delta} | W
+    deadline = {"policy": "deadline", "interval_s": _DEADLINE_S}
+    dynamic = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.1, "decay_per_s": 1.0}
+    found: list[dict[str, Any]] = [
+        {"policy": "decaying"} | paper | W,
+        absolute,
+        {"policy": "relative", "sigma": _SIGMA} | W,
+        {"policy": "mixed", "sigma": _SIGMA, "epsilon": delta} | W,
+        {"policy": "quadratic", "Q": Q.tolist(), "epsilon": delta**2, "period_s": _PERIOD_S} | W,
+        {"policy": "send_on_area", "delta_s": delta * _PERIOD_S} | W,
+        {"policy": "periodic", "period_s": _PERIOD_S} | W,
+        {"policy": "self_triggered", "growth_per_s": 1.0, "mismatch_per_s": 1.0,
+         "shortest_s": _PERIOD_S, "longest_s": _DEADLINE_S} | paper | W,
+        deadline | {"rule": absolute},
+        {"policy": "dwell", "interval_s": _PERIOD_S, "rule": absolute},
+        deadline | {"rule": {"policy": "lyapunov", "rate_per_s": 0.2} | W},
+        deadline | {"rule": dynamic | W},
+    ]  # fmt: skip
+    return {
+        one["policy"] + (f"({one['rule']['policy']})" if "rule" in one else ""): one
+        for one in found
+    }
+
+
+def loop_named(name: str, horizon_s: float, norm: str) -> Scenario:
+    """Return a shipped scenario with the paper's trigger in a norm."""
+    resolved = resolve(load(find_scenario(name), [f"horizon_s={horizon_s}"]))
+    paper, loop = resolved.decaying, loop_of(resolved)
+    weight = np.eye(loop.n)
+    if norm == "chosen":
+        conditions = conditions_of(resolved, continuous=False)
+        weight = choose_weight(loop, paper.beta, paper.alpha_per_s, conditions)
+    rows = tuple(map(tuple, weight.tolist()))
+    return resolved.model_copy(update={"trigger": paper.model_copy(update={"weight": rows})})
+
+
+def tightness_rows(loop: Scenario, policy: str, trigger: Mapping[str, Any]) -> Iterator[Row]:
+    """Search one loop under one policy."""
+    name = f"{loop.name}, {policy}"
+    say(name)
+    content = loop.model_dump(mode="json", exclude_none=True) | {"trigger": trigger}
+    resolved = resolve(validate(content, name))
+    certificate = certify(resolved, conditions_of(resolved, continuous=False))
+    if certificate.void is not None:
+        yield Row(name, None, "", note=f"no certificate: {certificate.void}")
+        return
+    search = partial(find_worst, resolved, most_nodes=NODES, beam=BEAM, certificate=certificate)
+    yield from (row_of(name, search(objective)) for objective in QUANTITIES)
+
+
+def row_of(name: str, worst: Worst) -> Row:
+    """Return the share of a bound that the worst run uses; more than 1 refutes the bound."""
+    searched = f"all {worst.runs}" if worst.exact else f"some, {worst.runs} runs"
+    return Row(
+        f"{name}: {QUANTITIES[worst.objective]}",
+        worst.tightness,
+        "of the bound",
+        goal=Goal("<=", _ROUNDING),
+        note=f"worst {worst.value}, certified {worst.certified}; patterns searched: {searched}",
+    )
+
+
+@benchmark(
+    "tightness", "The adversary against the certificates",
+    {"--loop": {"action": "append", "choices": LOOPS, "help": "tightness: only this loop"},
+     "--policy": {"action": "append", "help": "tightness: only this policy"},
+     "--search-s": {"type": float, "default": 5.0, "help": "tightness: horizon in s"},
+     "--norm": {"choices": ("chosen", "identity"), "default": "chosen",
+                "help": "tightness: the norm"}},
+)  # fmt: skip
+def tightness(options: argparse.Namespace) -> Iterator[Row]:
+    """Search the largest share of each certificate's bounds that the worst losses use, by policy.
+
+    The loops are the shipped linear ones, as their processes run them, with the schedule's
+    certificate, in the norm that ``noack certify --weight chosen`` finds for the paper's trigger.
+    """
+    for name in options.loop or LOOPS:
+        say(f"{name}: the norm")
+        loop = loop_named(name, options.search_s, options.norm)
+        paper = loop.decaying.model_dump(include={"beta", "alpha_per_s", "floor"})
+        for policy, trigger in triggers(paper, np.array(loop.decaying.weight)).items():
+            if policy in (options.policy or (policy,)):
+                yield from tightness_rows(loop, policy, trigger)

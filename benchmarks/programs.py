@@ -1,0 +1,311 @@
+"""Programs that benchmarks start: noack as a user starts it, C programs; on cores, on two hosts.
+
+Runs are observed from outside, by their output and by samples of their processes.
+"""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import psutil
+
+from benchmarks.report import MeasurementError
+from noack.protocol.topology import ROLES
+
+PACKAGES: Mapping[str, str] = {"cc": "gcc libc6-dev", "cyclictest": "rt-tests", "socat": "socat"}
+"""Debian packages by program."""
+PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
+"""A progress line of a run; the group is the time in the run, s."""
+_ROUNDING_S = 0.05
+"""Rounding error of a progress line, which shows tenths of a second."""
+PLAIN_TERMINAL = {"FORCE_COLOR": "1", "TERM": "dumb"}
+"""Makes noack treat a pipe as a simple terminal; other pipes receive no progress lines."""
+FREE_PORTS = ("--set", "ports={}")
+"""A benchmark can run at the same time as a demo, whose ports are fixed."""
+NOACK = (sys.executable, "-m", "cosim.cli")
+LAUNCHER = "launcher"
+
+
+def provide(packages: Mapping[str, str] = PACKAGES) -> list[str]:
+    """Install missing programs, where root has apt-get; return those that are still missing.
+
+    The rows of a missing program have no value: standard error names the packages first.
+    """
+    missing = [program for program in packages if shutil.which(program) is None]
+    wanted = [word for program in missing for word in packages[program].split()]
+    if wanted and shutil.which("apt-get") and os.geteuid() == 0:
+        print(f"installing {', '.join(wanted)} ...", file=sys.stderr)
+        install = ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *wanted]
+        for command in (["apt-get", "update", "-qq"], install):
+            subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+        missing = [program for program in missing if shutil.which(program) is None]
+    if missing:
+        names = " ".join(packages[program] for program in missing)
+        print(
+            f"not installed: {', '.join(missing)}; without them some goals are not measured "
+            f"(Debian: sudo apt-get install {names})",
+            file=sys.stderr,
+        )
+    return missing
+
+
+def compiled(source: str, into: Path, *options: str) -> Path:
+    """Compile a C file of this folder into another folder; return the path.
+
+    Raises:
+        MeasurementError: there is no C compiler, or it fails.
+    """
+    target = into / Path(source).stem
+    if shutil.which("cc") is None:
+        raise MeasurementError(f"{source} is written in C and cc is not installed")
+    command = ["cc", "-O2", *options, "-o", str(target), str(Path(__file__).with_name(source))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise MeasurementError(f"cc {source}: {done.stderr.strip()[:200]}")
+    return target
+
+
+class Line(NamedTuple):
+    """A line of a program's standard error, and the time at which it was read."""
+
+    at_s: float
+    text: str
+
+
+class Finished(NamedTuple):
+    """A program that has ended with exit status 0."""
+
+    begun_s: float
+    lines: list[Line]
+    stdout: str
+
+
+def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
+    """Run a program to its end, recording the time of each line of its standard error.
+
+    Raises:
+        MeasurementError: it failed.
+    """
+    with tempfile.TemporaryFile("w+") as stdout:
+        begun_s = time.monotonic()
+        with subprocess.Popen(
+            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
+            text=True, env=os.environ | PLAIN_TERMINAL,
+        ) as process:  # fmt: skip
+            assert process.stderr is not None
+            lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
+        stdout.seek(0)
+        if process.returncode != 0:
+            messages = [line.text for line in lines if not PROGRESS.match(line.text)]
+            last = messages[-1] if messages else "no message"
+            raise MeasurementError(f"{command[0]} ended with {process.returncode}: {last}")
+        return Finished(begun_s, lines, stdout.read())
+
+
+def imported_s(modules: str) -> float:
+    """Return wall seconds from the start of a Python to the end of its imports."""
+    code = f"import {modules}, sys; print('ready', file=sys.stderr)"
+    finished = execute([sys.executable, "-c", code])
+    return finished.lines[-1].at_s - finished.begun_s
+
+
+class NoackRun(NamedTuple):
+    """A completed run of noack."""
+
+    summary: dict[str, Any]
+    first_step_s: float | None
+    """Wall time from process start to the first control step (:func:`first_step_s`)."""
+
+
+def noack(*arguments: str) -> NoackRun:
+    """Run ``noack ARGUMENTS`` to its end and return its own measurements.
+
+    Raises:
+        MeasurementError: it failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
+        finished = execute([*NOACK, *arguments, *FREE_PORTS, "--runs", runs, "--json"])
+    return NoackRun(json.loads(finished.stdout), first_step_s(finished.begun_s, finished.lines))
+
+
+def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
+    """Return an upper bound of the time from ``begun_s`` to the first control step at speed 1.
+
+    A progress line that shows simulated time t and is read at time s proves that the run's epoch
+    was at s − t or before, up to the line's rounding: s − t is the epoch plus the line's delay,
+    some hundredths of a second. The minimum over all lines is the best bound. The first control
+    step is half a control period (1 ms) after the epoch, far less than the bound's slack. None if
+    there was no progress line.
+    """
+    bounds_s = [
+        line.at_s - (float(found[1]) - _ROUNDING_S) - begun_s
+        for line in lines
+        if (found := PROGRESS.match(line.text)) is not None
+    ]
+    return min(bounds_s, default=None)
+
+
+class Sample(NamedTuple):
+    """The system's data about a process."""
+
+    rss_kib: float
+    pss_kib: float
+    uss_kib: float
+    """Private memory, which is judged; shared memory is no leak of this process."""
+    fds: int
+    sockets: int
+    threads: int
+    cpu_s: float
+
+    @classmethod
+    def of(cls, process: psutil.Process) -> "Sample":
+        """Sample a process."""
+        with process.oneshot():
+            memory, cpu = process.memory_full_info(), process.cpu_times()
+            kib = (memory.rss, getattr(memory, "pss", memory.uss), memory.uss)
+            sockets = len(process.net_connections("all"))
+            return cls(*(one / 1024 for one in kib), process.num_fds(), sockets,
+                       process.num_threads(), cpu.user + cpu.system)  # fmt: skip
+
+
+class Processes:
+    """The launcher of a run, by its process id, and the run's processes."""
+
+    def __init__(self, launcher: int) -> None:
+        self._known = {LAUNCHER: psutil.Process(launcher)}
+
+    def sample(self) -> dict[str, Sample]:
+        """Sample every process that is alive."""
+        if len(self._known) <= len(ROLES):
+            with contextlib.suppress(psutil.Error):
+                self._known = processes_of(self._known[LAUNCHER]) | self._known
+        found = {}
+        for role, process in self._known.items():
+            with contextlib.suppress(psutil.Error):
+                found[role] = Sample.of(process)
+        return found
+
+    def left_behind(self, patience_s: float) -> list[str]:
+        """Return the roles of processes that are alive although the run is over."""
+        _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)
+        return sorted(role for role, process in self._known.items() if process in alive)
+
+    def kill(self) -> None:
+        """Kill all processes, the launcher last."""
+        for process in reversed(self._known.values()):
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+
+def processes_of(launcher: psutil.Process) -> dict[str, psutil.Process]:
+    """Return the processes of a run by role."""
+    children = launcher.children()
+    return {role: child for child in children for role in ROLES if is_of(role, child)}
+
+
+def is_of(role: str, process: psutil.Process) -> bool:
+    """Whether a process has a role in a run, by its title; not if it has ended."""
+    try:
+        return process.cmdline()[:1] == [f"noack {role}"]
+    except psutil.NoSuchProcess:
+        return False
+
+
+def udp_port(process: psutil.Process) -> int:
+    """Return the port of a process in the loop."""
+    (port,) = {one.laddr.port for one in process.net_connections("udp4") if not one.raddr}
+    return int(port)
+
+
+_CORES = sorted(os.sched_getaffinity(0))
+RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
+BEFORE_OTHERS = 1
+"""The lowest SCHED_FIFO priority. If permitted, the load and all relays have it, so that other
+programs of the machine do not affect their comparison."""
+
+
+@contextmanager
+def on_core(core: int) -> Iterator[None]:
+    """Pin the calling thread, and processes that it starts within the context, to one core."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@contextmanager
+def scheduled(priority: int) -> Iterator[bool]:
+    """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
+
+    Yields:
+        Whether it was permitted.
+    """
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        os.sched_setscheduler(0, policy, parameters)
+
+
+class TwoHosts(NamedTuple):
+    """Two network namespaces that a veth link connects: their names, addresses IPv4 and IPv6."""
+
+    names: tuple[str, str]
+    addresses: tuple[tuple[str, str], tuple[str, str]]
+
+    def inside(self, host: int, *command: str, monotonic_s: int = 0) -> list[str]:
+        """Return a command that runs on a host, whose monotonic clock is ahead by some seconds."""
+        clock = ["unshare", "--time", f"--monotonic={monotonic_s}", "--fork", "--kill-child"]
+        return ["ip", "netns", "exec", self.names[host], *(clock if monotonic_s else ()), *command]
+
+
+def _run(command: Sequence[str]) -> None:
+    try:
+        subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    except subprocess.CalledProcessError as error:
+        raise MeasurementError(f"{' '.join(command)}: {error.stderr.strip()}") from None
+
+
+@contextmanager
+def two_hosts() -> Iterator[TwoHosts]:
+    """Make the namespaces, and delete them at the end.
+
+    Raises:
+        MeasurementError: the system does not permit it.
+    """
+    if shutil.which("ip") is None or shutil.which("unshare") is None:
+        raise MeasurementError("ip (iproute2) and unshare (util-linux) are not installed")
+    names = (f"noack-{os.getpid()}-reference", f"noack-{os.getpid()}-client")
+    hosts = TwoHosts(names, (("10.83.3.1", "fd83:3::1"), ("10.83.3.2", "fd83:3::2")))
+    try:
+        for name in names:
+            _run(["ip", "netns", "add", name])
+            _run(["ip", "-n", name, "link", "set", "lo", "up"])
+        _run(["ip", "-n", names[0], "link", "add", "line", "type", "veth", "peer", "line",
+              "netns", names[1]])  # fmt: skip
+        for name, (four, six) in zip(names, hosts.addresses, strict=True):
+            _run(["ip", "-n", name, "address", "add", f"{four}/24", "dev", "line"])
+            _run(["ip", "-n", name, "address", "add", f"{six}/64", "dev", "line", "nodad"])
+            _run(["ip", "-n", name, "link", "set", "line", "up"])
+        _run(hosts.inside(1, "true", monotonic_s=1))
+        yield hosts
+    finally:
+        for name in names:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)

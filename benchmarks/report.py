@@ -1,0 +1,278 @@
+"""Benchmarks as functions that return rows; rounds, rows, tables, and the machine's other load."""
+
+import argparse
+import operator
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+from rich.table import Table
+
+BUSY_SHARE, STEAL_SHARE = 0.1, 0.01
+"""Figures are doubtful if other programs, or the hypervisor, used this share of all cores."""
+_COMPARISONS = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operator.eq}
+median = statistics.median
+
+
+class MeasurementError(Exception):
+    """A benchmark could not be measured; the message is the reason, one line."""
+
+
+class Peer(NamedTuple):
+    """The figure of the alternative, measured in the same run."""
+
+    name: str
+    value: float | None
+
+
+class Goal(NamedTuple):
+    """A figure to reach."""
+
+    comparison: str
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.comparison} {self.limit:g}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure."""
+
+    name: str
+    value: float | None
+    """None if it could not be measured."""
+    unit: str
+    peer: Peer | None = None
+    """The alternative, in the same unit."""
+    goal: Goal | None = None
+    """A condition on the ratio to the peer; without a peer, on the value."""
+    note: str | None = None
+    unjudged: str | None = None
+    """Why the goal cannot be judged although there is a figure."""
+    paired_ratio: float | None = None
+    """If both sides were measured in turn, the median of the rounds' ratios; replaces the ratio of
+    the two figures."""
+
+    @property
+    def ratio(self) -> float | None:
+        """Ratio of our value to the peer's."""
+        if self.paired_ratio is not None:
+            return self.paired_ratio
+        if self.value is None or self.peer is None or not self.peer.value:
+            return None
+        return self.value / self.peer.value
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the goal was reached; None if there is none or it cannot be judged."""
+        found = self.value if self.peer is None else self.ratio
+        if self.goal is None or found is None or self.unjudged is not None:
+            return None
+        return bool(_COMPARISONS[self.goal.comparison](found, self.goal.limit))
+
+    @property
+    def notes(self) -> str:
+        """Why it is not judged, and the note."""
+        return "; ".join(filter(None, (self.unjudged, self.note)))
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The row of a table: figure, value, alternative, its value, ratio, goal, verdict."""
+        goal = "" if self.goal is None else str(self.goal)
+        return (
+            self.name, with_unit(self.value, self.unit), self.peer.name if self.peer else "",
+            with_unit(self.peer.value, self.unit) if self.peer else "",
+            "" if self.ratio is None else number_text(self.ratio), goal,
+            {True: "yes", False: "no", None: "?" if goal else ""}[self.holds],
+        )  # fmt: skip
+
+    def as_json(self) -> dict[str, object]:
+        """Return the row as ``--json`` writes it."""
+        row = {
+            "name": self.name, "value": self.value, "unit": self.unit,
+            "peer": self.peer and self.peer._asdict(), "ratio": self.ratio,
+            "goal": self.goal and str(self.goal), "holds": self.holds,
+        }  # fmt: skip
+        return row | ({"note": self.notes} if self.notes else {})
+
+
+Measure = Callable[[argparse.Namespace], Iterable[Row]]
+
+
+class Benchmark(NamedTuple):
+    """A benchmark of the command line: its table's title, its function, its own options."""
+
+    name: str
+    title: str
+    measure: Measure
+    options: Mapping[str, Mapping[str, Any]] = {}
+    """The arguments of ``add_argument`` by the option's name."""
+
+
+BENCHMARKS: dict[str, Benchmark] = {}
+
+
+def benchmark(
+    name: str, title: str, options: Mapping[str, Mapping[str, Any]] | None = None
+) -> Callable[[Measure], Measure]:
+    """Declare a function that measures a benchmark."""
+
+    def declare(measure: Measure) -> Measure:
+        BENCHMARKS[name] = Benchmark(name, title, measure, options or {})
+        return measure
+
+    return declare
+
+
+class Load:
+    """The machine's load by other programs since the object's construction."""
+
+    def __init__(self) -> None:
+        self._before = self._read()
+
+    def rows(self) -> list[Row]:
+        """Return the shares of all cores used by other programs and by the hypervisor."""
+        total_s, busy_s, steal_s, own_s = np.subtract(self._read(), self._before).tolist()
+        rows = []
+        for name, used_s, doubtful in (
+            ("other programs", max(busy_s - own_s, 0.0), BUSY_SHARE),
+            ("steal", steal_s, STEAL_SHARE),
+        ):
+            share = used_s / max(total_s, 1e-9)
+            doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
+            rows.append(Row(f"machine: {name}", 100 * share, "% of all cores", note=doubt))
+        return rows
+
+    @staticmethod
+    def _read() -> tuple[float, ...]:
+        """CPU seconds: of all cores, used, taken by the hypervisor; used by this benchmark."""
+        times = psutil.cpu_times()._asdict()
+        for part in ("guest", "guest_nice"):  # included in the users' time
+            times.pop(part, None)
+        total_s, steal_s = sum(times.values()), times.get("steal", 0.0)
+        busy_s = total_s - steal_s - times["idle"] - times.get("iowait", 0.0)
+        return total_s, busy_s, steal_s, own_cpu_s() + own_cpu_s(children=True)
+
+
+def own_cpu_s(*, children: bool = False) -> float:
+    """Return the CPU time of this process, or of its children that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN if children else resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+Figures = Mapping[str, float]
+"""The figures of one side in one round, by quantity."""
+
+
+class Rounds:
+    """Figures of several sides that are measured in turn, each once per round."""
+
+    def __init__(self) -> None:
+        self.missing: dict[str, str] = {}
+        """For each side without valid figures, the reason."""
+        self._figures: dict[str, list[Figures]] = {}
+
+    def add(self, side: str, figures: Figures | str) -> None:
+        """Add a side's figures of a round, or the reason why there are none."""
+        if isinstance(figures, str):
+            self.missing[side] = figures
+        else:
+            self._figures.setdefault(side, []).append(figures)
+
+    def of(self, side: str, quantity: str) -> list[float]:
+        """Return the rounds of a quantity; empty if the side was not measured."""
+        return [figures[quantity] for figures in self._figures.get(side, ())]
+
+    def row(
+        self, name: str, unit: str, quantity: str, ours: str, peer: str | None = None,
+        goal: Goal | None = None, *, note: str | None = None, paired: bool = False,
+    ) -> Row:  # fmt: skip
+        """Return the row of a quantity: the medians of our side and of the alternative's.
+
+        With ``paired``, the ratio is the median of the rounds' ratios, since a disturbance affects
+        both sides of a round; else it is the ratio of the medians.
+        """
+        sides = [side for side in (ours, peer) if side is not None]
+        reasons = [f"{side}: {self.missing[side]}" for side in sides if side in self.missing]
+        value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
+        ratios = []
+        if paired and not reasons:
+            ratios = [one / other for one, other in zip(value, alternative, strict=True)]
+        return Row(
+            name, median(value) if value else None, unit,
+            None if peer is None else Peer(peer, median(alternative) if alternative else None),
+            goal, note, "; ".join(reasons) or None, median(ratios) if ratios else None,
+        )  # fmt: skip
+
+
+Side = Callable[[], float]
+"""Measures one figure of a side."""
+
+
+def compared(
+    name: str, unit: str, ours: Side, peer: tuple[str, Side] | Peer | None = None,
+    goal: Goal | None = None, *, note: str | None = None, unjudged: str | None = None,
+    rounds: int = 5,
+) -> Row:  # fmt: skip
+    """Measure our side and the alternative in turn; the ratio is the median of the rounds' ratios.
+
+    The alternative may also be a known figure.
+    """
+    say(name)
+    if not isinstance(peer, tuple) or isinstance(peer, Peer):
+        return Row(name, median(ours() for _ in range(rounds)), unit, peer, goal, note, unjudged)
+    found = [(ours(), peer[1]()) for _ in range(rounds)]
+    value, other = (median(side) for side in zip(*found, strict=True))
+    ratio = median(a / b for a, b in found)
+    return Row(name, value, unit, Peer(peer[0], other), goal, note, unjudged, ratio)
+
+
+def cpu_ms(call: Callable[[], object]) -> Side:
+    """Return a side: milliseconds of CPU time of a call, which other load changes little."""
+    return lambda: 1e3 * _cpu_s(call)
+
+
+def per_cpu_s(count: float, call: Callable[[], object]) -> Side:
+    """Return a side: so many per second of CPU time."""
+    return lambda: count / _cpu_s(call)
+
+
+def _cpu_s(call: Callable[[], object]) -> float:
+    begun_s = time.process_time()
+    call()
+    return max(time.process_time() - begun_s, 1e-9)
+
+
+def say(text: str) -> None:
+    """Print what is being measured."""
+    print(f"  {text} ...", file=sys.stderr, flush=True)
+
+
+def table_of(title: str, rows: Sequence[Row]) -> Table:
+    """Return the rows as a table."""
+    table = Table(title=title, title_justify="left")
+    for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
+        right = heading in ("value", "its value", "ratio", "goal")
+        table.add_column(heading, justify="right" if right else "left")
+    colours = {"yes": "[green]yes[/]", "no": "[bold red]no[/]"}
+    for row in rows:
+        *cells, verdict = row.cells
+        table.add_row(*cells, colours.get(verdict, verdict))
+    return table
+
+
+def number_text(value: float) -> str:
+    """Return a figure with four digits."""
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
+
+
+def with_unit(value: float | None, unit: str) -> str:
+    """Return a figure with its unit; a dash for None."""
+    return "-" if value is None else f"{number_text(value)} {unit}".strip()

@@ -1,0 +1,529 @@
+"""Live runs as a user starts them: start, many loops, the demo, the lab page; the installation."""
+
+import argparse
+import itertools
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import psutil
+
+from benchmarks.programs import (
+    FREE_PORTS,
+    NOACK,
+    Processes,
+    execute,
+    imported_s,
+    noack,
+)
+from benchmarks.report import (
+    Figures,
+    Goal,
+    MeasurementError,
+    Peer,
+    Rounds,
+    Row,
+    benchmark,
+    compared,
+    median,
+    own_cpu_s,
+    say,
+)
+from cosim.record.run_directory import LATEST
+from noack.protocol.topology import LOOP_ROLES, WITH_DEADLINES
+from tools.screenshot_recording import BROWSERS, Browser
+
+ROOT = Path(__file__).parents[1]
+CAP = 2
+_SCENARIO = """
+name = "fleet"
+horizon_s = {horizon_s}
+recovery = {{ rejoin_within_s = 0 }}
+
+[model]
+name = "double_integrator"
+
+[plant]
+initial_state = [1.0, 0.0]
+initial_state_halfwidth = [0.5, 0.5]
+draw = "uniform"
+uncertainty_A = [[0.0, 0.0], [0.2, 0.2]]
+rate_hz = {rate_hz}
+
+[controller]
+rate_hz = {rate_hz}
+
+[trigger]
+beta = 0.5
+alpha_per_s = 0.25
+floor = 0.02
+
+[network]
+mansd = {cap}
+loss = {{ model = "bernoulli", probability = 0.3 }}
+impairments = [{{ kind = "rate", rate_bps = {rate_bps}, queue = 1000 }}]
+
+[[loops]]
+name = "loop"
+count = {loops}
+"""
+_KIBI = 1024
+_POLL_S = 2.0
+_SINGLE_S = 60.0
+_FLAT_MIB = 32.0
+_STEP_US, _MEMORY_MIB, _END_SHARE = Goal("<=", 5), Goal("<=", 80), Goal("<=", 0.1)
+_LATE_MS = {50.0: Goal("<=", 1.0), 500.0: Goal("<=", 0.3)}
+"""By the rate of the loops, Hz."""
+_LIBRARIES = "import numpy, zenoh; print(); input()"
+_NOTHING = Goal("==", 0)
+
+
+class Load(NamedTuple):
+    """The loops of a run."""
+
+    loops: int
+    rate_hz: float
+    horizon_s: float
+
+    def __str__(self) -> str:
+        plural = "s" if self.loops > 1 else ""
+        return f"{self.loops:,} loop{plural} at {self.rate_hz:g} Hz, {self.horizon_s:g} s"
+
+    @property
+    def scenario(self) -> str:
+        """The scenario.
+
+        The bottleneck carries what the guarantee demands even if every sample is an event. A slower
+        one would stay congested after a stall of the computer: late updates cause events, events
+        delays.
+        """
+        bits = 92 * 8  # an update of two states with its UDP and IP header
+        rate_bps = int(self.loops * self.rate_hz * bits / (CAP + 1))
+        return _SCENARIO.format(**self._asdict(), cap=CAP, rate_bps=rate_bps)
+
+    def step_us(self, measured: "Measured") -> float:
+        """CPU time of the processes per loop and step."""
+        return sum(measured.cpu_s.values()) / (self.loops * self.horizon_s * self.rate_hz) * 1e6
+
+
+class Measured(NamedTuple):
+    """A finished run."""
+
+    summary: dict[str, Any]
+    memory_mib: Mapping[str, list[float]]
+    """Private memory over time, by process."""
+    cpu_s: Mapping[str, float]
+    """By process, while the loops ran."""
+    end_s: float
+    """Wall time from the end of the loops to the end of the command."""
+
+
+def run(load: Load, folder: Path) -> Measured:
+    """Run the loops as a user does.
+
+    Raises:
+        MeasurementError: the run failed.
+    """
+    path = folder / "fleet.toml"
+    path.write_text(load.scenario)
+    command = [*NOACK, "run", str(path), "--json", "--no-report", "--runs", str(folder)]
+    with (folder / "output").open("w+") as output:
+        with subprocess.Popen(command, stdout=output, stderr=subprocess.DEVNULL) as process:
+            followed = _follow(process, folder / LATEST)
+        output.seek(0)
+        summary = json.loads(output.read() or "{}")
+    if process.returncode != 0:
+        found = summary.get("exit", {}).get("reason", summary.get("error"))
+        raise MeasurementError(f"{load.loops} loops at {load.rate_hz:g} Hz: {found}")
+    return Measured(summary, *followed)
+
+
+def _follow(
+    process: subprocess.Popen[bytes], started: Path
+) -> tuple[dict[str, list[float]], dict[str, float], float]:
+    """Return memory and CPU time of a run's processes from its start, when a path exists."""
+    processes = Processes(process.pid)
+    memory, cpu_s = defaultdict[str, list[float]](list), defaultdict[str, list[float]](list)
+    ended_s = time.monotonic()
+    while process.poll() is None:
+        if started.exists():
+            for role, one in processes.sample().items():
+                memory[role].append(one.uss_kib / _KIBI)
+                if role in LOOP_ROLES:
+                    cpu_s[role].append(one.cpu_s)
+                    ended_s = time.monotonic()
+        time.sleep(_POLL_S)
+    used_s = {role: total_s[-1] - total_s[0] for role, total_s in cpu_s.items()}
+    return memory, used_s, time.monotonic() - ended_s
+
+
+def figures(load: Load, found: Measured, single_us: float) -> list[Row]:
+    """Return the figures of a run; ``single_us`` is the CPU time of a step of one loop alone."""
+    network, loops = found.summary["network"], found.summary["loops"]
+    step_us = load.step_us(found)
+    equal = [one["replay"]["bit_exact"] for one in (network, *loops)].count(True)
+    loop_memory = {role: mib for role, mib in found.memory_mib.items() if role in LOOP_ROLES}
+    growth = max(mib[-1] - mib[len(mib) // 2] for mib in loop_memory.values())
+    rows = [
+        Row("missing samples", sum(one["missing_samples"] for one in loops), "", goal=_NOTHING),
+        Row("unintended losses", sum(one["unintended_losses"] for one in loops), "", goal=_NOTHING),
+        Row("longest loss burst", max(one["longest_loss_burst"] for one in loops), "",
+            goal=Goal("<=", CAP)),
+        Row("updates", network["datagrams"] / load.horizon_s, "/s"),
+        *(
+            Row(f"{role} lateness p99, worst loop",
+                max(one["lateness_us"][role]["p99"] for one in loops) * 1e-3, "ms",
+                goal=_LATE_MS[load.rate_hz])
+            for role in WITH_DEADLINES
+        ),
+        Row("loops and network not replayed bit for bit", 1 + len(loops) - equal, "",
+            goal=_NOTHING),
+        Row("CPU time per loop and step", step_us, "µs", goal=_STEP_US,
+            note=", ".join(f"{role} {used_s:.1f} s" for role, used_s in found.cpu_s.items())),
+        Row("the same", step_us, "µs", Peer("one loop alone", single_us)),
+        Row("growth of memory in the second half, worst process", growth, "MiB",
+            goal=Goal("<", _FLAT_MIB),
+            note=", ".join(
+                f"{role} {mib[len(mib) // 2]:.0f}–{mib[-1]:.0f}"
+                for role, mib in found.memory_mib.items()
+            )),
+        Row("end of the run", found.end_s, "s", Peer("the run", load.horizon_s), _END_SHARE),
+    ]  # fmt: skip
+    return [replace(row, name=f"{load}: {row.name}") for row in rows]
+
+
+def memory(load: Load, found: Measured) -> Iterator[Row]:
+    """Yield the private memory of the processes of one loop: the median over its run."""
+    used = {role: median(found.memory_mib[role]) for role in LOOP_ROLES}
+    name, total = f"{load}: private memory of {', '.join(used)}", sum(used.values())
+    note = ", ".join(f"{role} {mib:.0f}" for role, mib in used.items())
+    peer = Peer("as many Pythons that import numpy and zenoh", libraries_mib(len(used)))
+    yield Row(name, total, "MiB", goal=_MEMORY_MIB, note=note)
+    yield Row("the same", total, "MiB", peer)
+
+
+def libraries_mib(count: int) -> float:
+    """Return the private memory of so many Pythons at once that import the libraries."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with ExitStack() as stack:
+        pythons = [
+            stack.enter_context(subprocess.Popen([sys.executable, "-c", _LIBRARIES], **pipes))
+            for _ in range(count)
+        ]
+        for python in pythons:
+            assert python.stdout is not None
+            python.stdout.readline()
+        used = [psutil.Process(python.pid).memory_full_info().uss for python in pythons]
+        for python in pythons:
+            python.kill()
+    return float(sum(used)) / _KIBI**2
+
+
+@benchmark(
+    "fleet", "Many loops on one network",
+    {"--fleet-s": {"type": float, "default": 60.0, "help": "length of the runs, seconds"},
+     "--fleet-loops": {"type": int, "default": 1000, "help": "loops at 50 Hz"},
+     "--fleet-dir": {"type": Path, "help": "where the runs are kept meanwhile"}},
+)  # fmt: skip
+def fleet(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure many loops through one bottleneck, live, beside one loop at the same rate.
+
+    Each loop samples, computes and applies its input at the same rate. A step is one of the plant
+    of one loop: with it come a measurement, a tick of the controller and an actuation. The CPU time
+    is that of plant, sensor, emulator and controller while the loops run. Their alternative is one
+    loop alone, and that of their memory as many Pythons that import the libraries of each process.
+    """
+    for loops, rate_hz in ((options.fleet_loops, 50.0), (20, 500.0)):
+        load = Load(loops, rate_hz, options.fleet_s)
+        single = load._replace(loops=1, horizon_s=min(load.horizon_s, _SINGLE_S))
+        measured = []
+        for one in (single, load):
+            say(str(one))
+            with tempfile.TemporaryDirectory(dir=options.fleet_dir) as folder:
+                measured.append(run(one, Path(folder)))
+        alone, together = measured
+        yield from figures(load, together, single.step_us(alone))
+        if rate_hz != 50.0:
+            yield from memory(single, alone)
+
+
+ROUNDS = 5
+OURS, IMPORTS = "noack", "Python that imports the libraries"
+_CERTIFY = (*NOACK, "certify", "lane_following")
+_IMPORT_CONTROL = (sys.executable, "-c", "import control")
+_LOOPS = Load(20, 500.0, 5.0)
+
+
+def started() -> Figures:
+    """Start a short run.
+
+    Returns:
+        ``first_s``, wall seconds from the start of ``noack run`` to the first control step, and
+        ``launch_s``, the launch time from the run's summary.
+
+    Raises:
+        MeasurementError: the run failed or printed no progress.
+    """
+    found = noack("run", "lane_following", "--set", "horizon_s=1")
+    if found.first_step_s is None:
+        raise MeasurementError("the run showed no progress line")
+    return {"first_s": found.first_step_s, "launch_s": found.summary["startup_s"]}
+
+
+def cpu_s(command: Sequence[str]) -> float:
+    """Return the CPU seconds of a program, which other load changes less than its duration."""
+    before_s = own_cpu_s(children=True)
+    execute(command)
+    return own_cpu_s(children=True) - before_s
+
+
+def startup_rows(rounds: Rounds) -> Iterator[Row]:
+    """Yield the rows of the start of a run."""
+    note = "upper bound: includes a progress line's way through the recorder"
+    yield rounds.row(
+        "noack run → first control step", "s", "first_s", OURS, goal=Goal("<=", 0.6), note=note
+    )
+    yield rounds.row("the same, against a bare import", "s", "first_s", OURS, IMPORTS)
+    yield rounds.row("of it, from launch to time 0, as the run says", "s", "launch_s", OURS)
+
+
+def demo_rows(summary: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield the rows of a demo run from its summary."""
+    (loop,) = summary["loops"]
+    late = loop["lateness_us"]["plant"]
+    in_time = 100 * (1 - late["late_steps"] / late["steps"])
+    yield Row("demo: missing samples", loop["missing_samples"], "samples", goal=_NOTHING)
+    yield Row("demo: unintended losses", loop["unintended_losses"], "datagrams", goal=_NOTHING)
+    yield Row("demo: plant steps within one period", in_time, "%", goal=Goal(">=", 99.9))
+    for name in ("p50", "p99", "max"):
+        yield Row(f"demo: plant lateness, {name}", late[name], "µs")
+
+
+@benchmark("startup", "Time to the first control step; the demo")
+def startup(options: argparse.Namespace) -> Iterator[Row]:
+    """Start several short runs, and the alternatives in turn; then 20 loops, and the demo.
+
+    The progress lines give an upper bound of the time to the first control step
+    (:func:`benchmarks.programs.first_step_s`). The alternative is a Python that only imports the
+    libraries that every process of a run needs. That of ``noack certify`` is one that only imports
+    python-control, with which such loops are analysed. Of the demo, missing samples, unintended
+    losses and late steps count: a plant step is late if it is made more than one period after its
+    time.
+    """
+    rounds = Rounds()
+    for number in range(ROUNDS):
+        say(f"round {number + 1} of {ROUNDS}")
+        rounds.add(OURS, started())
+        rounds.add(IMPORTS, {"first_s": imported_s("numpy, scipy.linalg, pydantic, zenoh")})
+    yield from startup_rows(rounds)
+    yield compared(
+        "noack certify lane_following, with all limits", "CPU s", lambda: cpu_s(_CERTIFY),
+        ("Python that imports python-control", lambda: cpu_s(_IMPORT_CONTROL)), Goal("<", 1),
+    )  # fmt: skip
+    say("20 loops")
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+        begun_s = time.monotonic()
+        run(_LOOPS, Path(folder))
+        loops_s = time.monotonic() - begun_s
+    yield Row("the first run of 20 loops, 5 s, without report", loops_s, "s", goal=Goal("<=", 15))
+    say("noack demo, 20 s")
+    yield from demo_rows(noack("demo").summary)
+
+
+PROGRAM = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
+
+
+def installed_bytes(names: Iterable[str]) -> int:
+    """Return the bytes of the files of installed distributions."""
+    total = 0
+    for name in names:
+        try:
+            files = distribution(name).files or ()
+        except PackageNotFoundError:  # only on other systems or versions of Python
+            continue
+        total += sum(path.stat().st_size for one in files if (path := Path(one.locate())).is_file())
+    return total
+
+
+def lines(*patterns: str) -> int:
+    """Return the lines of the files that git knows."""
+    command = ["git", "ls-files", "-z", "--", *patterns]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    files = [ROOT / name for name in listed.split("\0") if name]
+    return sum(len(file.read_bytes().splitlines()) for file in files if file.is_file())
+
+
+@benchmark("size", "Installation and code")
+def size(options: argparse.Namespace) -> Iterator[Row]:
+    """Count the bytes of the installation, and the lines of code."""
+    lock = (ROOT / "requirements.lock").read_text()
+    default = set(re.findall(r"^([A-Za-z0-9_.-]+)==", lock, re.M))
+    python = lines(*(f"{folder}/*.py" for folder in PROGRAM))
+    yield Row("installed without extras", installed_bytes(default) / 1e6, "MB")
+    yield Row("of it, numba and llvmlite", installed_bytes(default & {"numba", "llvmlite"}) / 1e6,
+              "MB", goal=_NOTHING)  # fmt: skip
+    yield Row("Python outside tests", python, "lines", goal=Goal("<=", 75_000))
+    yield Row("the same, with benchmarks", python + lines("benchmarks/*.py"), "lines",
+              goal=Goal("<=", 64_000))  # fmt: skip
+    yield Row("C", lines("native/*.c", "native/*.h"), "lines", goal=Goal("<=", 5_000))
+
+
+_CLONE_PATIENCE_S = 900.0
+
+
+@benchmark("clone", "The demo from a clean clone")
+def clone(options: argparse.Namespace) -> Iterator[Row]:
+    """Clone the last commit, install, and run the demo to its verdict; 20 s of it are the run."""
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+        say("make demo from a clean clone")
+        target = Path(folder) / "noack"
+        subprocess.run(["git", "clone", "-q", str(ROOT), str(target)], check=True)
+        begun_s = time.monotonic()
+        done = subprocess.run(
+            ["make", "demo"], cwd=target, capture_output=True, text=True, check=False,
+            timeout=_CLONE_PATIENCE_S, env=os.environ | {"VIRTUAL_ENV": ""},
+        )  # fmt: skip
+        spent_s = time.monotonic() - begun_s
+    if done.returncode:
+        raise MeasurementError(
+            f"make demo: {(done.stderr.strip() or 'no message').splitlines()[-1]}"
+        )
+    compiler = "gcc present" if shutil.which("cc") else "no C compiler"
+    yield Row(f"make demo from a clean clone to its verdict, {compiler}", spent_s, "s",
+              goal=Goal("<=", 60))  # fmt: skip
+
+
+LAB_ROUNDS = 3
+HORIZON_S = 10.0
+ALONE, OPEN = "run without the page", "page open"
+DRAGGED, VIEWED = "a slider moves", "viewer open"
+_PATIENCE_S = 120.0
+_MOVE_S = 0.05
+_KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
+_SLIDER = "document.querySelector('.q-slider[aria-label=\"loss probability\"] [tabindex]')"
+
+
+class _Page:
+    """The lab page in a headless browser."""
+
+    def __init__(self, browser: Browser, address: str) -> None:
+        self._browser = browser
+        browser.open(address, 1280, 900)
+        self.wait(f"!!{_SLIDER} && document.body.innerText.includes('certified')")
+
+    def js(self, expression: str) -> Any:
+        """Return the value of an expression."""
+        found = self._browser.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        return found["result"].get("value")
+
+    def wait(self, condition: str) -> None:
+        """Wait until a condition holds."""
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while not self.js(condition):
+            if time.monotonic() > deadline_s:
+                text = self.js("document.body.innerText")
+                raise MeasurementError(f"the page does not reach {condition}: {text}")
+            time.sleep(0.2)
+
+    @contextmanager
+    def moving(self) -> Iterator[None]:
+        """Move a slider to and fro meanwhile."""
+        ended = threading.Event()
+
+        def move() -> None:
+            self.js(f"{_SLIDER}.focus()")
+            for key, code in itertools.cycle(_KEYS):
+                if ended.wait(_MOVE_S):
+                    return
+                for kind in ("rawKeyDown", "keyUp"):
+                    self._browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key,
+                                       windowsVirtualKeyCode=code)  # fmt: skip
+
+        mover = threading.Thread(target=move)
+        mover.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            mover.join()
+
+    def run_live(self) -> None:
+        """Run live by the page, until it says that the run ended."""
+        for kind in (".q-tab", "button"):
+            self.js(
+                f"[...document.querySelectorAll('{kind}')].filter("
+                "e => e.innerText.trim().toLowerCase().endsWith('run live')).at(-1).click()"
+            )
+            time.sleep(0.5)
+        self.wait(f"document.body.innerText.includes('ended: {HORIZON_S} of')")
+
+
+@contextmanager
+def _opened(folder: Path, settings: Sequence[str]) -> Iterator[_Page]:
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        raise MeasurementError("no Chromium or Chrome")
+    command = [*NOACK, "lab", "lane_following", "--no-browser", "--json", *settings, *FREE_PORTS]
+    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    browser = Browser(program, str(folder / "profile"))
+    try:
+        address = json.loads("".join(iter(server.stdout.readline, "}\n")) + "}")["address"]
+        yield _Page(browser, address)
+    finally:
+        browser.close()
+        server.send_signal(signal.SIGINT)
+        server.wait()
+
+
+def summary_of(side: str, folder: Path) -> dict[str, Any]:
+    """Run a side; return the summary."""
+    settings = ("--set", f"horizon_s={HORIZON_S}")
+    arguments = ("run", "lane_following", *settings)
+    if side == ALONE:
+        return noack(*arguments).summary
+    with _opened(folder, settings) as page:
+        if side == OPEN:
+            return noack(*arguments).summary
+        if side == DRAGGED:
+            with page.moving():
+                return noack(*arguments).summary
+        page.run_live()
+    found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
+    return found
+
+
+@benchmark("lab", "A live run while the lab page is open")
+def lab(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure the lateness of a live run while the lab page is open: it must not disturb the loop.
+
+    A run of the paper's example is measured alone; while the page is open in a headless browser;
+    while a slider of it moves without pause; and started by the page, which then shows the viewer.
+    Without a graphics card the browser draws by the processor, which is the worst case.
+    """
+    rounds, sides, roles = Rounds(), (ALONE, OPEN, DRAGGED, VIEWED), ("plant", "controller")
+    for i, side in itertools.product(range(LAB_ROUNDS), sides):
+        say(f"round {i + 1} of {LAB_ROUNDS}: {side}")
+        with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+            summary = summary_of(side, Path(folder))
+        if summary["exit"]["status"] != 0:
+            raise MeasurementError(f"the run ended: {summary['exit']['reason']}")
+        late = summary["loops"][0]["lateness_us"]
+        rounds.add(side, {role: late[role]["p99"] for role in roles})
+    for side, role in itertools.product(sides[1:], roles):
+        name = f"{role} lateness, p99, {side}"
+        yield rounds.row(name, "µs", role, side, ALONE, Goal("<=", 1.2), paired=True)

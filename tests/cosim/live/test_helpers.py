@@ -1,0 +1,59 @@
+"""Processes that help with the end of a long run: the results are those without them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.live import finalize
+from cosim.live.finalize import ReplayBeside
+from cosim.record.run_directory import SUMMARY_FILE, RunEnding, write_environment, write_scenario
+from cosim.record.run_record import load_record, write_run
+from cosim.shipped_files import find_shipped
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus
+from noack.protocol.record_tables import PLANT_STEP
+from tests.cosim.summaries import alone
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    scenario = find_shipped("double_integrator", "scenarios")
+    record = simulate(resolve(load(scenario, ["horizon_s=1"])))
+    record[PLANT_STEP]["u"][9, 0] += 1.0
+    write_scenario(record.scenario, tmp_path)
+    write_environment(tmp_path, "live")
+    write_run(alone(record), tmp_path)
+    monkeypatch.setattr(finalize, "_MANY_STEPS", 10)
+    monkeypatch.setattr(finalize, "cores", lambda: 2)
+    return tmp_path
+
+
+def _killed(*_: object) -> None:
+    raise MemoryError
+
+
+@pytest.mark.parametrize("part", [ReplayBeside.part, _killed])
+def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., object]
+) -> None:
+    found = []
+
+    def told(self: ReplayBeside) -> object:
+        try:
+            found.append(part(self))
+        except MemoryError:
+            found.append(None)
+        return found[-1]
+
+    monkeypatch.setattr(ReplayBeside, "part", told)
+    finalize.finalize(RunEnding(run_dir, 0, ExitStatus.OK, "horizon"), report=False)
+    stored = json.loads((run_dir / SUMMARY_FILE).read_text())["loops"][0]["replay"]
+    assert stored["first_difference"]["row"] == 9
+    assert stored == replay(load_record(run_dir)).verdict().model_dump()
+    assert len(found) == 1
+    assert (found[0] is None) == (part is _killed)

@@ -1,0 +1,175 @@
+"""Plants by their physical laws, published numbers and other solvers; bit-exact repetition."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.integrate import solve_ivp
+
+from noack.plants.cart_pole import CartPoleSettings
+from noack.plants.dc_motor import DcMotor, DcMotorSettings
+from noack.plants.plant_settings import OdeSystem, PlantEquations
+from noack.plants.systems.plant_linearisation import linearise
+from tests.noack.plants.motion import H_NS, motion
+
+INDUCTANCES = (2.75e-6, 1e-3, 0.5)
+"""The last one makes speed and current oscillate."""
+
+
+def settings(**given: Any) -> DcMotorSettings:
+    return DcMotorSettings(kind="dc_motor", **given)
+
+
+def published() -> signal.TransferFunction:
+    """θ(s)/V(s) = K/(s((Js + b)(Ls + R) + K²)), University of Michigan, "DC Motor Position"."""
+    J, b, K, R, L = 3.2284e-6, 3.5077e-6, 0.0274, 4.0, 2.75e-6
+    return signal.TransferFunction(
+        [K], np.polymul([1, 0], np.polyadd(np.polymul([J, b], [L, R]), [K**2]))
+    )
+
+
+def test_the_step_response_is_the_published_transfer_functions() -> None:
+    _, angle = signal.step(published(), T=np.arange(101) * H_NS * 1e-9)
+    found = motion(DcMotor(settings(), np.zeros(3)), [1.0] * 100)
+    np.testing.assert_allclose(found[:, 0], angle, atol=1e-9)
+    assert angle[-1] > 5.0
+
+
+def test_the_linearisation_has_the_published_frequency_response() -> None:
+    A, B = settings().linearisation()
+    w = np.logspace(-1, 7, 50)
+    _, expected = signal.freqresp(published(), w)
+    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: float) -> np.ndarray:
+    """The same law by an implicit integrator with events: forward, backward, at standstill."""
+    J, b, L = motor.inertia_kg_m2, motor.friction_n_m_s, motor.inductance_h
+    K, R, T_c = motor.torque_constant_n_m_per_a, motor.resistance_ohm, motor.coulomb_friction_n_m
+    t_s, x = 0.0, x.copy()
+    while t_s < end_s:
+        turning = math.copysign(1, x[1]) if x[1] else 0.0
+        steady = voltage / R
+        if not x[1] and K * abs(x[2]) > T_c * (1 - 1e-9) and K * steady * np.sign(x[2]) > T_c:
+            turning = math.copysign(1, x[2])
+
+        def derivative(_: float, z: np.ndarray, s: float = turning) -> list[float]:
+            acceleration = (K * z[2] - b * z[1] - s * T_c) / J if s else 0.0
+            return [z[1], acceleration, (voltage - R * z[2] - K * z[1]) / L]
+
+        def change(_: float, z: np.ndarray, s: float = turning) -> float:
+            return float(s * z[1] if s else abs(K * z[2]) - T_c)
+
+        change.terminal, change.direction = True, -1 if turning else 1  # type: ignore[attr-defined]
+        found = solve_ivp(
+            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13
+        )
+        t_s, x = found.t[-1], found.y[:, -1].copy()
+        if found.status == 1 and turning:
+            x[1] = 0.0
+    return x
+
+
+@pytest.mark.parametrize("inductance_h", INDUCTANCES)
+def test_friction_and_stiction_agree_with_another_solver(inductance_h: float) -> None:
+    motor = settings(inductance_h=inductance_h, coulomb_friction_n_m=1e-3)
+    system, expected = DcMotor(motor, np.array([0.0, 5.0, 0.0])), np.array([0.0, 5.0, 0.0])
+    stuck = 0
+    for voltage in np.random.default_rng(0).choice([0.0, 0.1, -0.1, 0.5, -0.6, 2.0], 12):
+        system.advance(np.array([voltage]), 0, 5_000_000)
+        expected = reference(motor, expected, voltage, 5e-3)
+        np.testing.assert_allclose(system.x, expected, rtol=1e-7, atol=1e-8)
+        stuck += system.x[1] == 0.0
+    # With a large inductance, the current changes too slowly for a stop of a whole step.
+    assert stuck or inductance_h > 1e-3
+
+
+def test_the_shaft_sticks_exactly_up_to_the_coulomb_torque() -> None:
+    limit_v = 4.0 * 1e-3 / 0.0274  # R T_c / Kt
+    for factor, moves in ((0.999, False), (1.001, True)):
+        motor = DcMotor(settings(coulomb_friction_n_m=1e-3), np.zeros(3))
+        assert (motion(motor, [factor * limit_v] * 50)[-1, 0] > 0.0) == moves
+
+
+def test_a_non_finite_state_stays_non_finite() -> None:
+    assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
+
+
+def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
+    _, v, angle, rate = x.tolist()
+    m, length = settings.pole_kg, settings.length_m
+    along, up = v + length * rate * math.cos(angle), -length * rate * math.sin(angle)
+    kinetic = settings.cart_kg * v**2 + m * (along**2 + up**2) + settings.inertia_kg_m2 * rate**2
+    return 0.5 * kinetic + m * settings.gravity_m_per_s2 * length * math.cos(angle)
+
+
+def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
+    settings = CartPoleSettings(kind="cart_pole", friction_n_s_per_m=0.0)
+    states = motion(OdeSystem(settings.equations(), np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 500)
+    assert np.ptp(states[:, 2]) > 1.0  # it has fallen
+    energies = [energy(settings, x) for x in states]
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-7)
+    total, moment = settings.cart_kg + settings.pole_kg, settings.pole_kg * settings.length_m
+    momentum = total * states[:, 1] + moment * states[:, 3] * np.cos(states[:, 2])
+    np.testing.assert_allclose(momentum, momentum[0], atol=1e-8)
+
+
+def test_energy_changes_by_the_work_of_force_and_friction() -> None:
+    settings = CartPoleSettings(kind="cart_pole")
+    force, h_ns = 0.7, 500_000
+    states = motion(
+        OdeSystem(settings.equations(), np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns
+    )
+    power = force * states[:, 1] - settings.friction_n_s_per_m * states[:, 1] ** 2
+    work = np.trapezoid(power, dx=h_ns * 1e-9)
+    gained = energy(settings, states[-1]) - energy(settings, states[0])
+    assert gained == pytest.approx(work, rel=1e-5)
+
+
+def test_its_linearisation_has_the_poles_of_the_literature() -> None:
+    """Open-loop poles by the Control Tutorials (MATLAB): 0, -0.1428, -5.6041, 5.5651."""
+    A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
+    poles = np.sort(np.linalg.eigvals(A).real)
+    np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
+    np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
+
+
+def test_the_integration_agrees_with_another_solver() -> None:
+    def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
+
+    system = OdeSystem(PlantEquations(pendulum), np.array([2.0, 0.0]))
+    states = motion(system, [0.5] * 500, 20_000_000)
+    exact = solve_ivp(
+        lambda t, z: pendulum(t, z, np.array([0.5])), (0, 10), [2.0, 0.0],
+        method="DOP853", rtol=1e-13, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(states[-1], exact.y[:, -1], atol=1e-6)
+
+
+def test_the_state_is_nan_after_it_has_escaped() -> None:
+    """ż = z² from 1 is infinite at 1 s."""
+
+    def escaping(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        return (float(z[0]) ** 2,)
+
+    system = OdeSystem(PlantEquations(escaping), np.array([1.0]))
+    states = motion(system, [0.0] * 20, 100_000_000)
+    assert np.isfinite(states[9]).all()
+    assert np.isnan(states[12:]).all()
+
+
+def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:
+    def broken(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        if t > 0.003:
+            raise [OverflowError, KeyError][int(v[0])]("far")
+        return (1.0,)
+
+    states = motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [0.0, 0.0])
+    assert states[1] == pytest.approx([0.002])
+    assert np.isnan(states[2]).all()
+    with pytest.raises(KeyError, match="far"):
+        motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [1.0, 1.0])
