@@ -53,9 +53,10 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.config.sections import PLANTS, POLICIES
 from noack.core.clock import NS_PER_S
+from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import PLANT_STEP
-from noack.protocol.wire_format import Flow, Message
+from noack.protocol.wire_format import Flow
 from noack.runtime.real_time_loop import realtime
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
@@ -283,9 +284,14 @@ def steps_us(scenario: Scenario, count: int) -> Iterator[float]:
     plant = plants_of((scenario,))
     for step, u in enumerate(record[PLANT_STEP]["u"]):
         t_ns = step * period_ns
-        plant.handle(Message(Flow.ACTUATION, step, t_ns, u), t_ns)
+        core.noack_process_handle(plant.core, ffi.new("noack_message *", {
+            "flow": Flow.ACTUATION, "sequence": step, "t_ns": t_ns,
+            "entries": len(u), "vector": u.tolist(),
+        }), t_ns)  # fmt: skip
         begun_ns = time.thread_time_ns()
-        plant.on_timer(t_ns)
+        while (question := core.noack_process_tick(plant.core, t_ns)) != core.NOACK_DONE:
+            plant.answer(question)
+        plant.take_rows()
         yield (time.thread_time_ns() - begun_ns) / 1e3
 
 

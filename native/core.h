@@ -76,7 +76,7 @@ static inline int64_t first_above(
     return begin;
 }
 
-/* chance.c: correlated random events. */
+/* random.c: correlated random events. */
 double latent(double correlation, double innovation, noack_stage_memory *memory, double u);
 int happens(const noack_chance *chance, noack_stage_memory *memory, double u);
 

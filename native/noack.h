@@ -1231,8 +1231,9 @@ typedef struct { /* what the runs share; matrices in row-major order */
     double *scratch;    /* noack_exact_scratch() numbers */
 } noack_exact;
 
-/* Return 1 if runs use the processor's AVX2 and FMA; without them they take many times as long. */
-int64_t noack_exact_is_fused(void);
+/* Return which of the processor's instructions runs use: 2: AVX2, FMA and registers of AVX-512;
+   1: AVX2 and FMA; 0: neither, so that runs take many times as long. */
+int64_t noack_exact_instructions(void);
 
 /* Numbers of the scratch that n, m and the rule need; the other fields are not read. */
 int64_t noack_exact_scratch(const noack_exact *exact);

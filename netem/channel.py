@@ -41,7 +41,6 @@ _PACKET_ROW = np.dtype(
 _RELEASE_ROW = dtype_of("noack_release_row")
 NO_TIME_NS = 2**63 - 1
 """Stands for a time that never comes, in the core."""
-UNKNOWN_ARRIVAL_NS = 2**62
 RUN_ID = 0
 """Run number in the datagrams of every simulated run: a record depends on the scenario alone.
 
@@ -62,8 +61,6 @@ class Datagram(NamedTuple):
 
     flow: int
     data: bytes
-    arrival_ns: int = UNKNOWN_ARRIVAL_NS
-    """Arrival at the socket, for the record; later than its handling: unknown."""
 
 
 class Channel:
@@ -106,9 +103,6 @@ class Channel:
         self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
         self._delayed: Any = ffi.new("noack_delayed[]", 0)
         self._taken: list[tuple[str, Rows]] = []
-        self._handled = 0
-        self._payloads: dict[int, bytes] = {}
-        self._copies: dict[int, int] = {}  # delayed copies of each payload
         self._add_places(_PLACES)
         if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
             raise ValueError(f"network: {ffi.string(wrong).decode()}")
@@ -125,7 +119,7 @@ class Channel:
         elif question == core.NOACK_ASK_PLACES:
             self._add_places(self.core.places)
         elif question == core.NOACK_ASK_OUTCOME:
-            self._decide()
+            self.decide(encoded(self.core.asked.message))
         else:
             assert question == core.NOACK_ROWS_FULL
             self._taken += self.take_rows()
@@ -154,53 +148,6 @@ class Channel:
         self._set_change_time()
         return outputs
 
-    def next_deadline_ns(self) -> int | None:
-        """Time of the next departure in either direction; None: nothing is in flight."""
-        due_ns = int(core.noack_channel_due_ns(self.core))
-        return None if due_ns == NO_TIME_NS else due_ns
-
-    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Process a datagram; return it if it is neither lost nor delayed."""
-        if not 0 <= message.flow < self.core.loops * len(self.links):
-            raise ValueError(f"a network of {self.core.loops} loops has no flow {message.flow}")
-        channel, number, data = self.core, self._handled, message.data
-        datagram = ffi.new("noack_datagram *", {
-            "flow": message.flow, "size_bytes": len(data), "arrival_ns": message.arrival_ns,
-            "bit": -1, "head": data[:PACKET_HEAD_BYTES], "message": {"sequence": number},
-        })  # fmt: skip
-        before = channel.heap_count
-        self._payloads[number] = data
-        outputs = self._step(lambda: core.noack_channel_handle(channel, datagram, now_ns))
-        self._handled += 1
-        self._copies[number] = channel.heap_count - before
-        self._forget(number)
-        return outputs
-
-    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Forward the datagram that is due; if one is due in each direction, the first one."""
-        outputs = self._step(lambda: core.noack_channel_release(self.core, now_ns))
-        number = self.core.leaving[0].message.sequence
-        self._copies[number] -= 1
-        self._forget(number)
-        return outputs
-
-    def _step(self, step: Callable[[], int]) -> Sequence[Datagram | Record | Notice]:
-        """Make a step; return the datagrams that leave, and its row."""
-        while (question := step()) != core.NOACK_DONE:
-            self.answer(question)
-        leaving = (self.core.leaving[place] for place in range(self.core.leaving_count))
-        datagrams = [
-            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit))
-            for one in leaving
-        ]
-        rows = [Record(table, row) for table, batch in self.take_rows() for row in batch.tolist()]
-        return (*datagrams, *rows)
-
-    def _forget(self, number: int) -> None:
-        """Forget a payload after its last departure."""
-        if not self._copies[number]:
-            del self._copies[number], self._payloads[number]
-
     def _change(self) -> None:
         """Apply the changes that are due at the datagram whose arrival asked for them."""
         assert self._schedule is not None
@@ -219,11 +166,9 @@ class Channel:
         next_ns = None if self._schedule is None else self._schedule.next_ns
         self.core.change_ns = NO_TIME_NS if next_ns is None else next_ns
 
-    def _decide(self) -> None:
-        """Let the user's network decide."""
+    def decide(self, data: bytes) -> None:
+        """Let the user's network decide for the datagram that the core asked about."""
         assert self._network is not None
-        asked = self.core.asked.message
-        data = encoded(asked) if asked.flow else self._payloads[asked.sequence]
         delay_ns = self._network(data, self.core.asked_ns)
         fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
         self.core.outcome = (fate, -1 if delay_ns is None else delay_ns, -1, -1, -1)
@@ -298,15 +243,3 @@ def encoded(message: Any) -> bytes:
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(
         Message(Flow(message.flow), message.sequence, message.t_ns, vector, message.loop)
     )
-
-
-def flipped(data: bytes, bit: int) -> bytes:
-    """Return the data with one bit flipped; bit 0 is the least significant bit of byte 0.
-
-    A bit of −1 is none.
-    """
-    if bit < 0:
-        return data
-    changed = bytearray(data)
-    changed[bit // 8] ^= 1 << (bit % 8)
-    return bytes(changed)

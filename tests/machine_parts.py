@@ -1,6 +1,6 @@
-"""Machines of one loop from their parts, and vectors of their state, for tests."""
+"""Machines that make one step at a time, and vectors of their state, for tests."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,17 +8,57 @@ import numpy as np
 from controller_node.controller import Controller, controllers_of
 from noack.config.parameter_changes import ParameterChange
 from noack.config.scenario import Scenario
+from noack.core.core_library import core, ffi
 from noack.core.core_memory import reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
-from noack.protocol.wire_format import Message
+from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import Plant, plants_of
 from sensor_node.sensor import Sensor, sensors_of
 
 
-class OneLoop(LoopMachines):
+class SteppedMachines(LoopMachines):
+    """Machines to which a test gives one input at a time, instead of a driver in C."""
+
+    def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
+        """Process a message that its machine receives; return what the machine does."""
+        given = ffi.new("noack_message *", {
+            "flow": message.flow, "sequence": message.sequence, "t_ns": message.t_ns,
+            "entries": len(message.vector), "loop": message.loop,
+            "vector": message.vector.tolist(),
+        })  # fmt: skip
+        return self._outputs(lambda: int(core.noack_process_handle(self.core, given, now_ns)))
+
+    def on_timer(self, now_ns: int) -> Sequence[Output]:
+        """Do the one tick that is due; return what the machine does."""
+        if self.next_deadline_ns() is None:
+            return ()
+        return self._outputs(lambda: int(core.noack_process_tick(self.core, now_ns)))
+
+    def _outputs(self, step: Callable[[], int]) -> Sequence[Output]:
+        outputs: list[Output] = []
+        while (question := step()) != core.NOACK_DONE:
+            if question != core.NOACK_ROWS_FULL:
+                self.answer(question)
+            outputs += self._taken()
+        if self.core.output.sends:
+            outputs.insert(0, message_of(self.core.output.message))
+        return [*outputs, *self._taken()]
+
+    def _taken(self) -> list[Output]:
+        records = [Record(table, row) for table, rows in self.take_rows() for row in rows.tolist()]
+        return [*records, *self.take_notices()]
+
+
+def message_of(given: Any) -> Message:
+    """A ``noack_message`` as a message."""
+    vector = np.array(ffi.unpack(given.vector, given.entries), np.float64)
+    return Message(Flow(given.flow), given.sequence, given.t_ns, vector, given.loop)
+
+
+class OneLoop(SteppedMachines):
     """The machine of one loop; its rows and log lines are without the number of the loop."""
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
@@ -52,12 +92,12 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
     return OneLoop(controllers_of((resolved,), start=start).parts)
 
 
-def machine(part: Plant | Sensor | Controller) -> LoopMachines:
+def machine(part: Plant | Sensor | Controller) -> OneLoop:
     """The machine of one loop."""
     return OneLoop([part])
 
 
-def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int, **settings: Any) -> LoopMachines:
+def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int, **settings: Any) -> OneLoop:
     """A linear plant from x0 on."""
     system = LinearSystem(A, B, x0)
     return machine(Plant(system, B.shape[1], period_ns=period_ns, **settings))

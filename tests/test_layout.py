@@ -24,7 +24,7 @@ LINES = {
     "noack/core": 1470,
     "noack/disturbances": 220,
     "noack/impairments": 3900,
-    "noack/machines": 450,
+    "noack/machines": 400,
     "noack/observers": 390,
     "noack/plants": 2335,
     "noack/protocol": 850,
@@ -50,7 +50,7 @@ LINES = {
     "sensor_node": 370,
     "controller_node": 390,
     "benchmarks": 4600,
-    "native": 9550,
+    "native": 9500,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

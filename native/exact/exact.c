@@ -4,38 +4,45 @@
    0; the last bits of a loop do not depend on the size chosen. */
 #include "exact.h"
 
-enum { CACHE_LINE = 8 }; /* doubles */
+static const int64_t NEVER_NS = INT64_C(1) << 62; /* longer times never end */
+enum { MOST_FATES = 1 << 30, CACHE_LINE = 8 /* doubles */ };
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-static int is_fused; /* whether there are instructions for 4 numbers, and fused rounding */
+static int instructions; /* of the processor: see noack_exact_instructions() */
 
 /* When the library is loaded: ask the processor, and whether the kernel keeps the wide registers.
    With ziglang, __builtin_cpu_supports() answers no to everything. */
 __attribute__((constructor)) static void ask_processor(void) {
+    const unsigned wide = bit_AVX512F | bit_AVX512VL | bit_AVX512DQ;
     unsigned a, b, c, d, kept, high;
     if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE))
         return;
     __asm__("xgetbv" : "=a"(kept), "=d"(high) : "c"(0));
-    is_fused = (kept & 6) == 6 && __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
+    if ((kept & 6) != 6 || !__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & bit_AVX2))
+        return;
+    instructions = (kept & 0xe6) == 0xe6 && (b & wide) == wide ? 2 : 1;
 }
 
-static const exact_code *const fused[] = {&exact_fused_2, &exact_fused_3,  &exact_fused_4,
-                                          &exact_fused_8, &exact_fused_16, &exact_fused_64};
-static const exact_code *const plain[] = {&exact_plain_3, &exact_plain_64};
+static const exact_code *const of_2[] = {
+    &exact_fused_3, &exact_wide_4, &exact_wide_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const of_1[] = {
+    &exact_fused_3, &exact_fused_4, &exact_fused_8, &exact_fused_16, &exact_fused_64};
+static const exact_code *const of_0[] = {&exact_plain_3, &exact_plain_4, &exact_plain_64};
+static const exact_code *const *const codes[] = {of_0, of_1, of_2};
 #else
-enum { is_fused = 0 };
-static const exact_code *const plain[] = {&exact_plain_2, &exact_plain_3,  &exact_plain_4,
-                                          &exact_plain_8, &exact_plain_16, &exact_plain_64};
-static const exact_code *const *const fused = plain;
+enum { instructions = 0 };
+static const exact_code *const of_0[] = {
+    &exact_plain_3, &exact_plain_4, &exact_plain_8, &exact_plain_16, &exact_plain_64};
+static const exact_code *const *const codes[] = {of_0};
 #endif
 
-int64_t noack_exact_is_fused(void) { return is_fused; }
+int64_t noack_exact_instructions(void) { return instructions; }
 
 /* The code for the fewest states that suffice. That for 3 sums in another order than the others. */
 static const exact_code *code_for(const noack_exact *exact) {
-    const exact_code *const *code = is_fused ? fused : plain;
+    const exact_code *const *code = codes[instructions];
     int64_t entries = max_of(exact->n, exact->m);
     while ((*code)->n < entries || ((*code)->n == 3 && entries != 3))
         code++;
@@ -89,6 +96,48 @@ int is_quadratic(const noack_exact *exact) {
     const noack_trigger_rule *rule = &exact->rule;
     return rule->up_rows > 0
            && (!is_plain(exact) || rule->is_dynamic || rule->from_event || rule->grid_ns > 0);
+}
+
+/* noack_exact_check() checks the numbers once: all that the other files assume. */
+static int is_positive(double number) { return number >= 0.0 && number < INFINITY; }
+
+static const char *check_exact_rule(const noack_exact *exact) {
+    const noack_trigger_rule *rule = &exact->rule;
+    const char *wrong = check_rule(rule, NEVER_NS);
+    if (wrong != NULL)
+        return wrong;
+    if (!is_positive(rule->level) || !is_positive(rule->rate_per_s) || !is_positive(rule->floor)
+        || !is_positive(rule->decay_per_s))
+        return "a trigger rule has a threshold or a rate below 0";
+    if (rule->longest_ns < rule->shortest_ns)
+        return "a trigger rule has times out of range";
+    if (rule->integrates && (is_quadratic(exact) || rule->is_dynamic))
+        return "a trigger rule integrates another norm than that of W e_s, or on a grid";
+    return NULL;
+}
+
+const char *noack_exact_check(const noack_exact *exact) {
+    if (!is_between(1, exact->n, NOACK_EXACT_ENTRIES)
+        || !is_between(1, exact->m, NOACK_EXACT_ENTRIES))
+        return "a loop has no state or input, or more than 64";
+    if (exact->H == NULL || exact->K == NULL || exact->scratch == NULL)
+        return "a simulation has no matrix or no memory";
+    if (!is_positive(exact->horizon_s) || !is_positive(exact->settle)
+        || !is_positive(exact->fading_per_s) || !(exact->fading_until_s >= 0.0))
+        return "a simulation has a time, a share or a rate below 0";
+    if (!is_between(0, exact->most_events, INT64_MAX)
+        || !is_between(NOACK_EXACT_ROW, exact->measure, NOACK_EXACT_TIMES))
+        return "a simulation has an unknown measure, or less than 0 events";
+    if (!is_between(0, exact->event_places, MOST_FATES)
+        || (exact->event_places > 0 && (exact->event_s == NULL || exact->delivered == NULL)))
+        return "a simulation has no room for its events";
+    if (exact->link == NULL) {
+        if (!is_between(0, exact->fate_count, MOST_FATES)
+            || (exact->fate_count > 0 && exact->fates == NULL))
+            return "a simulation has no fates";
+    } else if (noack_link_check(exact->link) != NULL || exact->link->rows < 1)
+        return "a simulation has no link";
+    return check_exact_rule(exact);
 }
 
 /* Take the next count numbers of the scratch, which are 0. */

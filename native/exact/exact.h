@@ -82,7 +82,7 @@ typedef struct { /* a run, or a part of one */
     double growth;    /* e^(rt) of the supremum, at the start of a piece */
 } exact_run;
 
-/* The code for a number of states; see simulator.h. */
+/* The code for a number of states; see states.c. */
 typedef struct {
     int64_t n, stride; /* states; doubles of a vector */
     void (*share)(exact_memory *memory);
@@ -94,11 +94,10 @@ typedef struct {
 } exact_code;
 
 #if defined(__x86_64__)
-extern const exact_code exact_fused_2, exact_fused_3, exact_fused_4, exact_fused_8, exact_fused_16,
-    exact_fused_64;
+extern const exact_code exact_wide_4, exact_wide_8, exact_fused_3, exact_fused_4, exact_fused_8,
+    exact_fused_16, exact_fused_64;
 #endif
-extern const exact_code exact_plain_2, exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16,
-    exact_plain_64;
+extern const exact_code exact_plain_3, exact_plain_4, exact_plain_8, exact_plain_16, exact_plain_64;
 
 /* exact.c: whether a rule compares more than |W e_s|; whether the next update arrives; a column of
  * STRIDE numbers for each of the matrix. */

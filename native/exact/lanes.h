@@ -1,5 +1,5 @@
 /* Vectors of N numbers in the processor's registers; N is a constant of the file that includes
-   this: 3, or a power of 2.
+   this: 3, or a power of 2 from 4 on.
 
    Every product is added with fused rounding: x y + z is rounded once. The order of each sum is
    fixed. So results have the same bits on every processor, with instructions for vectors or without
@@ -13,7 +13,7 @@
 #include <immintrin.h>
 #endif
 
-#if defined(FUSED) && N > 2
+#ifdef FUSED
 #define WIDTH 4
 typedef double part __attribute__((vector_size(32)));
 #else
@@ -27,9 +27,7 @@ typedef struct {
 } lanes; /* entries from N on have no meaning */
 
 static inline part fused(part a, part b, part c) {
-#if defined(FUSED) && N <= 2
-    return _mm_fmadd_pd(a, b, c);
-#elif defined(FUSED)
+#ifdef FUSED
     return _mm256_fmadd_pd(a, b, c);
 #else
     for (int i = 0; i < WIDTH; i++)
@@ -100,11 +98,7 @@ static inline lanes fma_scaled(lanes v, double s, lanes z) {
 static inline lanes magnitude(lanes v) {
 #ifdef FUSED
     for (int i = 0; i < PARTS; i++)
-#if N <= 2
-        v.part[i] = _mm_andnot_pd(_mm_set1_pd(-0.0), v.part[i]);
-#else
         v.part[i] = _mm256_andnot_pd(_mm256_set1_pd(-0.0), v.part[i]);
-#endif
 #else
     for (int i = 0; i < STRIDE; i++)
         v.part[i / WIDTH][i % WIDTH] = fabs(v.part[i / WIDTH][i % WIDTH]);

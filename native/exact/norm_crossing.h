@@ -65,28 +65,32 @@ static inline double safe_length(
         size - level, rate * level + radial, most + largest_of(turned, 0.0) / size, span);
 }
 
-/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. ends_below: it is
-   known that h(end_s) < 0. */
+/* What is known before a search. LIKELY: a bound on all of |y| is not worth its computation. */
+typedef enum { UNKNOWN, LIKELY, ENDS_BELOW } forecast; /* of a crossing; or that h(end_s) < 0 */
+
+/* The first s in [0, end_s) from which |y(s)| >= c e^(-rs), NONE or UNRESOLVED. */
 static double first_exit(
-    const double *curve, int p, const level_search *search, int ends_below, int most_steps) {
+    const double *curve, int p, const level_search *search, forecast crossing, int most_steps) {
     const double ahead = 3.0, nearer = 0.6;
     vector_curve own = {curve, p};
     double rate = search->rate, end_s = search->end_s, s = 0.0, ahead_s = end_s;
-    double lowest = level_at(search, end_s);
-    if (largest(curve, p, end_s) < lowest * lowest)
-        return NONE;
-    double most = bend(curve, p, end_s);
+    if (crossing != LIKELY) {
+        double lowest = level_at(search, end_s);
+        if (largest(curve, p, end_s) < lowest * lowest)
+            return NONE;
+    }
+    double most = bend(curve, p, end_s), level = search->level;
     curve_point at = look(curve, p, search, 0.0);
     for (int steps = 0; steps < most_steps; steps++) {
         double square = dot(at.y, at.y), mixed = dot(at.y, at.dy), speed = dot(at.dy, at.dy);
-        double level = level_at(search, s), size = sqrt(square);
+        double size = sqrt(square);
         if (!(size < level))
             return s;
         if (s >= end_s)
             return NONE;
         double radial = size > 0.0 ? mixed / size : sqrt(speed), slope = rate * level + radial;
         if (slope > (most + rate * rate * level) * (ahead_s - s)) {
-            if (ends_below && ahead_s == end_s)
+            if (crossing == ENDS_BELOW && ahead_s == end_s)
                 return NONE;
             double turned =
                 size > 0.0 ? speed - radial * radial + dot(at.y, at.ddy) : dot(at.dy, at.ddy);
@@ -113,6 +117,7 @@ static double first_exit(
             most = bend(curve, p, ahead_s);
         }
         at = look(curve, p, search, s);
+        level = level_at(search, s);
     }
     return UNRESOLVED;
 }

@@ -13,7 +13,7 @@ static const double CERTAINTY = 1e-10; /* the supremum exceeds the returned one 
    is at most twice the distance to the polynomials of degree 23, which is 2^-47 for k = 24 and
    1e-10 for k = 30. The terms of a piece's squares decrease like (2 z s)^k/k! with z s < 3.5
    (taylor.h), so that the error is below 1e-16 of |(x, u)|^2 s at the start. */
-enum { NODES = 12, AT_ONCE = 6 };
+enum { NODES = 12 };
 static const double AT[NODES] = {
     0.009219682876640375, 0.04794137181476257, 0.11504866290284765, 0.2063410228566913,
     0.3160842505009099,   0.43738329574426554, 0.5626167042557345,  0.6839157494990901,
@@ -25,27 +25,27 @@ static const double SHARE[NODES] = {
     0.10158371336153296,  0.08003916427167311, 0.05346966299765921, 0.023587668193255914,
 };
 
-/* The sum of SHARE v'Wv over the nodes from the first on, as many as registers hold. v is a curve
-   of degree p. */
-static inline lanes weighted_squares(
-    const double *curve, int p, const double *weight, double s, int first) {
-    lanes v[AT_ONCE], total = filled(0.0);
-    double at[AT_ONCE];
-#pragma GCC unroll 6
-    for (int i = 0; i < AT_ONCE; i++) {
-        at[i] = AT[first + i] * s;
+/* The sum of SHARE v'Wv over the nodes. v is a curve of degree p. */
+static inline lanes weighted_squares(const double *curve, int p, const double *weight, double s) {
+    lanes v[NODES], total[2] = {filled(0.0), filled(0.0)};
+    double at[NODES];
+#pragma GCC unroll 12
+    for (int i = 0; i < NODES; i++) {
+        at[i] = AT[i] * s;
         v[i] = load(curve + p * STRIDE);
     }
     for (int k = p - 1; k >= 0; k--) {
         lanes coefficient = load(curve + k * STRIDE);
-#pragma GCC unroll 6
-        for (int i = 0; i < AT_ONCE; i++)
+#pragma GCC unroll 12
+        for (int i = 0; i < NODES; i++)
             v[i] = fma_scaled(v[i], at[i], coefficient);
     }
-#pragma GCC unroll 6
-    for (int i = 0; i < AT_ONCE; i++)
-        total = fma_lanes(scale(v[i], SHARE[first + i]), weigh(weight, v[i]), total);
-    return total;
+#pragma GCC unroll 12
+    for (int i = 0; i < NODES; i++) {
+        lanes *half = &total[i / (NODES / 2)];
+        *half = fma_lanes(scale(v[i], SHARE[i]), weigh(weight, v[i]), *half);
+    }
+    return add(total[0], total[1]);
 }
 
 /* The sum of SHARE u'Ru over the nodes; u is a curve of degree p with m entries. */
@@ -82,9 +82,7 @@ static double weighted_input_squares(const exact_memory *memory, int p, double s
 
 /* The integral of xQx + uRu over [0, s] of polynomials of degree p. */
 static double square_integrals(const exact_memory *memory, int p, double s) {
-    lanes squares = filled(0.0);
-    for (int first = 0; first < NODES; first += AT_ONCE)
-        squares = add(squares, weighted_squares(memory->x, p, memory->Q, s, first));
+    lanes squares = weighted_squares(memory->x, p, memory->Q, s);
     int u_degree = memory->is_static ? 0 : p; /* of a constant u */
     return s * (sum(squares) + weighted_input_squares(memory, u_degree, s));
 }
@@ -138,7 +136,7 @@ static double raise_supremum(
             return best;
         double level = largest_of(best * (1.0 + CERTAINTY), smallest) / growth;
         level_search search = {level, rate, end_s, 0};
-        double s = first_exit(curve, p, &search, 1, few_steps);
+        double s = first_exit(curve, p, &search, ENDS_BELOW, few_steps);
         if (s == UNRESOLVED) {
             lanes signs = filled(1.0);
             squared(curve, p, 1, (const double *)&signs, memory->squares);
@@ -163,7 +161,7 @@ static double last_above(const double *curve, int p, double end_s, double level,
     if (largest(curve, p, end_s) <= square)
         return NONE;
     level_search back = {level, 0.0, end_s, 1};
-    double back_s = first_exit(curve, p, &back, 0, MOST_STEPS);
+    double back_s = first_exit(curve, p, &back, LIKELY, MOST_STEPS);
     return back_s < 0.0 ? back_s : end_s - back_s;
 }
 

@@ -1,14 +1,434 @@
-/* The code for N states. native/build.py compiles it for each N; with FUSED for processors of the
-   kind x86-64 that have AVX2 and FMA. */
+/* Follows a run from event to event: the code for N states. native/build.py compiles it for each N;
+   with FUSED for processors of the kind x86-64 that have AVX2 and FMA; with WIDE for those that
+   have AVX-512's 32 registers, too. */
 #if defined(__SANITIZE_ADDRESS__) && !defined(__clang__)
 #pragma GCC optimize("O0") /* vectors with checks take minutes to optimise */
 #endif
 
-#include "simulator.h"
+#include "integral_crossing.h"
+#include "piece_measures.h"
+#include "quadratic_crossing.h"
+
+enum { MOST_PIECES = 1000000 };      /* of a run */
+static const double LARGEST = 1e100; /* a state above this norm counts as diverged */
+static const double SLOWEST = 2.0;   /* largest l s on a piece, l the decay rate of eta */
+/* Length of the first search after an event, in units of the time that the error would need by its
+   first coefficients. */
+static const double LOOK_AHEAD = 1.05;
+
+typedef struct { /* the comparison from the start of a piece on */
+    rule_phase phase;
+    double scale; /* the values of a quadratic comparison are divided by its square; otherwise 1 */
+    double level; /* squared threshold, divided by the square of the scale */
+    double auxiliary; /* eta or the integral, at the start */
+} comparison;
+
+static inline double size_of(lanes v) { return sqrt(dot(v, v)); }
+
+/* Write the coefficients of degree begin to end; those of quadratic forms times a factor. The last
+   three arguments are constants, each combination of which has code. */
+static inline __attribute__((always_inline)) void expand_with(
+    exact_memory *memory, models state, double factor, int begin, int end, int moves, int apart,
+    int renewed) {
+    const double *H_k = memory->H_k, *A_k = memory->A_k, *X_k = memory->X_k, *D_k = memory->D_k;
+    const double *KH_k = memory->KH_k, *weight = memory->weight;
+    double *rs = memory->r, *es = memory->e, *ds = memory->d, *qs = memory->q, *xs = memory->x;
+    double *us = memory->u, *errors = memory->own_error, *weighted = memory->own_weighted;
+    lanes x_c = renewed ? subtract(state.r, state.q) : state.r;
+    int quadratic = memory->quadratic;
+    for (int k = begin; k <= end; k++) {
+        int table = k * N * STRIDE, at = k * STRIDE;
+        lanes r = filled(0.0), d = r, q = r, e = times(X_k + table, state.r);
+        e = add(times(A_k + table, state.e), e);
+        if (renewed)
+            e = add(e, times(D_k + table, state.q));
+        if (moves || k == 0) {
+            r = times(H_k + table, state.r);
+            d = apart ? times(H_k + table, state.d) : d;
+            q = renewed ? times(H_k + table, state.q) : q;
+            store(rs + at, r);
+            if (apart || k == 0)
+                store(ds + at, d);
+            if (renewed || k == 0)
+                store(qs + at, q);
+            store(us + at, times(KH_k + table, x_c));
+        }
+        lanes x = subtract(r, e), e_s = add(e, d);
+        store(es + at, e);
+        store(xs + at, x);
+        if (weight != NULL || renewed)
+            store(weighted + at, weigh(weight, renewed ? subtract(e, q) : e));
+        if (!quadratic && apart)
+            store(errors + at, weigh(weight, e_s));
+        if (quadratic) {
+            int64_t place = at * memory->blocks;
+            put_rows(memory->form, memory->blocks, x, e_s, factor, memory->y + place);
+            if (memory->dynamic)
+                put_rows(memory->gain, memory->blocks, x, e_s, factor, memory->w + place);
+        }
+    }
+}
+
+static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
+    int own = memory->weight != NULL || memory->renewed;
+    memory->weighted = own ? memory->own_weighted : memory->e;
+    memory->error = memory->apart ? memory->own_error : memory->weighted;
+    if (memory->renewed && !memory->has_D_k) {
+        driven(memory->A, memory->minus_BK, memory->H_k, memory->D_k);
+        memory->has_D_k = 1;
+    }
+    if (memory->renewed)
+        expand_with(memory, state, factor, begin, end, 1, 1, 1);
+    else if (memory->is_static)
+        expand_with(memory, state, factor, begin, end, 0, 1, 0);
+    else if (memory->apart)
+        expand_with(memory, state, factor, begin, end, 1, 1, 0);
+    else
+        expand_with(memory, state, factor, begin, end, 1, 0, 0);
+}
+
+/* The same state with the plant's own as the reference, if that is small beside the present one:
+   their difference would lose its digits. */
+static models renewed(exact_memory *memory, models state) {
+    const double small = 1e-8; /* of a square */
+    lanes x = plant_of(state);
+    if (dot(x, x) < small * dot(state.r, state.r)) {
+        state = (models){x, filled(0.0), sensor_error(state), subtract(state.q, state.e)};
+        memory->renewed = 1;
+    }
+    return state;
+}
+
+/* The rule's span after an event or after the start. */
+static rule_span next_span(const exact_memory *memory, models state, double t_s) {
+    lanes x = plant_of(state);
+    double left = memory->quadratic ? left_side(memory, x) : 0.0;
+    double size = memory->rule->forecasts ? size_of(weigh(memory->forecast_weight, x)) : 0.0;
+    return span_after(memory, t_s, left, size);
+}
+
+/* The comparison of a phase, scaled to the state. */
+static comparison comparison_at(
+    const exact_memory *memory, rule_phase phase, models state, double auxiliary) {
+    if (!memory->quadratic)
+        return (comparison){phase, 1.0, 0.0, auxiliary};
+    double size = sqrt(dot(state.r, state.r) + dot(state.e, state.e) + dot(state.d, state.d));
+    double scale = largest_of(largest_of(size, phase.threshold), sqrt(fabs(auxiliary)));
+    scale = largest_of(scale, 1e-150);
+    double level = phase.threshold / scale;
+    return (comparison){phase, scale, level * level, auxiliary};
+}
+
+/* The length of the first search after an event, from the first coefficients. */
+static double first_window(exact_memory *memory, const comparison *now, int64_t point, double t_s) {
+    double threshold = now->phase.threshold;
+    if (memory->quadratic) {
+        compare(memory, 2, now->auxiliary / (now->scale * now->scale));
+        double soon_s = estimate_root(memory->g, now->level, 2.0 * now->phase.rate_per_s);
+        return largest_of(LOOK_AHEAD * soon_s, (double)point * memory->grid_s - t_s);
+    }
+    lanes first = load(memory->error + STRIDE), second = load(memory->error + 2 * STRIDE);
+    double speed = size_of(first);
+    if (speed == 0.0)
+        return INFINITY;
+    if (memory->integrates) /* of an error that grows in proportion to time: speed s^2/2 */
+        return LOOK_AHEAD * sqrt(2.0 * largest_of(threshold - now->auxiliary, 0.0) / speed);
+    double norm[] = {0.0, speed, dot(first, second) / speed};
+    return LOOK_AHEAD * estimate_root(norm, threshold, now->phase.rate_per_s);
+}
+
+/* The time of the next event on a piece, NONE or UNRESOLVED; the integral; the next grid point. */
+static double find_event(
+    exact_memory *memory, comparison *now, int p, int64_t *point, double t_s, double window_s,
+    forecast crossing) {
+    const rule_phase *phase = &now->phase;
+    if (memory->quadratic) {
+        if (!phase->compares && !memory->dynamic)
+            return NONE;
+        int degree = compare(memory, p, now->auxiliary / (now->scale * now->scale));
+        level_search search = {now->level, 2.0 * phase->rate_per_s, window_s, 0};
+        return phase->compares ? first_event(memory, degree, &search, point, t_s) : NONE;
+    }
+    double level = phase->compares ? phase->threshold : INFINITY;
+    level_search search = {level, phase->rate_per_s, window_s, 0};
+    if (memory->integrates)
+        return first_excess(memory->error, p, &search, &now->auxiliary);
+    return phase->compares ? first_exit(memory->error, p, &search, crossing, MOST_STEPS) : NONE;
+}
+
+/* e^(rt) of the supremum; r is 0 from some time on. */
+static double growth_at(const noack_exact *exact, double t_s) {
+    double rate = exact->fading_per_s;
+    return rate > 0.0 ? fixed_exp(rate * least(t_s, exact->fading_until_s)) : 1.0;
+}
+
+/* Raise a row's supremum by that of a piece; return 0 if it is UNRESOLVED. bound: the norm does not
+   exceed its threshold; NULL: it may. */
+static int measure_supremum(
+    exact_memory *memory, exact_run *run, models end, int q, double t_s, double length_s,
+    const rule_phase *bound) {
+    const noack_exact *exact = memory->exact;
+    int of_state = exact->measure == NOACK_EXACT_STATE, fades = t_s < exact->fading_until_s;
+    const double *curve = of_state ? memory->x : memory->weighted;
+    lanes last = of_state ? plant_of(end) : weigh(memory->weight, controller_error(end));
+    double rate = fades ? exact->fading_per_s : 0.0, growth = run->growth;
+    run->growth = fades ? growth_at(exact, t_s + length_s) : growth;
+    double grown =
+        t_s + length_s <= exact->fading_until_s ? run->growth : growth * fixed_exp(rate * length_s);
+    double before = run->row->sup_e_c_scaled, at_s = length_s, ceiling = INFINITY;
+    if (bound != NULL)
+        ceiling = bound->threshold * (bound->rate_per_s > 0.0 ? growth : grown);
+    double best = largest_of(before, size_of(last) * grown);
+    if (!(ceiling <= best * (1.0 + CERTAINTY)))
+        best = raise_supremum(memory, best, curve, q, length_s, rate, growth, &at_s);
+    if (best == UNRESOLVED)
+        return 0;
+    run->at_s = best > before ? t_s + at_s : run->at_s;
+    run->row->sup_e_c_scaled = best;
+    return 1;
+}
+
+/* Add a piece's contribution to a row; settled is a level of |x|. Return the last time on the piece
+ * at which |x| > settled; NONE; or UNRESOLVED. */
+static double measure_piece(
+    exact_memory *memory, exact_run *run, models end, double t_s, double length_s, double settled,
+    const rule_phase *bound) {
+    noack_exact_row *row = run->row;
+    int64_t measure = memory->exact->measure;
+    int q = degree_for(memory->measured_s, length_s);
+    if (measure == NOACK_EXACT_ROW || measure == NOACK_EXACT_COST)
+        row->cost += square_integrals(memory, q, length_s);
+    if (measure == NOACK_EXACT_TIMES || measure == NOACK_EXACT_COST)
+        return NONE;
+    if (!measure_supremum(memory, run, end, q, t_s, length_s, bound))
+        return UNRESOLVED;
+    if (measure != NOACK_EXACT_ROW)
+        return NONE;
+    lanes x = plant_of(end);
+    double within_s = last_above(memory->x, q, length_s, settled, x);
+    if (within_s >= 0.0)
+        row->settling_s = t_s + within_s;
+    return within_s;
+}
+
+/* Count an event, log it, and return whether its update arrives. */
+static int count_event(
+    const exact_memory *memory, exact_run *run, models state, double t_s, double last_s) {
+    const noack_exact *exact = memory->exact;
+    noack_exact_row *row = run->row;
+    int delivered = arrives(exact, run);
+    if (row->transmissions < exact->event_places) {
+        int64_t at = run->number * exact->event_places + row->transmissions;
+        exact->event_s[at] = t_s;
+        exact->delivered[at] = (uint8_t)delivered;
+        for (int64_t i = 0; exact->states != NULL && i < exact->n; i++) {
+            double *to = exact->states + 3 * exact->n * at + i;
+            to[0] = entry(plant_of(state), (int)i);
+            to[exact->n] = entry(sensor_error(state), (int)i);
+            to[2 * exact->n] = entry(controller_error(state), (int)i);
+        }
+    }
+    if (row->transmissions > 0)
+        row->inter_event_min_s = least(row->inter_event_min_s, t_s - last_s);
+    else if (t_s == 0.0 && !delivered)
+        row->sup_e_c_scaled = size_of(weigh(memory->weight, controller_error(state)));
+    row->transmissions += 1;
+    row->deliveries += delivered;
+    return delivered;
+}
+
+/* The models after an event: x_s = x, and x_c = x if the update arrives. */
+static models updated(models state, int delivered) {
+    lanes nothing = filled(0.0);
+    if (delivered)
+        return (models){plant_of(state), nothing, nothing, nothing};
+    return (models){state.r, state.e, subtract(nothing, state.e), state.q};
+}
+
+static void finish_row(
+    noack_exact_row *row, int64_t status, double t_s, double span_s, int above, double norm) {
+    int64_t gaps = row->transmissions - 1;
+    int finished = status == NOACK_EXACT_OK;
+    row->inter_event_min_s = gaps > 0 ? row->inter_event_min_s : NAN;
+    row->inter_event_mean_s = gaps > 0 ? span_s / (double)gaps : NAN;
+    row->settling_s = finished && !above ? row->settling_s : NAN;
+    row->cost = finished ? row->cost : NAN;
+    row->sup_e_c_scaled = finished ? row->sup_e_c_scaled : NAN;
+    row->final_norm = finished ? norm : NAN;
+    row->diverged_at_s = status == NOACK_EXACT_DIVERGED ? t_s : NAN;
+    row->status = status;
+}
+
+/* A state from x, e_s and e_c: the reference is x_c. */
+static models state_of(const double *signals) {
+    lanes x = load(signals), e_s = load(signals + STRIDE), e_c = load(signals + 2 * STRIDE);
+    return (models){add(x, e_c), e_c, subtract(e_s, e_c), filled(0.0)};
+}
+
+/* Follow a run to its end, or to its first event. */
+static void follow(exact_memory *memory, exact_run *run) {
+    const noack_exact *exact = memory->exact;
+    noack_exact_row *row = run->row;
+    double horizon_s = exact->horizon_s, farthest_s = memory->reach_s[DEGREES - 1];
+    models state = state_of(run->state);
+    double start = size_of(plant_of(state)), settled = exact->settle * start;
+    double t_s = run->t_s, last_s = -1.0, first_s = 0.0, auxiliary = run->auxiliary;
+    int64_t status = NOACK_EXACT_UNDECIDED, point = 0;
+    int event = run->event != 0;
+    int above = start > settled, fresh = 1, looked = 0, agree = size_of(state.d) == 0.0;
+    memory->renewed = 0;
+    run->growth = growth_at(exact, t_s);
+    rule_span span = {0};
+    if (memory->dynamic && memory->rule->decay_per_s > 0.0)
+        farthest_s = least(farthest_s, SLOWEST / memory->rule->decay_per_s);
+    for (int piece = 0; piece < MOST_PIECES && farthest_s > 0.0; piece++) {
+        if (event && run->stops) {
+            status = NOACK_EXACT_OK;
+            break;
+        }
+        if (event) {
+            if (row->transmissions >= exact->most_events || t_s <= last_s) {
+                status = NOACK_EXACT_TOO_MANY_EVENTS;
+                break;
+            }
+            agree = count_event(memory, run, state, t_s, last_s);
+            first_s = row->transmissions == 1 ? t_s : first_s;
+            last_s = t_s;
+            fresh = 1;
+            state = updated(state, agree);
+            memory->renewed &= !agree;
+        }
+        if (t_s >= horizon_s) {
+            status = NOACK_EXACT_OK;
+            break;
+        }
+        if (fresh) {
+            span = next_span(memory, state, t_s);
+            fresh = looked = 0;
+            point = span.point;
+            auxiliary = memory->integrates ? 0.0 : auxiliary;
+        }
+        state = renewed(memory, state);
+        rule_phase phase = phase_at(memory, &span, t_s);
+        forecast crossing = UNKNOWN;
+        double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
+        comparison now = comparison_at(memory, phase, state, auxiliary);
+        memory->apart = !agree || memory->renewed;
+        expand(memory, state, 1.0 / now.scale, 0, 2);
+        if (phase.compares && !looked) {
+            if (!is_within(state, LARGEST, phase.threshold)) {
+                status = NOACK_EXACT_DIVERGED;
+                break;
+            }
+            double soon_s = first_window(memory, &now, point, t_s);
+            crossing = soon_s < least(window_s, left_s) ? LIKELY : UNKNOWN;
+            window_s = least(window_s, soon_s);
+            looked = 1;
+        }
+        window_s = least(window_s, left_s);
+        int p = degree_for(memory->reach_s, window_s);
+        expand(memory, state, 1.0 / now.scale, 3, p);
+        double found_s = find_event(memory, &now, p, &point, t_s, window_s, crossing);
+        if (found_s == UNRESOLVED)
+            break;
+        event = found_s != NONE;
+        double spent_s = event ? found_s : window_s;
+        auxiliary = now.auxiliary;
+        if (memory->quadratic)
+            auxiliary = memory->dynamic ? polynomial(memory->eta, 2 * p + 1 + MORE, spent_s)
+                                              * (now.scale * now.scale)
+                                        : 0.0;
+        state = state_at(memory, degree_for(memory->reach_s, spent_s), spent_s);
+        int is_usual = phase.threshold > 1e-10 && phase.rate_per_s * spent_s < 1.0;
+        if (!(is_usual && is_within(state, 1e30, 1.0))
+            && !is_within(state, LARGEST, threshold_after(&phase, spent_s))) {
+            status = NOACK_EXACT_DIVERGED;
+            t_s += passed_at(memory, spent_s, LARGEST, &phase);
+            break;
+        }
+        int is_bounded = agree && !memory->quadratic && phase.compares && !memory->integrates
+                         && exact->measure != NOACK_EXACT_STATE; /* e_c = e_s */
+        const rule_phase *bound = is_bounded ? &phase : NULL;
+        double within_s = measure_piece(memory, run, state, t_s, spent_s, settled, bound);
+        if (within_s == UNRESOLVED)
+            break;
+        above = within_s == spent_s;
+        t_s = event || window_s < left_s ? t_s + spent_s : least(phase.until_s, horizon_s);
+        event = event || t_s >= span.due_s;
+    }
+    finish_row(row, status, t_s, last_s - first_s, above, size_of(plant_of(state)));
+    run->t_s = t_s;
+    run->event = event;
+    run->auxiliary = auxiliary;
+    store(run->state, plant_of(state));
+    store(run->state + STRIDE, sensor_error(state));
+    store(run->state + 2 * STRIDE, controller_error(state));
+}
+
+/* Compute what all runs share. */
+static void share(exact_memory *memory) {
+    powers(memory->H, memory->H_k);
+    for (int at = 0; at < (TERMS + 1) * N * STRIDE; at += STRIDE)
+        store(memory->KH_k + at, times(memory->K, load(memory->H_k + at)));
+}
+
+/* Compute a plant's tables; A is (n, n), B (n, m). */
+static void prepare(exact_memory *memory, const double *A, const double *B) {
+    const noack_exact *exact = memory->exact;
+    pad(exact->n, exact->n, A, STRIDE, memory->A);
+    pad(exact->n, exact->m, B, STRIDE, memory->B);
+    for (int j = 0; j < N; j++) {
+        lanes BK = times(memory->B, load(memory->K + j * STRIDE));
+        lanes column = add(load(memory->A + j * STRIDE), BK);
+        store(memory->minus_BK + j * STRIDE, subtract(filled(0.0), BK));
+        store(memory->E + j * STRIDE, subtract(column, load(memory->H + j * STRIDE)));
+    }
+    powers(memory->A, memory->A_k);
+    driven(memory->A, memory->E, memory->H_k, memory->X_k);
+    find_reaches(memory);
+    memory->has_D_k = 0;
+}
+
+/* The states (count, 3, n) at ascending times from a state (3, n) on, without events in between;
+   NAN where no polynomial reaches. */
+static void sample(
+    exact_memory *memory, const double *state, double start_s, int64_t count, const double *t_s,
+    double *states) {
+    int64_t n = memory->exact->n, pieces = 0, expanded = 0;
+    models at = state_of(state);
+    double farthest_s = memory->reach_s[DEGREES - 1];
+    memory->apart = 1;
+    memory->renewed = 0;
+    for (int64_t i = 0; i < count; i++, states += 3 * n) {
+        while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
+            if (!expanded) {
+                at = renewed(memory, at);
+                expand(memory, at, 1.0, 0, HIGHEST);
+            }
+            at = state_at(memory, HIGHEST, farthest_s);
+            start_s += farthest_s;
+            expanded = 0;
+        }
+        if (!expanded) {
+            at = renewed(memory, at);
+            expand(memory, at, 1.0, 0, HIGHEST);
+        }
+        expanded = 1;
+        double after_s = t_s[i] - start_s;
+        models there = state_at(memory, HIGHEST, after_s);
+        for (int j = 0; j < n; j++) {
+            states[j] = after_s <= farthest_s ? entry(plant_of(there), j) : NAN;
+            states[n + j] = after_s <= farthest_s ? entry(sensor_error(there), j) : NAN;
+            states[2 * n + j] = after_s <= farthest_s ? entry(controller_error(there), j) : NAN;
+        }
+    }
+}
 
 #define JOIN(name, n) name##n
 #define NAME(name, n) JOIN(name, n)
-#ifdef FUSED
+#if defined(WIDE)
+const exact_code NAME(exact_wide_, N) = {N, STRIDE, share, prepare, follow, sample};
+#elif defined(FUSED)
 const exact_code NAME(exact_fused_, N) = {N, STRIDE, share, prepare, follow, sample};
 #else
 const exact_code NAME(exact_plain_, N) = {N, STRIDE, share, prepare, follow, sample};

@@ -177,11 +177,15 @@ static inline double bend(const double *curve, int p, double s) {
     return ROUNDED_UP * 2.0 * sqrt(dot(half, half));
 }
 
-/* A bound on |y|^2 in [0, s]. */
+/* A bound on |y|^2 in [0, s]; p is even. */
 static inline double largest(const double *curve, int p, double s) {
-    lanes total = magnitude(load(curve + p * STRIDE));
-    for (int k = p - 1; k >= 0; k--)
-        total = fma_scaled(total, s, magnitude(load(curve + k * STRIDE)));
+    lanes even = magnitude(load(curve + p * STRIDE)), odd = filled(0.0);
+    double square = s * s;
+    for (int k = p - 2; k >= 0; k -= 2) {
+        even = fma_scaled(even, square, magnitude(load(curve + k * STRIDE)));
+        odd = fma_scaled(odd, square, magnitude(load(curve + (k + 1) * STRIDE)));
+    }
+    lanes total = fma_scaled(odd, s, even);
     return ROUNDED_UP * dot(total, total);
 }
 

@@ -8,9 +8,7 @@
 
 enum {
     FEW_BUFFERS = 16,
-    BUSY_NS = 10000, /* a datagram that comes so soon after others is expected to be one of many */
-    LOOP_OFFSET = 6, /* place of the loop's number in a datagram's header (docs/wire.md) */
-    LOOP_HEADER_BYTES = 32
+    BUSY_NS = 10000 /* a datagram that comes so soon after others is expected to be one of many */
 };
 
 enum { NO_CLIENT = -1, REFUSED = -2, NO_ROOM = -3 };
@@ -121,11 +119,9 @@ static int64_t release_due(noack_relay *relay, int64_t until_ns) {
 
 /* The row of the datagram's loop; count a datagram of no loop as refused. */
 static int64_t row_of_loop(noack_relay *relay, const uint8_t *data, int64_t size_bytes) {
-    if (size_bytes >= LOOP_HEADER_BYTES) {
-        int64_t loop = data[LOOP_OFFSET] | data[LOOP_OFFSET + 1] << 8;
-        if (loop < relay->loops)
-            return loop;
-    }
+    int64_t loop = noack_wire_loop(data, size_bytes);
+    if (0 <= loop && loop < relay->loops)
+        return loop;
     relay->no_loop++;
     return REFUSED;
 }

@@ -1,8 +1,7 @@
 """The machines of one role, of all loops of a run: the core's steps, and Python's part of them.
 
 A driver in C (live, in virtual time, in replay) makes the steps. It returns to this class where a
-step needs Python: users' code, changes of settings, rows to take. One input at a time goes through
-:meth:`LoopMachines.handle` and :meth:`LoopMachines.on_timer`, which make the same steps.
+step needs Python: users' code, changes of settings, rows to take.
 
 What a role describes of each machine is a *part*: it fills the core's structure, and answers the
 questions at which a step stops (``enum noack_question`` in native/noack.h).
@@ -24,9 +23,9 @@ from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Notice, Output, Record
+from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
-from noack.protocol.wire_format import Flow, Message
+from noack.protocol.wire_format import Flow
 
 Rows = NDArray[np.void]
 NewRows = Callable[[int, "np.dtype[np.void]"], Rows]
@@ -327,52 +326,6 @@ class LoopMachines:
             self._note_counting(loop)
         return outputs
 
-    def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Process a message that arrives at ``now_ns``; return what the machine does.
-
-        Raises:
-            ValueError: the loop's machine does not receive such messages.
-        """
-        part, machine = self.parts[message.loop], self.machines[message.loop].machine
-        receptions = [machine.received]
-        if part.shape.acknowledged:
-            receptions.append(machine.acknowledgements)
-        entries = {reception.flow: reception.entries for reception in receptions}
-        if entries.get(message.flow) != len(message.vector):
-            raise ValueError(
-                f"this {self.role.name} receives no {message.flow.name.lower()} "
-                f"of {len(message.vector)} entries"
-            )
-        given, self._message.loop = self._message, message.loop
-        given.flow, given.sequence, given.t_ns = message.flow, message.sequence, message.t_ns
-        given.entries = len(message.vector)
-        given.vector[0 : given.entries] = message.vector.tolist()
-        return self._outputs(
-            lambda: int(core.noack_process_handle(self.core, self._message, now_ns))
-        )
-
-    def on_timer(self, now_ns: int) -> Sequence[Output]:
-        """Do the one tick that is due; return what the machine does."""
-        if self.next_deadline_ns() is None:
-            return ()
-        return self._outputs(lambda: int(core.noack_process_tick(self.core, now_ns)))
-
-    def _outputs(self, step: Any) -> Sequence[Output]:
-        outputs: list[Output] = []
-        while (question := step()) != core.NOACK_DONE:
-            if question != core.NOACK_ROWS_FULL:
-                self.answer(question)
-            outputs += self._taken()
-        if self.core.output.sends:
-            outputs.insert(0, message_of(self.core.output.message))
-        outputs += self._taken()
-        return outputs
-
-    def _taken(self) -> list[Output]:
-        records = [Record(table, rows[k].item()) for table, rows in self.take_rows()
-                   for k in range(len(rows))]  # fmt: skip
-        return [*records, *self.take_notices()]
-
     def _inspect(self, rows: Rows) -> None:
         notable = self._notable(rows)
         if not len(notable):
@@ -406,13 +359,6 @@ def _with_loop(loop: int, output: Record | Notice) -> Record | Notice:
     if isinstance(output, Record):
         return Record(output.table, (loop, *output.row))
     return output._replace(loop=loop)
-
-
-def message_of(given: Any) -> Message:
-    """Return a ``noack_message`` as a message."""
-    data = ffi.buffer(given.vector, 8 * given.entries)
-    vector = np.frombuffer(bytes(data), np.float64)
-    return Message(Flow(given.flow), given.sequence, given.t_ns, vector, given.loop)
 
 
 def row_types(shapes: Iterable[RecordShape]) -> Mapping[str, np.dtype[np.void]]:

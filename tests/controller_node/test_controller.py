@@ -18,11 +18,10 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossRule,
 )
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import machine, state_of
+from tests.machine_parts import OneLoop, machine, state_of
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])
@@ -36,7 +35,7 @@ def new_controller(
     horizon_ns: int = 10**9,
     constraints: Sequence[LossRule] = (),
     **more: Any,
-) -> LoopMachines:
+) -> OneLoop:
     controller = Controller(
         H,
         LinearFeedback(K),
@@ -55,7 +54,7 @@ def update(sequence: int, t_ns: int, x: Sequence[float] = (1.0, -2.0)) -> Messag
     return Message(Flow.UPDATE, sequence, t_ns, np.array(x))
 
 
-def tick(controller: LoopMachines) -> tuple[Message, Any]:
+def tick(controller: OneLoop) -> tuple[Message, Any]:
     """Execute the next tick on time; return the actuation and its row."""
     t_ns = controller.next_deadline_ns()
     assert t_ns is not None

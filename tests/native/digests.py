@@ -59,7 +59,7 @@ def _functions() -> None:
 
 
 if __name__ == "__main__":
-    print("uses AVX2 and FMA:", core.noack_exact_is_fused())
+    print("instructions:", core.noack_exact_instructions())
     _records()
     _batches()
     _functions()

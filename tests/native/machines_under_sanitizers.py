@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from noack.core.core_library import LIBRARY, core, load_core
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.wire_format import Flow, Message
+from tests.machine_parts import SteppedMachines
 from tests.noack.machines.any_machines import (
     MS,
     Sizes,
@@ -80,7 +80,7 @@ def test_this_is_another_core_than_noacks() -> None:
 
 def machines_of(
     role: str, loops: list[tuple[Sizes, int]], scale: float, **more: Any
-) -> LoopMachines:
+) -> SteppedMachines:
     """Machines of these sizes and seeds, whose vectors and matrices have this scale."""
     with np.errstate(all="ignore"):
         parts: list[Any] = [
@@ -89,14 +89,14 @@ def machines_of(
             else plant(seed, of, min(scale, 1e3))  # others are refused before
             for of, seed in loops
         ]  # fmt: skip
-        own = LoopMachines(parts, **more)
+        own = SteppedMachines(parts, **more)
         for one in own.machines:
             if role == "plant":
                 one.x[0] *= scale
     return own
 
 
-def drive(own: LoopMachines, given_inputs: list[Any]) -> None:
+def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
     """Give machines their inputs; an observer's measurements are at most 100 steps apart."""
     for item in given_inputs:
         if isinstance(item, int):

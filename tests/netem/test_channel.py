@@ -15,6 +15,7 @@ from noack.core.core_library import core, ffi
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Record
 from tests.netem.any_settings import capped, computable, harsh
+from tests.netem.stepped_channel import SteppedChannel
 from tests.oracles.link import Duplex, Link
 
 LOOPS = 4
@@ -58,13 +59,13 @@ def test_it_does_what_the_plain_network_does(
         LinkState(one, 5, name, rows=LOOPS)
         for one, name in zip((first, second), names, strict=True)
     ]
-    channel = Channel(links, loops=LOOPS, first_number=number)
+    channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))
     now_ns, rng = 0, np.random.default_rng(1)
     for k, (flow, size, step_ns, leaves) in enumerate(arriving):
         if later is not None and k == len(arriving) // 2:
             changed = later.model_copy(update={"first_delivered": first.first_delivered})
             forward.change(changed)
-            channel.change(changed)
+            channel.channel.change(changed)
         now_ns += step_ns
         while leaves and (due_ns := expected.next_deadline_ns()) is not None and due_ns <= now_ns:
             assert channel.next_deadline_ns() == due_ns
@@ -77,13 +78,13 @@ def test_it_does_what_the_plain_network_does(
         assert channel.next_deadline_ns() == due_ns
         assert content_of(channel.on_timer(due_ns)) == content_of(expected.on_timer(due_ns))
     assert channel.next_deadline_ns() is None
-    assert [one.counters for one in channel.links] == [forward.counters, reverse.counters]
+    assert [one.counters for one in channel.channel.links] == [forward.counters, reverse.counters]
 
 
 def test_room_for_delayed_datagrams_grows(content: dict[str, Any]) -> None:
     delay = {"kind": "delay", "delay_s": 1.0}
     network = content["network"] | {"loss": {"model": "lossless"}, "impairments": [delay]}
-    channel = channel_of(resolve(validate(content | {"network": network}, "")))
+    channel = SteppedChannel(channel_of(resolve(validate(content | {"network": network}, ""))))
     sent = [bytes([k % 256, k // 256]) for k in range(1000)]
     for k, data in enumerate(sent):
         assert not content_of(channel.handle(Datagram(0, data), k))[0]

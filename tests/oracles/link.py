@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, flipped, link_name
+from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_name
 from netem.link_state import LinkState
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
@@ -134,8 +134,8 @@ class Link:
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, self._first_number + decision.packet, min(message.arrival_ns, now_ns),
-            now_ns, message.flow, Fate(decision.fate), decision.consecutive_losses,
+            self._inputs, self._first_number + decision.packet, now_ns, now_ns,
+            message.flow, Fate(decision.fate), decision.consecutive_losses,
             decision.release_ns, decision.copy_ns, decision.bit, len(message.data), head,
         )  # fmt: skip
         self._inputs += 1
@@ -274,3 +274,12 @@ def network_of(
     settings, name = resolved.network.link_of(others[0]), link_name(others[0])
     reverse = link_of(settings, resolved.seeds.loss, name, start)
     return Duplex(forward, reverse, first_number=start.first_number, loops=loops)
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """The data with one bit flipped; bit 0 is the least significant bit of byte 0; -1: none."""
+    if bit < 0:
+        return data
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)

@@ -12,11 +12,10 @@ from noack.config.scenario_file import validate
 from noack.disturbances.gaussian import GaussianDisturbance
 from noack.disturbances.step import StepDisturbance
 from noack.disturbances.uniform import UniformDisturbance
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import BLOCK, MeasurementModel, disturbance_of, measurement_model_of
-from tests.machine_parts import plant_of, state_of
+from tests.machine_parts import OneLoop, plant_of, state_of
 
 STEPS = 4000
 
@@ -41,7 +40,7 @@ def resolved(content: dict[str, Any]) -> Scenario:
     return resolve(validate(content, "test"))
 
 
-def steps_of(plant: LoopMachines, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
+def steps_of(plant: OneLoop, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
     rows, sent = [], []
     for k in range(count):
         plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)

@@ -6,19 +6,18 @@ import pytest
 
 from noack.config.resolution import resolved_loops
 from noack.config.scenario_file import validate
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import plants_of
-from tests.machine_parts import linear_plant, state_of
+from tests.machine_parts import OneLoop, linear_plant, state_of
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])
 B = np.array([[0.0, 1.0], [2.0, -1.0]])
 
 
-def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> LoopMachines:
+def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> OneLoop:
     x0 = np.array([1.0, -0.5])
     return linear_plant(A, B, x0, H_NS, horizon_ns=horizon_ns, measure_every=measure_every)
 

@@ -7,11 +7,10 @@ import pytest
 
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import plant_of
+from tests.machine_parts import OneLoop, plant_of
 
 MS = 1_000_000
 K = np.array([[-3.0, -1.5]])
@@ -35,7 +34,7 @@ def scenario(policy: str, **changes: Any) -> Any:
 class Driven:
     """A plant that executes every step on time."""
 
-    def __init__(self, plant: LoopMachines) -> None:
+    def __init__(self, plant: OneLoop) -> None:
         self.plant = plant
         self.steps: dict[int, Any] = {}
         self.notices: list[Notice] = []

@@ -14,7 +14,6 @@ from noack.config.scenario_file import validate
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.machines.loop_machines import LoopMachines
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import (
@@ -26,7 +25,7 @@ from noack.observers.observer_settings import (
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from sensor_node.sensor import Observer, Sensor
-from tests.machine_parts import machine, sensor_of
+from tests.machine_parts import OneLoop, machine, sensor_of
 from tests.trigger_rules import absolute_rule
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
@@ -85,7 +84,7 @@ def luenberger(L: Matrix) -> LuenbergerSettings:
     )
 
 
-def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> LoopMachines:
+def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> OneLoop:
     """A sensor with a Luenberger observer that starts at a known estimate."""
     start = np.array(x_hat)
     observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)

@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, transition
-from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import Sensor
-from tests.machine_parts import machine, state_of
+from tests.machine_parts import OneLoop, machine, state_of
 from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -150,7 +149,7 @@ def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
     return sent, np.array([record.row], tables(2, 1, acknowledged=True)[record.table])[0]
 
 
-def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> LoopMachines:
+def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> OneLoop:
     known = None if x0 is None else np.asarray(x0, dtype=float)
     return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
 

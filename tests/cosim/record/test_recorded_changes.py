@@ -38,6 +38,7 @@ from noack.protocol.wire_format import Flow, Message
 from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
 from tests.machine_parts import controller_of, sensor_of
+from tests.netem.stepped_channel import SteppedChannel
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -136,7 +137,7 @@ def test_the_plant_and_both_models_converge_to_the_set_point() -> None:
 
 def test_a_cap_lowered_during_a_burst_delivers_the_next_datagram() -> None:
     content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "worst_case"}}}
-    link = channel_of(resolve(validate(content, "here")))
+    link = SteppedChannel(channel_of(resolve(validate(content, "here"))))
     runs = []
     for number in range(12):
         if number == 5:  # one datagram was delivered, then four were lost

@@ -22,6 +22,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, loop_number
 from noack.runtime.life_cycle import HORIZON
 from tests.machine_interface import Machine
 from tests.machine_parts import controller_of, plant_of, sensor_of
+from tests.netem.stepped_channel import SteppedChannel
 from tests.wire_decoder import Decoder
 
 KEY = bytes(KEY_BYTES)
@@ -129,7 +130,8 @@ class Shuttle:
         wraps: Mapping[str, Wrap] | None = None,
     ) -> None:
         phases = phases_ns(scenario)
-        machines: dict[str, Machine[Any]] = {"netem": channel_of(scenario, loops=len(loops))}
+        machines: dict[str, Machine[Any]] = {}
+        machines["netem"] = SteppedChannel(channel_of(scenario, loops=len(loops)))
         for role, machine_of in MACHINES.items():
             single = [machine_of(loop) for loop in loops]
             machines[role] = Loops(single, phases) if numbered else single[0]

@@ -30,7 +30,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy, Policy, TriggerDecision
 from plant_server.plant import NEVER_NS, Disturbance, MeasurementModel, Plant, Watchdog
 from sensor_node.sensor import Observer, Sensor
-from tests.machine_parts import OneLoop
+from tests.machine_parts import OneLoop, SteppedMachines
 from tests.trigger_rules import TABLES, random_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -259,7 +259,7 @@ class Inputs:
 
 
 def driven(
-    machines: LoopMachines, inputs: Inputs, count: int
+    machines: SteppedMachines, inputs: Inputs, count: int
 ) -> Iterator[tuple[int, Message | None, int, list[Any]]]:
     """Give machines inputs; yield the loop, the input, its time and the plain outputs of each."""
     for _ in range(count):

@@ -20,7 +20,7 @@ from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.errors import CallerError
 from noack.core.linear_systems import discretise
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
-from noack.machines.loop_machines import LoopMachines, row_types
+from noack.machines.loop_machines import row_types
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import GENERATION, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -36,7 +36,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_rule import CodedPolicy
 from plant_server.plant import BLOCK, Plant
 from sensor_node.sensor import Sensor, sensors_of
-from tests.machine_parts import controller_of, machine, sensor_of
+from tests.machine_parts import SteppedMachines, controller_of, machine, sensor_of
 from tests.noack.machines.any_machines import (
     MS,
     Inputs,
@@ -80,7 +80,7 @@ def test_several_loops_do_what_each_does_alone(
     of: Sizes, role: str, loops: list[tuple[int, int]], seed: int
 ) -> None:
     phases_ns = [phase_ms * MS for _, phase_ms in loops]
-    together = LoopMachines([part_of(role, number, of) for number, _ in loops], phases_ns)
+    together = SteppedMachines([part_of(role, number, of) for number, _ in loops], phases_ns)
     alone = [machine(part_of(role, number, of)) for number, _ in loops]
     # Only the numbers of the loops and their phases differ; ticks are in the order of their times.
     dues: list[tuple[int, int]] = []
@@ -102,7 +102,7 @@ def test_several_loops_do_what_each_does_alone(
 
 def outputs_of(part: Part, seed: int = 1, rows: int = 1024, ask: Callable[..., None] | None = None):
     """All outputs of a machine; ``ask`` is called before each input, and may provoke a question."""
-    one = LoopMachines([part], rows=rows)
+    one = SteppedMachines([part], rows=rows)
     inputs, found = Inputs(one, seed), []
     while len(found) < COUNT:
         if ask is not None:
@@ -236,7 +236,7 @@ def test_losses_of_many_loops_are_compared_with_the_guarantee_of_each(
                    LossGuarantee((LongestBurst(loop),)), np.ones(1))
         for loop in range(4)
     ]  # fmt: skip
-    together = LoopMachines(parts, [0, MS, 2 * MS, 3 * MS])
+    together = SteppedMachines(parts, [0, MS, 2 * MS, 3 * MS])
     newest, expected, found = [-1] * 4, [], []
     for number, (loop, losses) in enumerate(received):
         sequence, t_ns = newest[loop] + losses + 1, number * MS
@@ -249,15 +249,6 @@ def test_losses_of_many_loops_are_compared_with_the_guarantee_of_each(
     assert found == expected
 
 
-def test_a_message_that_a_machine_does_not_receive_is_refused() -> None:
-    own = machine(Sensor(np.zeros((1, 1)), absolute_rule(1.0, n=1)))
-    for flow, entries in ((Flow.ACKNOWLEDGEMENT, 0), (Flow.MEASUREMENT, 2), (Flow.UPDATE, 1)):
-        with pytest.raises(ValueError, match=f"receives no {flow.name.lower()} of {entries} entr"):
-            own.handle(Message(flow, 0, 0, np.zeros(entries)), 0)
-    with pytest.raises(IndexError):
-        own.handle(Message(Flow.MEASUREMENT, 0, 0, np.zeros(1), 1), 0)
-
-
 @given(
     st.lists(st.tuples(sizes(), st.integers(0, 1000)), min_size=2, max_size=4),
     st.sampled_from(["plant", "sensor", "controller"]),
@@ -267,7 +258,7 @@ def test_rows_of_loops_of_different_sizes_are_those_of_each_alone(
     loops: list[tuple[Sizes, int]], role: str, seed: int
 ) -> None:
     """A loop's vector is the beginning of the table's; the rest is NaN; other columns are 0."""
-    together = LoopMachines([part_of(role, number, of) for of, number in loops])
+    together = SteppedMachines([part_of(role, number, of) for of, number in loops])
     alone = [machine(part_of(role, number, of)) for of, number in loops]
     inputs = Inputs(together, seed)
     for _ in range(COUNT):
@@ -311,7 +302,7 @@ def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
     return resolve(validate({**content, **changes}, "test"))
 
 
-def measured(sensor: LoopMachines, k: int, loop: int = 0, phase_ns: int = 0) -> Any:
+def measured(sensor: SteppedMachines, k: int, loop: int = 0, phase_ns: int = 0) -> Any:
     """The row of a measurement, every 10 ms of its loop's time."""
     vector = np.array([np.sin(k), 0.1 * k])
     message = Message(Flow.MEASUREMENT, k, k * 10 * MS, vector, loop)
@@ -337,7 +328,7 @@ def test_a_change_that_is_announced_late_applies_from_the_next_time_on(
     """The second loop begins 25 ms after the first; both are at 50 ms of their own time."""
     content["trigger"] = {"policy": "absolute", "delta": 0.5}
     one = scenario(content)
-    together = sensors_of((one, one), [0, 25 * MS])
+    together = SteppedMachines(sensors_of((one, one)).parts, [0, 25 * MS])
     names = tables_of(one)[SENSOR_MEASUREMENT].names
     assert names is not None
 

@@ -1,0 +1,77 @@
+"""The network of a run to which a test gives one datagram at a time, instead of a driver in C."""
+
+from collections.abc import Callable, Sequence
+
+from netem.channel import NO_TIME_NS, Channel, Datagram
+from noack.config.parameter_changes import ParameterChange
+from noack.core.core_library import core, ffi
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from tests.oracles.link import flipped
+
+_UNKNOWN_NS = 2**62
+"""An arrival at the socket that is later than its handling is unknown."""
+
+
+class SteppedChannel:
+    """A channel with payloads."""
+
+    def __init__(self, channel: Channel) -> None:
+        self.channel, self._handled = channel, 0
+        self._payloads: dict[int, bytes] = {}
+        self._copies: dict[int, int] = {}  # delayed copies of each payload
+
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
+        return self.channel.announce(change, now_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        """Time of the next departure in either direction; None: nothing is in flight."""
+        due_ns = int(core.noack_channel_due_ns(self.channel.core))
+        return None if due_ns == NO_TIME_NS else due_ns
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Process a datagram; return it if it is neither lost nor delayed."""
+        channel, number, data = self.channel.core, self._handled, message.data
+        assert 0 <= message.flow < channel.loops * len(self.channel.links)
+        datagram = ffi.new("noack_datagram *", {
+            "flow": message.flow, "size_bytes": len(data), "arrival_ns": _UNKNOWN_NS,
+            "bit": -1, "head": data[:PACKET_HEAD_BYTES], "message": {"sequence": number},
+        })  # fmt: skip
+        before = channel.heap_count
+        self._payloads[number] = data
+        outputs = self._step(lambda: int(core.noack_channel_handle(channel, datagram, now_ns)))
+        self._handled += 1
+        self._copies[number] = channel.heap_count - before
+        self._forget(number)
+        return outputs
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Forward the datagram that is due; if one is due in each direction, the first one."""
+        channel = self.channel.core
+        outputs = self._step(lambda: int(core.noack_channel_release(channel, now_ns)))
+        number = channel.leaving[0].message.sequence
+        self._copies[number] -= 1
+        self._forget(number)
+        return outputs
+
+    def _step(self, step: Callable[[], int]) -> Sequence[Datagram | Record | Notice]:
+        """Make a step; return the datagrams that leave, and its row."""
+        channel = self.channel.core
+        while (question := step()) != core.NOACK_DONE:
+            if question == core.NOACK_ASK_OUTCOME:
+                self.channel.decide(self._payloads[channel.asked.message.sequence])
+            else:
+                self.channel.answer(question)
+        leaving = (channel.leaving[place] for place in range(channel.leaving_count))
+        datagrams = [
+            Datagram(one.flow, flipped(self._payloads[one.message.sequence], one.bit))
+            for one in leaving
+        ]
+        batches = self.channel.take_rows()
+        rows = [Record(table, row) for table, batch in batches for row in batch.tolist()]
+        return (*datagrams, *rows)
+
+    def _forget(self, number: int) -> None:
+        """Forget a payload after its last departure."""
+        if not self._copies[number]:
+            del self._copies[number], self._payloads[number]
