@@ -40,8 +40,8 @@ LINES = {
     "plant_server": 450,
     "sensor_node": 400,
     "controller_node": 400,
-    "benchmarks": 4600,
-    "native": 9500,
+    "benchmarks": 4610,
+    "native": 9550,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
