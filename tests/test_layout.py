@@ -41,7 +41,7 @@ LINES = {
     "sensor_node": 400,
     "controller_node": 400,
     "benchmarks": 4610,
-    "native": 9550,
+    "native": 9510,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
