@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.output.glossary import as_markdown
-from tests.pages import ROOT
 from cosim.output.page_kit import glossary
+from tests.pages import ROOT
 
 PHRASES = (
     "lost that nobody ordered", "lost outside the emulator", "in the long run, at most",
