@@ -737,6 +737,7 @@ typedef struct { /* place 0 is the flow of every run, place 1 that of the acknow
     int64_t receivers[2]; /* sockets */
     int64_t senders[2];   /* sockets, connected to where the flows go; -1: none */
     int64_t timer;        /* a timerfd */
+    int64_t epoll;        /* waits for the sockets and the timer */
     noack_peer sources[2];
     int64_t foreign; /* datagrams from other addresses */
     int64_t sent;
@@ -755,6 +756,8 @@ const char *noack_driver_check(const noack_driver *driver);
 
 /* Prepare the scratch and the timer; return 0 or errno. */
 int64_t noack_driver_open(noack_driver *driver);
+/* Wait for its receivers, too, from now on; return 0 or errno. */
+int64_t noack_driver_watch(noack_driver *driver);
 void noack_driver_close(noack_driver *driver);
 
 /* Work until a time of the run, or until Python is needed; return a noack_driver_reason. After

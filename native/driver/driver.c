@@ -5,10 +5,10 @@
 #include <errno.h>
 #include <netinet/in.h>
 #include <netinet/udp.h>
-#include <poll.h>
 #include <sched.h>
 #include <stddef.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/timerfd.h>
@@ -93,6 +93,12 @@ static void renew_header(driver_scratch *own, int64_t k) {
     own->in_headers[k].msg_hdr.msg_controllen = sizeof own->in_controls[k];
 }
 
+/* Let epoll report a file that can be read by a bit; return 0 or errno. */
+static int64_t watch(const noack_driver *driver, int64_t fd, uint64_t bit) {
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = bit};
+    return epoll_ctl((int)driver->epoll, EPOLL_CTL_ADD, (int)fd, &event) == 0 ? 0 : errno;
+}
+
 int64_t noack_driver_open(noack_driver *driver) {
     driver_scratch *own = scratch_of(driver);
     for (int k = 0; k < BUFFERS; k++) {
@@ -110,13 +116,26 @@ int64_t noack_driver_open(noack_driver *driver) {
     own->batch = min_of(driver->process->loops, MESSAGES - 1);
     driver->senders[0] = driver->senders[1] = -1;
     driver->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC);
-    return driver->timer < 0 ? errno : 0;
+    driver->epoll = epoll_create1(EPOLL_CLOEXEC);
+    return driver->timer < 0 || driver->epoll < 0 ? errno : watch(driver, driver->timer, 0);
+}
+
+int64_t noack_driver_watch(noack_driver *driver) {
+    int64_t error = 0;
+    for (int k = 0; k < driver->receiver_count && error == 0; k++)
+        error = watch(driver, driver->receivers[k], UINT64_C(1) << k);
+    return error;
+}
+
+static void close_fd(int64_t *fd) {
+    if (*fd >= 0)
+        close((int)*fd);
+    *fd = -1;
 }
 
 void noack_driver_close(noack_driver *driver) {
-    if (driver->timer >= 0)
-        close((int)driver->timer);
-    driver->timer = -1;
+    close_fd(&driver->epoll);
+    close_fd(&driver->timer);
 }
 
 /* Whether a name is that of a peer: the same family, port and host. */
@@ -360,20 +379,16 @@ static int64_t sleep_until_needed(
     }
     if (tick_ns != INT64_MAX)
         wait_ns = min_of(wait_ns, tick_ns - driver->spin_ns);
-    struct pollfd readable[3];
-    nfds_t count = 0;
-    for (; count < (nfds_t)driver->receiver_count; count++)
-        readable[count] = (struct pollfd){(int)driver->receivers[count], POLLIN, 0};
-    if (wait_ns > 0) {
+    if (wait_ns > 0)
         set_timer(driver, wall_ns, wall_ns + wait_ns);
-        readable[count++] = (struct pollfd){(int)driver->timer, POLLIN, 0};
-    }
-    if (poll(readable, count, wait_ns > 0 ? -1 : 0) < 0)
+    struct epoll_event events[3]; /* of both sockets and the timer */
+    int count = epoll_wait((int)driver->epoll, events, 3, wait_ns > 0 ? -1 : 0);
+    if (count < 0)
         return errno == EINTR ? -1 : 0;
-    int64_t ready = 0;
-    for (int64_t k = 0; k < driver->receiver_count; k++)
-        ready |= (int64_t)(readable[k].revents != 0) << k;
-    return ready;
+    uint64_t ready = 0;
+    for (int k = 0; k < count; k++)
+        ready |= events[k].data.u64;
+    return (int64_t)ready;
 }
 
 /* Receive at most a number of messages from a place on; return their number. After an ICMP error of

@@ -76,6 +76,11 @@ def _ends(process: RunProcess, addresses: Mapping[str, Address]) -> _Ends:
     }
 
 
+def _raise_error(number: int) -> None:
+    if number:
+        raise OSError(number, os.strerror(number))
+
+
 class LiveDriver:
     """Drives the machines of all loops of a process.
 
@@ -110,10 +115,9 @@ class LiveDriver:
             machine.received.not_before_ns = admitted_ns - phase_ns
             machine.acknowledgements.not_before_ns = admitted_ns - phase_ns
         self._check()
-        if number := core.noack_driver_open(self.core):
-            raise OSError(number, os.strerror(number))
+        _raise_error(core.noack_driver_open(self.core))
         self.close = weakref.finalize(self, core.noack_driver_close, self.core)
-        """Close its timer."""
+        """Close its timer and its epoll."""
 
     def open(
         self,
@@ -140,6 +144,7 @@ class LiveDriver:
         for peer, address in zip(self.core.sources, sources, strict=False):
             peer.name, peer.name_bytes = packed_name(address)
         self._check()
+        _raise_error(core.noack_driver_watch(self.core))
 
     def set_clock(self, clock: RunClock) -> None:
         """Read the time as this clock does."""
