@@ -102,7 +102,7 @@ def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     found = about("wake-ups with the real-time settings applied", realtime=late)
     assert found.verdict is FindingStatus.LIMITED
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
-    assert "4 of them (0.4 %) beyond the 4.00 ms that loop's certificates allow" in found.means
+    assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in found.means
     assert "one every 0.5 s of a run of 20 s" in found.means
     assert "certificate.late_periods" in found.remedy
 

@@ -19,6 +19,7 @@ from tests.noack.machines.any_machines import (
     set_number,
     text_of,
 )
+from tests.trigger_rules import TABLES
 
 SOURCE = Path(__file__).parents[3] / "native" / "loop" / "machine_check.c"
 NULL, FAR, HUGE = ffi.NULL, 2**60 + 1, 2**63 - 1
@@ -160,7 +161,7 @@ def machines_of(role: str) -> LoopMachines:
     if role == "plant":
         own = LoopMachines([plant(next(_full_plants()), OF)])
     elif role == "sensor":
-        part = sensor(0, OF, form=5)
+        part = sensor(0, OF, form=list(TABLES).index("dynamic"))
         part.observer = observer(next(_kalman()), 2, 3, 2, 2, 1.0)
         own = LoopMachines([part])
         memory, one = own._memory, own.machines[0].model

@@ -21,6 +21,7 @@ from noack.runtime.live_driver import LiveDriver, LoopChannel
 from noack.runtime.udp_sockets import bind
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
+from tests.machine_parts import SteppedMachines
 
 RUN_ID, KEY = 7, bytes(range(32))
 HOUR_NS = 3600 * 10**9
@@ -91,7 +92,7 @@ class Live:
             self._stack.enter_context(bind(0, "test")) for _ in range(4)
         )
         self.machines = self.new_machines(role, loops, phases_ns)
-        self.alone = self.new_machines(role, loops, phases_ns)
+        self.alone = SteppedMachines(self.new_machines(role, loops, phases_ns).parts, phases_ns)
         """The same machines, to which a test passes the inputs one by one."""
         wire = Wire(RUN_ID, KEY, encrypted=encrypted)
         self.encoder = Encoder(RUN_ID, KEY, encrypted=encrypted)
