@@ -41,10 +41,10 @@ from cosim.output.viewer import run_recording
 from cosim.record.record_source import joined
 from cosim.record.run_directory import RECORD, write_environment
 from cosim.record.table_files import TableFile
-from noack.config.resolution import run_tables
-from noack.config.scenario_file import load
 from noack.protocol.topology import RECORDER
 from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario_file import load
 
 LENGTHS_S = (120.0, 600.0)
 """Both are replayed in a process of its own; a shorter run is not."""

@@ -35,7 +35,6 @@ from cosim.live.finalize import finalize
 from cosim.live.launcher import launch
 from cosim.live.run_watcher import Watcher
 from cosim.record.run_record import RunRecord, load_record
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import Vector
 from noack.protocol.machine_interface import GENERATION
@@ -47,6 +46,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import RunProgress
+from noack.scenario.scenario_file import load
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 """Table of each process's steps."""

@@ -14,11 +14,11 @@ from cosim.analysis.adversary import Objective, Worst, conditions_of, find_worst
 from cosim.cli import find_scenario
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import Matrix
 from noack.impairments.loss_prediction import expected_loss
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
 from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.certificates.weight import choose_weight
 from tests.oracles.receiver import Limits, Outcomes, longest_burst, outcomes_of, violations

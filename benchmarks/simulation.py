@@ -48,16 +48,16 @@ from cosim.studies.campaign.campaign_workers import local
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
-from noack.config.sections import PLANTS, POLICIES
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.wire_format import Flow
 from noack.runtime.real_time_loop import realtime
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
+from noack.scenario.sections import PLANTS, POLICIES
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from plant_server.plant import plants_of

@@ -65,11 +65,11 @@ from cosim.output.figure_files import save_figure
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from cosim.record.run_record import load_record
-from noack.config.scenario_file import load
 from noack.core.errors import NoackError
 from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.spool import SPOOL
+from noack.scenario.scenario_file import load
 
 WARM_UP_SHARE, LONGEST_WARM_UP_S = 0.2, 300.0
 WINDOWS, LEAST_WINDOWS = 12, 8

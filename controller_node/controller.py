@@ -14,9 +14,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule
-from noack.config.resolution import loop_of, setpoint_of
-from noack.config.scenario import Scenario
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NS_PER_S
@@ -33,6 +30,9 @@ from noack.protocol.record_tables import (
     RecordShape,
 )
 from noack.protocol.wire_format import Flow
+from noack.scenario.parameter_changes import ChangeSchedule
+from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.scenario import Scenario
 
 CONTROLLER = Role(
     "controller", "noack_controller", Flow.UPDATE, (CONTROLLER_STEP, CONTROLLER_DELIVERY, None),

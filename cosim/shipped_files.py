@@ -64,7 +64,7 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
-    from noack.config import toml_file
+    from noack.scenario import toml_file
 
     return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
 

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
-from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
@@ -26,6 +24,8 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Message
+from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
+from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]
 

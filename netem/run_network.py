@@ -12,8 +12,6 @@ import numpy as np
 from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.relay_links import let_wait, stamp_arrivals
 from netem.relay_memory import PACKET_ROW, RelayDirection, RelayMemory, name_array
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
-from noack.config.scenario import Scenario
 from noack.core.clock import RunClock
 from noack.core.core_library import Array, core
 from noack.impairments.link_settings import LinkSettings
@@ -28,6 +26,8 @@ from noack.protocol.wire_format import loop_number
 from noack.runtime.address import Address, SocketName, packed_name
 from noack.runtime.real_time_loop import RecordSink, RowSink
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket, errors_by_text
+from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
+from noack.scenario.scenario import Scenario
 
 _ROWS = 256
 """Rows of each table of the record that it keeps: as many as telemetry has in a batch."""

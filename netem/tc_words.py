@@ -21,7 +21,6 @@ from pydantic import (
 )
 
 from netem.relay_links import LinkSpec
-from noack.config import toml_file
 from noack.core.errors import CallerError, shortened
 from noack.impairments.clauses import Table
 from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
@@ -32,6 +31,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import read_files
 from noack.impairments.words import COUNT, WordReader, percent_text
 from noack.runtime.address import parse_address, parse_destination
+from noack.scenario import toml_file
 from noack.settings.section import ScenarioSection, Seed
 
 _REFUSED = {

@@ -27,9 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
-from noack.config.sections import PlantSection
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.core_memory import CoreMemory, Structure, reals_at
@@ -42,6 +39,9 @@ from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedErr
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP, RecordShape
 from noack.protocol.wire_format import Flow
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.sections import PlantSection
 
 PLANT = Role("plant", "noack_plant", Flow.ACTUATION, (PLANT_STEP, PLANT_ACTUATION, None))
 BLOCK = 256

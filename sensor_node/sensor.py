@@ -22,9 +22,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule
-from noack.config.resolution import assumed_model, loop_of, policy_of, setpoint_of
-from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, Structure, reals_at
 from noack.core.linear_systems import Matrix, Vector
@@ -38,6 +35,9 @@ from noack.protocol.record_tables import (
     RecordShape,
 )
 from noack.protocol.wire_format import Flow
+from noack.scenario.parameter_changes import ChangeSchedule
+from noack.scenario.resolution import assumed_model, loop_of, policy_of, setpoint_of
+from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import CodedPolicy, EventTrigger, Policy, fill_rule, rule_rows
 
 SENSOR = Role(

@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import Controller, controllers_of
-from noack.config.parameter_changes import ParameterChange
-from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import reals_at
 from noack.core.linear_systems import Matrix, Vector
@@ -15,6 +13,8 @@ from noack.machines.loop_machines import LoopMachines
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.scenario import Scenario
 from plant_server.plant import Plant, plants_of
 from sensor_node.sensor import Sensor, sensors_of
 

@@ -16,15 +16,15 @@ from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
 from netem.tc_words import KEYWORDS
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
-from noack.config.sections import POLICIES, AnyDisturbance, AnyObserver
-from noack.config.toml_file import json_schema
 from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.constraints import CONSTRAINTS
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.scenario.sections import POLICIES, AnyDisturbance, AnyObserver
+from noack.scenario.toml_file import json_schema
 from tests.pages import PAGES, ROOT, blocks
 
 

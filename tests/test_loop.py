@@ -12,9 +12,6 @@ from scipy.linalg import expm
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
@@ -26,6 +23,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES, SENDS, receiver_of
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
 from tests.machine_parts import sensor_of
 from tests.wire_decoder import Decoder
 

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from noack.config.sections import POLICIES
 from noack.core.linear_systems import Matrix
+from noack.scenario.sections import POLICIES
 from noack.settings.section import Table
 from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices

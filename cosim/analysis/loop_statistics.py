@@ -39,7 +39,6 @@ from cosim.record.align import (
 )
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -56,6 +55,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.scenario import Scenario
 from plant_server.plant import too_old
 
 _STEPS = {

@@ -20,7 +20,6 @@ from cosim.analysis.summary_model import (
 )
 from cosim.record.align import aligned_parts
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
-from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import row_norms
@@ -29,6 +28,7 @@ from noack.impairments.feature import Impairment
 from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.rate import Rate
 from noack.protocol.record_tables import NETEM_PACKET, Fate
+from noack.scenario.scenario import Scenario, phases_ns
 
 _BINS = 200
 _MOST_NAMED = 3

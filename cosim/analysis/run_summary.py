@@ -37,9 +37,6 @@ from cosim.analysis.summary_model import (
 )
 from cosim.record.run_events import Divergence, changes_of, divergence, packet_outcomes
 from cosim.record.run_record import RunRecord, no_such_loop
-from noack.config.resolution import loop_of
-from noack.config.runtime_parameters import text_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
@@ -56,6 +53,9 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.scenario.resolution import loop_of
+from noack.scenario.runtime_parameters import text_of
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import assumptions
 from plant_server.plant import system_of
 

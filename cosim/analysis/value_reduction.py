@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.scenario import Scenario
+from noack.scenario.scenario import Scenario
 
 EXACT = 2**20
 """Number of values up to which quantiles are exact."""

@@ -25,8 +25,8 @@ from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
 from cosim.output.certificates import Certificates as Certificates
-from noack.config.scenario import Scenario as Scenario
 from noack.core.errors import NoackError as NoackError
+from noack.scenario.scenario import Scenario as Scenario
 
 __version__ = version("noack")
 

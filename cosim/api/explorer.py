@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cosim.interactive.ensemble import Ensemble
     from cosim.interactive.exploration import Exploration
     from cosim.interactive.scenario_guarantee import Guarantee, Margin
-    from noack.config.scenario import Scenario
+    from noack.scenario.scenario import Scenario
 
 
 class Explorer:

@@ -20,10 +20,10 @@ from cosim.record.run_directory import (
     chosen_run,
     file_of_loop,
 )
-from noack.config.resolution import run_tables
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario import Scenario
 
 with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay

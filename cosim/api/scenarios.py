@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from cosim.shipped_files import find_shipped
-from noack.config import toml_file
-from noack.config.matrix_files import matrices_of, model_of
-from noack.config.runtime_parameters import full_key
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import completed, put
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
+from noack.scenario import toml_file
+from noack.scenario.matrix_files import matrices_of, model_of
+from noack.scenario.runtime_parameters import full_key
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import completed, put
 
 Source = Scenario | str | PathLike[str] | Mapping[str, Any]
 """A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""

@@ -21,11 +21,11 @@ from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
 from cosim.output.certificates import Certificates, certificates_of
 from cosim.shipped_files import find_shipped
-from noack.config import toml_file
-from noack.config.resolution import resolve
 from noack.core.errors import CallerError
 from noack.core.number_format import Rows, as_html, as_text
 from noack.core.process_limits import cores
+from noack.scenario import toml_file
+from noack.scenario.resolution import resolve
 from noack.theory.margins.joint_spectral_radius import ACCURACY
 from noack.traces.trace_formats import find_trace
 

@@ -44,13 +44,13 @@ with lazy_modules():
 
     from cosim.live import fork_server, progress
     from cosim.output import result_tables
-    from noack.config import scenario_file
+    from noack.scenario import scenario_file
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-    from noack.config.scenario import Scenario
+    from noack.scenario.scenario import Scenario
 
 _TOUR = (
     ("noack doctor", "check this machine"),

@@ -5,8 +5,8 @@ from cosim.record.run_directory import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped_files import shipped_names
 
 with lazy_modules():
-    from noack.config import runtime_parameters as parameters
-    from noack.config import scenario, toml_file
+    from noack.scenario import runtime_parameters as parameters
+    from noack.scenario import scenario, toml_file
 
 
 def scenarios(incomplete: str) -> list[str]:

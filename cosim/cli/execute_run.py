@@ -30,10 +30,10 @@ with lazy_modules():
     from cosim.output import run_verdict
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
-    from noack.config import link_load, resolution, scenario
     from noack.protocol import topology
     from noack.runtime import address, run_registry
     from noack.runtime.connections import metrics_server
+    from noack.scenario import link_load, resolution, scenario
     from noack.theory.certificates import assumptions
 
 if TYPE_CHECKING:

@@ -25,7 +25,6 @@ import zenoh
 from cosim.live.launcher import needed_bytes
 from cosim.output.viewer.live_viewer import has_display
 from cosim.record.run_directory import environment
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.process_limits import python_command
@@ -33,6 +32,7 @@ from noack.runtime.address import LOOPBACK
 from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import bind
+from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
 EXTRAS = {

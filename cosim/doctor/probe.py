@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S, RunClock
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.wire_format import KEY_BYTES, Wire
 from noack.runtime.address import LOOPBACK
 from noack.runtime.live_driver import LiveDriver
 from noack.runtime.real_time_loop import RecordSink, realtime, run_loop
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of
 
 _WARM_UP = 20

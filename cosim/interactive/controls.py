@@ -20,13 +20,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from cosim.interactive.draft import Draft, DraftError, Mistake, value_text
-from noack.config import toml_file
-from noack.config.runtime_parameters import trigger_parameters
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import value_of
-from noack.config.sections import POLICIES
 from noack.core.clock import NS_PER_S
 from noack.core.errors import NoackError
+from noack.scenario import toml_file
+from noack.scenario.runtime_parameters import trigger_parameters
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import value_of
+from noack.scenario.sections import POLICIES
 
 _STEPS = 200
 _DECADE = 10.0

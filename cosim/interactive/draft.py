@@ -18,11 +18,11 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from cosim.shipped_files import find_shipped, shipped_names, text_of
-from noack.config import toml_file
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import completed, put, toml_text, value_of
 from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import read_regular
+from noack.scenario import toml_file
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import completed, put, toml_text, value_of
 from noack.settings.user_files import PLACES
 
 _SOURCE = "scenario"

@@ -18,9 +18,9 @@ from cosim.simulation.batch import (
 )
 from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
 from cosim.studies.campaign.random_draws import box_of
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
 
 DRAWS = 200
 LOW, HIGH = 0.05, 0.95

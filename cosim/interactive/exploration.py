@@ -20,14 +20,14 @@ from cosim.simulation.continuous import (
     summary,
 )
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import loop_of, policy_of, resolve
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
 from noack.protocol.record_tables import CONTROLLER_DELIVERY
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.resolution import loop_of, policy_of, resolve
+from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import TriggerRule
 
 POINTS = 400

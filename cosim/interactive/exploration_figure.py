@@ -26,9 +26,9 @@ from cosim.output.figure_description import (
     time_axis,
 )
 from cosim.output.palette import CERTIFIED, CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESHOLD
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.scenario.scenario import Scenario
 
 BAND, KEPT = "90 % of draws", "kept settings"
 _SMALLEST = 1e-6

@@ -7,11 +7,11 @@ import numpy as np
 from cosim.analysis.margin_search import find_margin
 from cosim.interactive.exploration import Exploration
 from cosim.output.certificates import constant_rows
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.number_format import number
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (

@@ -30,8 +30,8 @@ from cosim.interactive.exploration_figure import (
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
 from cosim.record.run_directory import SUMMARY_FILE
-from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
+from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
 

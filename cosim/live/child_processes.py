@@ -23,13 +23,13 @@ from pydantic import AfterValidator, Field, model_validator
 from cosim.live.coordinator import Coordinator
 from cosim.live.fork_server import ENVIRONMENT, ForkedProcess, ForkServer
 from cosim.live.run_watcher import Watcher
-from noack.config import toml_file
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import open_append
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES, PLANT, RECORDER
 from noack.runtime.join_ticket import Ticket
+from noack.scenario import toml_file
+from noack.scenario.scenario import Scenario
 from noack.settings.section import ScenarioSection
 
 SSH_FAILED = 255

@@ -15,11 +15,11 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_events import GrowthMonitor
 from cosim.record.run_record import Rows
-from noack.config.resolution import resolved_loops, tables_of
-from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolved_loops, tables_of
+from noack.scenario.scenario import Scenario, phases_ns
 
 MOST_CHECKED = 100
 _TURN_S = 0.01

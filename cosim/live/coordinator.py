@@ -16,15 +16,6 @@ import zenoh
 from pydantic import JsonValue
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.parameter_changes import (
-    ChangeSchedule,
-    ParameterChange,
-    changed,
-    current_parameters,
-    scheduled,
-)
-from noack.config.scenario import loop_scenario, loop_sections
-from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.core.process_limits import cores
@@ -44,6 +35,15 @@ from noack.runtime.control_messages import (
 from noack.runtime.control_plane import ControlPlane, header_of, next_payload
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHED_AWAY_S, Event, LifeCycle, Side, State
+from noack.scenario.parameter_changes import (
+    ChangeSchedule,
+    ParameterChange,
+    changed,
+    current_parameters,
+    scheduled,
+)
+from noack.scenario.scenario import loop_scenario, loop_sections
+from noack.scenario.scenario_tables import MOST_CHANGES
 
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""

@@ -31,16 +31,16 @@ from noack.runtime.command_line import TICKET_ON_STDIN
 
 with lazy_modules():
     import noack.impairments.kinds.loss as loss
-    from noack.config import scenario, scenario_checks
     from noack.impairments import link_settings
     from noack.runtime import control_messages, join_ticket
+    from noack.scenario import scenario, scenario_checks
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
 _COMMON = (
-    "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.config.scenario_file",
-    "noack.config.resolution", "noack.core.random_streams", "cosim.record.run_directory",
+    "noack.runtime.control_plane", "noack.runtime.join_ticket", "noack.scenario.scenario_file",
+    "noack.scenario.resolution", "noack.core.random_streams", "cosim.record.run_directory",
 )  # fmt: skip
 """What the processes and the launcher import."""
 _IMPORTS = (

@@ -32,8 +32,6 @@ from cosim.record.run_directory import (
     write_environment,
     write_scenario,
 )
-from noack.config.resolution import resolve_run, resolved_loops, tables_of
-from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, NeverStartedError, NoackError
 from noack.core.file_access import write_whole
 from noack.core.number_format import byte_size
@@ -51,6 +49,8 @@ from noack.runtime.command_line import Signals, stop_reason
 from noack.runtime.control_plane import run_name
 from noack.runtime.join_ticket import Ticket, invitation_file, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.resolution import resolve_run, resolved_loops, tables_of
+from noack.scenario.scenario import Scenario
 
 with lazy_modules():  # asyncio and TLS
     from cosim.live import remote_access

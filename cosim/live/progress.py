@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cosim.live.run_watcher import Watcher
-from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.runtime.control_messages import RunProgress
 from noack.runtime.join_ticket import DEFAULT_SESSION
+from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
     from cosim.live.remote_access import Listening

@@ -25,9 +25,6 @@ from cosim.record.processes import report_of, write_reports
 from cosim.record.run_directory import RECORDING_FILE, active_run
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows
-from noack.config.parameter_changes import change_notice
-from noack.config.runtime_parameters import is_of_loss_alone
-from noack.config.scenario import Scenario, loop_names
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core
 from noack.core.errors import ExitStatus, MachineError, PeerError
@@ -52,6 +49,9 @@ from noack.runtime.life_cycle import LAUNCHED_AWAY_S, LAUNCHER_GONE
 from noack.runtime.run_process import RunProcess, join_run
 from noack.runtime.spool import NOTICES
 from noack.runtime.telemetry import first_row
+from noack.scenario.parameter_changes import change_notice
+from noack.scenario.runtime_parameters import is_of_loss_alone
+from noack.scenario.scenario import Scenario, loop_names
 
 with lazy_modules():
     from cosim.live import claim_monitor

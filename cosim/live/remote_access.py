@@ -25,8 +25,6 @@ from cryptography.x509.oid import NameOID
 
 from cosim.live.child_processes import Host, load_hosts
 from cosim.live.coordinator import AdmissionPass, Coordinator
-from noack.config.run_sections import ClocksSection
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, PeerError, why
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.address import Address, family_of, parse_address, text_of
@@ -39,6 +37,8 @@ from noack.runtime.connections.coordinator_link import (
 from noack.runtime.control_plane import RUNS, run_name, socket_path
 from noack.runtime.host_clocks.time_exchange import TimeReference, answering
 from noack.runtime.join_ticket import RemoteAccess, Ticket, new_admission_pass, own_host
+from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario import Scenario
 
 _BACKLOG = 4096
 _FLOOD_PER_S = 100

@@ -12,8 +12,8 @@ from prometheus_client import Metric
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 
 from cosim.live.run_watcher import Watcher
-from noack.config.scenario import Scenario
 from noack.runtime.control_messages import RunProgress
+from noack.scenario.scenario import Scenario
 
 _PREFIX = "noack_run"
 _GAUGES = {

@@ -15,11 +15,11 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import write_run
 from cosim.simulation.virtual_time import Progress, simulate_loops
-from noack.config.resolution import resolve_run
-from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
 from noack.core.process_limits import require_limits
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.resolution import resolve_run
+from noack.scenario.scenario import Scenario
 
 
 def simulate_run(scenario: Scenario, runs: Path, progress: Progress | None = None) -> RunEnding:

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from cosim.record.run_record import Rows
-from noack.config.resolution import run_tables
-from noack.config.scenario import Scenario
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import GENERATION, Notice, Start
 from noack.protocol.record_tables import OWNER
@@ -26,6 +24,8 @@ from noack.runtime.spool import (
     read_chunks,
 )
 from noack.runtime.telemetry import ReceivedRows
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario import Scenario
 
 
 class TelemetryStore:

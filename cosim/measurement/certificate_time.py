@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.observed_conditions import PacketLosses, causes_of
 from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.measurement.loss_bursts import outcomes
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.conditions import allowed_conditions, network_delay_ns
 from noack.traces.packet_trace import PacketTrace

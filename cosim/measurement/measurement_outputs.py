@@ -34,14 +34,14 @@ from cosim.output.figure_description import (
 )
 from cosim.output.figure_format import FigureFiles
 from cosim.output.result_tables import KEY_VALUE, ResultTable, terminal_table
-from noack.config import toml_file
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import toml_text
-from noack.config.sections import NetworkSection
 from noack.core.errors import CallerError, printable
 from noack.core.file_access import require_suffix, write_whole
 from noack.core.number_format import NONE, duration, number, percent
 from noack.impairments.loss_prediction import read_files
+from noack.scenario import toml_file
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import toml_text
+from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace
 
 Form = Literal["trace", "model"]

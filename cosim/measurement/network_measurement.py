@@ -35,7 +35,7 @@ from cosim.measurement.loss_bursts import (
     outcomes,
     quantile_m,
 )
-from noack.config.scenario import Scenario
+from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import PacketTrace
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999)

@@ -14,8 +14,8 @@ from cosim.analysis.margin_search import MarginResult
 from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
-from noack.config.resolution import policy_of
 from noack.core.number_format import duration, number
+from noack.scenario.resolution import policy_of
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import envelope_formula
 from noack.theory.certificates.conditions import BOX

@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any
 
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, Rows, as_html, as_text, number
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate

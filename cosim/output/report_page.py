@@ -38,9 +38,9 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_record import RecordedRun
-from noack.config.scenario import Scenario
 from noack.core.file_access import write_whole
 from noack.core.number_format import seconds
+from noack.scenario.scenario import Scenario
 
 TIMING_FIGURES = ("lateness", "latency", "clocks")
 """These have a section of their own, after the signals."""

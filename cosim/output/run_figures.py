@@ -44,7 +44,6 @@ from cosim.output.palette import CONTROLLER, FORCED, LOST, PLANT, SENSOR, THRESH
 from cosim.record.align import AlignedRun, Reals, aligned_parts
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms
 from noack.impairments.loss_guarantee import LossesInWindow
@@ -59,6 +58,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Flow
+from noack.scenario.scenario import Scenario
 
 Flags = NDArray[np.bool_]
 Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import LoopMatrices, loop_of, policy_of, steady_state
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import ModelFlow, Propagator, row_norms
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
@@ -33,6 +31,8 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
+from noack.scenario.scenario import Scenario
 from noack.theory.paper.error_bounds import ErrorBounds, ErrorMonitor
 
 Times = NDArray[np.int64]

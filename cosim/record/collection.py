@@ -26,8 +26,6 @@ from cosim.record.run_directory import (
     read_object,
 )
 from cosim.record.run_record import RunRecord, load_run
-from noack.config.resolution import run_tables
-from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError, why
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
@@ -44,6 +42,8 @@ from noack.runtime.spool import (
     notices_of,
     writer_of,
 )
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 _MOST_CHUNK_BYTES = 64 * 2**20
 """A process keeps no more in memory before it writes a batch."""

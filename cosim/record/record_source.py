@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import has_loop, is_of_network, network_tables
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import CLOCK_TABLES, LOOP, NETEM_SETTING
+from noack.scenario.resolution import has_loop, is_of_network, network_tables
 
 Rows = NDArray[np.void]
 Slice = Mapping[str, Rows]

@@ -28,7 +28,7 @@ with lazy_modules():
     from importlib import metadata
 
 if TYPE_CHECKING:
-    from noack.config.scenario import Scenario
+    from noack.scenario.scenario import Scenario
     from noack.settings.user_files import FileSettings
 
 DEFAULT_RUNS = Path("runs")
@@ -100,8 +100,8 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         MachineError, OSError: the directory cannot be written.
     """
     # The command line needs this module for shell completion, and not the settings.
-    from noack.config.scenario import with_loop_tables
-    from noack.config.scenario_file import dumps
+    from noack.scenario.scenario import with_loop_tables
+    from noack.scenario.scenario_file import dumps
     from noack.settings.user_files import file_tables, unchanged, with_tables
 
     common = dict(file_tables(scenario))

@@ -24,10 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_of
-from noack.config.resolution import loop_of, policy_of
-from noack.config.runtime_parameters import is_of_loss_alone
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, ModelFlow, Vector, row_norms
@@ -43,6 +39,10 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import CHANGEABLE
 from noack.protocol.wire_format import HEADER_ROW, MAGIC, VERSIONS, Flow
+from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_of
+from noack.scenario.resolution import loop_of, policy_of
+from noack.scenario.runtime_parameters import is_of_loss_alone
+from noack.scenario.scenario import Scenario
 
 NEVER_NS = 2**63 - 1
 

@@ -40,25 +40,6 @@ from cosim.record.record_source import (
 )
 from cosim.record.record_source import Rows as Rows
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, Kind, kind_of
-from noack.config.resolution import (
-    LoopMatrices,
-    has_loop,
-    is_of_network,
-    loop_of,
-    network_tables,
-    resolve,
-    resolved_loops,
-    run_tables,
-    tables_of,
-)
-from noack.config.scenario import (
-    Scenario,
-    loop_names,
-    loop_scenario,
-    loop_sections,
-    phases_ns,
-)
-from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, PeerError
 from noack.core.file_access import PARTIAL, new_file, write_whole
@@ -74,6 +55,25 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import LogLine, parse_message
+from noack.scenario.resolution import (
+    LoopMatrices,
+    has_loop,
+    is_of_network,
+    loop_of,
+    network_tables,
+    resolve,
+    resolved_loops,
+    run_tables,
+    tables_of,
+)
+from noack.scenario.scenario import (
+    Scenario,
+    loop_names,
+    loop_scenario,
+    loop_sections,
+    phases_ns,
+)
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 if TYPE_CHECKING:
     from cosim.record.table_files import StoredTables

@@ -25,15 +25,15 @@ from cosim.record.run_record import (
     vector_names,
     write_tables,
 )
-from noack.config.resolution import has_loop, run_tables
-from noack.config.scenario import loop_names
-from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import SPOOL, batch_bytes, batches_in, spool_files, stored_lines
+from noack.scenario.resolution import has_loop, run_tables
+from noack.scenario.scenario import loop_names
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 _SEGMENT_BYTES = 1024 * 1024
 

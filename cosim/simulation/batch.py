@@ -14,12 +14,12 @@ from cosim.simulation.exact_simulation import ROW as ROW
 from cosim.simulation.exact_simulation import EventLog, ExactSimulation
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.config.resolution import loop_of, rule_of
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
 from noack.impairments.link_settings import LinkSettings
+from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import TriggerRule
 
 

@@ -34,8 +34,6 @@ from cosim.simulation.exact_simulation import (
 )
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState
-from noack.config.resolution import LoopMatrices, loop_of, rule_of
-from noack.config.scenario import Scenario
 from noack.core.core_library import core
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.linear_systems import Matrix, Vector
@@ -43,6 +41,8 @@ from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
+from noack.scenario.resolution import LoopMatrices, loop_of, rule_of
+from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import TriggerRule
 
 _SMALLEST_THRESHOLD = 1e-140

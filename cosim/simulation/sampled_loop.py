@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.controller import controllers_of
-from noack.config.resolution import assumed_model, loop_of, rule_of
-from noack.config.scenario import Scenario
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.scenario.resolution import assumed_model, loop_of, rule_of
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import network_delay_ns
 from plant_server.plant import disturbance_of, measurement_model_of, plants_of
 from sensor_node.sensor import sensors_of

@@ -22,16 +22,6 @@ from cosim.record.record_source import (
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
-from noack.config.parameter_changes import change_notice, scheduled, settings_key
-from noack.config.resolution import (
-    has_loop,
-    is_of_network,
-    network_tables,
-    resolved_loops,
-    shape_of,
-    tables_of,
-)
-from noack.config.scenario import Scenario, phases_ns
 from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.machine_interface import Notice, Record
@@ -39,6 +29,16 @@ from noack.protocol.record_tables import LOOP, OWNER
 from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import KEY_BYTES, Flow, Rejection
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.parameter_changes import change_notice, scheduled, settings_key
+from noack.scenario.resolution import (
+    has_loop,
+    is_of_network,
+    network_tables,
+    resolved_loops,
+    shape_of,
+    tables_of,
+)
+from noack.scenario.scenario import Scenario, phases_ns
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 

@@ -43,11 +43,11 @@ from cosim.record.run_directory import (
 )
 from cosim.record.run_record import RecordedRun, RunRecord, load_run, steps_of
 from cosim.studies.run_comparison import compare_runs
-from noack.config.scenario import Scenario, loops_of
-from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, one_line, printable, why
 from noack.core.file_access import new_file, open_regular
 from noack.core.number_format import number
+from noack.scenario.scenario import Scenario, loops_of
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 from noack.settings.user_files import PLACES, Sha256, file_tables
 
 MANIFEST = "archive.json"

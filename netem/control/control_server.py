@@ -22,13 +22,13 @@ from zenoh.handlers import RingChannel
 from netem.control.emulator_statistics import CommandQueue, Statistics, StatisticsThread
 from netem.relay_links import DIRECTIONS, Direction
 from netem.tc_words import settings_of, text_of
-from noack.config.toml_file import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_prediction import with_kept_loss
 from noack.runtime import private_folder
 from noack.runtime.control_plane import cause_of, open_session
 from noack.runtime.private_folder import require_name
+from noack.scenario.toml_file import brief
 
 EMULATORS = "netem"
 """The folder of the files."""

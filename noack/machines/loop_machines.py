@@ -18,14 +18,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_key
-from noack.config.scenario import Scenario
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow
+from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_key
+from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]
 NewRows = Callable[[int, "np.dtype[np.void]"], Rows]

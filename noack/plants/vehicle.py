@@ -1,9 +1,9 @@
 """A road vehicle: the vehicle models of CommonRoad, steered by a servo, along a lane.
 
 The library's equations and parameters are used unchanged. The lane is the library's x-axis. The
-lateral axis of the lane models (:mod:`noack.config.named_models`) has the opposite direction: V and
-Y_g are minus the library's lateral velocity and y. Yaw, yaw rate and steering angle have the same
-sign.
+lateral axis of the lane models (:mod:`noack.scenario.named_models`) has the opposite direction: V
+and Y_g are minus the library's lateral velocity and y. Yaw, yaw rate and steering angle have the
+same sign.
 
 Equations with tyre models are compiled, and integrated by compiled code, which also locates their
 jumps: a tyre's lateral force jumps where the wheel's camber changes its sign. The small models run

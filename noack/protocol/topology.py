@@ -1,7 +1,7 @@
 """Topology of the loop (see ARCHITECTURE.md): which process sends which flow to which.
 
 Updates cross the network between sensor and controller. Acknowledgements of the baseline, or
-actuations, may cross it, too (:mod:`noack.config.sections`).
+actuations, may cross it, too (:mod:`noack.scenario.sections`).
 """
 
 from collections.abc import Collection, Mapping

@@ -18,9 +18,9 @@ from pydantic import (
 )
 from pydantic_core import to_json
 
-from noack.config.parameter_changes import ParameterChange
-from noack.config.toml_file import brief
 from noack.core.errors import PeerError
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.toml_file import brief
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]

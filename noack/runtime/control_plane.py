@@ -20,7 +20,6 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.scenario_tables import MOST_CHANGES
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
 from noack.protocol.topology import COORDINATOR
@@ -29,6 +28,7 @@ from noack.runtime.control_messages import ChangeAnnouncement, message_json, par
 from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
+from noack.scenario.scenario_tables import MOST_CHANGES
 
 LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run

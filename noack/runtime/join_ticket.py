@@ -18,8 +18,6 @@ from typing import Annotated
 
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
-from noack.config.scenario import Scenario
-from noack.config.toml_file import brief
 from noack.core.clock import clock_identity
 from noack.core.errors import CallerError, PeerError, why
 from noack.core.file_access import new_file, open_regular, read_regular
@@ -28,6 +26,8 @@ from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.address import LOOPBACK, Address, family_of, text_of
 from noack.runtime.control_messages import NumericHost, SocketAddress
 from noack.runtime.private_folder import live_lock_files, lock_file, require_name
+from noack.scenario.scenario import Scenario
+from noack.scenario.toml_file import brief
 from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"

@@ -24,10 +24,6 @@ from typing import Any, Protocol, TypeVar
 
 from setproctitle import setproctitle
 
-from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import resolved_loops, run_tables
-from noack.config.scenario import Scenario, loops_of, phases_ns
-from noack.config.scenario_checks import prepare_changes
 from noack.core.clock import NS_PER_S, RunClock, SlewedRunClock
 from noack.core.errors import (
     CallerError,
@@ -67,6 +63,10 @@ from noack.runtime.life_cycle import AWAY_S, HORIZON, LAUNCHER_GONE, Event, Life
 from noack.runtime.real_time_loop import Channel, Driver, realtime, run_loop
 from noack.runtime.telemetry import OwnSpool, TelemetryBuffer, deliver_report, persisted_rows
 from noack.runtime.udp_sockets import CountingSocket, bind, enlarge_buffer
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.resolution import resolved_loops, run_tables
+from noack.scenario.scenario import Scenario, loops_of, phases_ns
+from noack.scenario.scenario_checks import prepare_changes
 
 _JOIN_TIMEOUT_S = 24 * 3600.0  # a person may start the other processes late; Ctrl-C ends the wait
 _ADMISSION_TIMEOUT_S = 10.0

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import zenoh
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from noack.config.toml_file import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import private_folder
 from noack.runtime.control_messages import ChangeReply, ChangeRequest, message_json, parse_message
 from noack.runtime.control_plane import RUNS, answer_to, cause_of, open_session, run_name
 from noack.runtime.join_ticket import Ticket
+from noack.scenario.toml_file import brief
 
 _ANSWER_S = 30.0
 

@@ -10,7 +10,7 @@ from noack.trigger.policy_settings import Interval, ModelMatrices, PolicySetting
 from noack.trigger.trigger_rule import TriggerRule, require_rule
 
 if TYPE_CHECKING:
-    AnyTrigger = PolicySettings  # noack.config.sections inserts the union of all policies
+    AnyTrigger = PolicySettings  # noack.scenario.sections inserts the union of all policies
 
 
 class CombinedSettings(PolicySettings):

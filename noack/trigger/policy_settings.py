@@ -2,7 +2,7 @@
 
 A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
 field ``policy``, and the behaviour that the settings describe;
-:mod:`noack.config.sections` finds it there.
+:mod:`noack.scenario.sections` finds it there.
 """
 
 import json

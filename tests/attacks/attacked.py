@@ -18,7 +18,6 @@ import psutil
 
 from benchmarks.programs import TwoHosts, udp_port
 from cosim.record.run_record import RunRecord, load_record
-from noack.config.resolution import loop_of
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -29,6 +28,7 @@ from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
 from noack.protocol.wire_format import Flow
 from noack.runtime.address import LOOPBACK
 from noack.runtime.join_ticket import Ticket, loads
+from noack.scenario.resolution import loop_of
 from tests.attacks.kinds import Target
 from tests.attacks.sender import Plan, Sent, carry_out
 from tests.integration.conftest import PATIENCE_S, starting, wait_for

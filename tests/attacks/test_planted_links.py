@@ -23,11 +23,11 @@ from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, Endi
 from netem.capture import CaptureWriter
 from netem.fates import FateRecorder
 from netem.relay_links import LinkSpec
-from noack.config.matrix_files import write_matrices
 from noack.core.errors import NoackError
 from noack.impairments.link_settings import LinkSettings
 from noack.runtime.join_ticket import write_invitation
 from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.scenario.matrix_files import write_matrices
 from tests.attacks.other_user import NOBODY, needs_root
 from tests.noack.runtime.test_invitation import INVITED
 

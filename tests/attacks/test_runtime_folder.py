@@ -15,11 +15,11 @@ import pytest
 
 from cosim.doctor.machine_measures import _runtime_folder
 from netem.control import control_server as emulator_session
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, published
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
 
 OWN = f"noack-{os.getuid()}"

@@ -13,10 +13,10 @@ from benchmarks.faults import FaultedRun, figures_of, recovery_s
 from cosim.cli import find_scenario
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Rejection
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.record.changed_records import changed, copied
 from tests.wire_decoder import Decoder
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.guarantees import loop_named, row_of, triggers
 from cosim.analysis.adversary import Objective, find_worst
-from noack.config.sections import POLICIES
+from noack.scenario.sections import POLICIES
 
 
 def test_every_policy_that_is_a_rule_is_compared() -> None:

@@ -20,16 +20,16 @@ from cosim.analysis.run_summary import linearisation, linearisation_rows, summar
 from cosim.analysis.summary_model import ClaimVerdict, LinearisationPart, NoLinearisationPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.link_load import require_capacity
-from noack.config.resolution import LoopMatrices, loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix
 from noack.plants.four_tank import FourTankSettings
 from noack.plants.plant_settings import OdeSystem
 from noack.plants.quadrotor import QuadrotorSettings
 from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.link_load import require_capacity
+from noack.scenario.resolution import LoopMatrices, loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

@@ -14,9 +14,9 @@ import cosim.live.launcher
 from cosim.record.run_directory import new_run_dir
 from cosim.record.run_record import load_record
 from cosim.shipped_files import find_shipped
-from noack.config.scenario_file import load
 from noack.core.errors import MachineError
 from noack.protocol.topology import ROLES
+from noack.scenario.scenario_file import load
 from tests.integration import conftest as live
 
 HORIZON_S = 8.0

@@ -20,10 +20,10 @@ from benchmarks.programs import TwoHosts, two_hosts
 from benchmarks.report import MeasurementError
 from cosim.cli import app
 from cosim.record.run_record import load_record, load_run
-from noack.config.scenario import phases_ns
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.scenario import phases_ns
 from tests.integration import conftest as live
 from tests.integration.conftest import Start, ended
 

@@ -9,11 +9,11 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.record.align import align_tables
 from cosim.record.processes import places_of_lives
 from cosim.record.run_record import Rows, RunRecord, load_record
-from noack.config.resolution import run_tables
-from noack.config.scenario_file import load
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import read_chunks
+from noack.scenario.resolution import run_tables
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
 from tests.integration import conftest as live
 

@@ -12,8 +12,8 @@ from cosim.analysis.summary_model import read_summary
 from cosim.output.run_tables import network_rows
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import RunRecord, load_record, load_run
-from noack.config.scenario import phases_ns
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP, Fate
+from noack.scenario.scenario import phases_ns
 from tests.integration import conftest as live
 from tests.integration.test_restarts import kill
 

@@ -9,10 +9,10 @@ import numpy as np
 from cosim.shipped_files import find_shipped, shipped_names
 from cosim.simulation.batch import run_with_events
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.core_library import core
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.simulation.batch.exact import random_population, random_setting
 from tests.trigger_rules import TABLES, random_rule
 

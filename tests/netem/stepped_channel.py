@@ -3,10 +3,10 @@
 from collections.abc import Callable, Sequence
 
 from netem.channel import NO_TIME_NS, Channel, Datagram
-from noack.config.parameter_changes import ParameterChange
 from noack.core.core_library import core, ffi
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PACKET_HEAD_BYTES
+from noack.scenario.parameter_changes import ParameterChange
 from tests.oracles.link import flipped
 
 _UNKNOWN_NS = 2**62

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from netem.channel import Channel, Datagram, channel_of
 from netem.link_state import LinkState
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.core_library import core, ffi
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Record
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.netem.any_settings import capped, computable, harsh
 from tests.netem.stepped_channel import SteppedChannel
 from tests.oracles.link import Duplex, Link

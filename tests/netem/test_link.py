@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.tc_words import settings_of
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -20,6 +18,8 @@ from noack.protocol.record_tables import (
     Fate,
     tables,
 )
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.oracles.link import Datagram, Link, update_link_of
 
 MS = 1_000_000

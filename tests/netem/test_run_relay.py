@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from netem.run_network import NetworkChannel, RunNetwork
-from noack.config.resolution import resolve, tables_of
-from noack.config.scenario_file import load
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import BEGINNING, Notice
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, OWNER
@@ -19,6 +17,8 @@ from noack.runtime.address import text_of
 from noack.runtime.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import bind
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario_file import load
 from tests.netem.engine.relays import PATIENCE_S, Received, drain, endpoints, name_of
 
 SCENARIO = resolve(

@@ -12,8 +12,6 @@ import numpy as np
 
 from netem.channel import UPDATE_LINK, Datagram, at_start, due_settings, link_name
 from netem.link_state import LinkState
-from noack.config.parameter_changes import ChangeSchedule, ParameterChange
-from noack.config.scenario import Scenario
 from noack.impairments.link_settings import NEVER_NS, Counters, Decisions, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -23,6 +21,8 @@ from noack.protocol.record_tables import (
     PACKET_HEAD_BYTES,
     Fate,
 )
+from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
+from noack.scenario.scenario import Scenario
 from tests.machine_interface import Machine
 
 

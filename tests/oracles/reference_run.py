@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from noack.config.resolution import loop_of, setpoint_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_checks import with_settings
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import SignalSource
+from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_checks import with_settings
 from tests.oracles.trigger_rules import Array, Rule
 from tests.oracles.whole_loop import Chance, Settings, held_input
 

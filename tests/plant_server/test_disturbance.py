@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from noack.config.resolution import resolve, tables_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.disturbances.gaussian import GaussianDisturbance
 from noack.disturbances.step import StepDisturbance
 from noack.disturbances.uniform import UniformDisturbance
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from plant_server.plant import BLOCK, MeasurementModel, disturbance_of, measurement_model_of
 from tests.machine_parts import OneLoop, plant_of, state_of
 

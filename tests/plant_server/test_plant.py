@@ -4,11 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import resolved_loops
-from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.resolution import resolved_loops
+from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of
 from tests.machine_parts import OneLoop, linear_plant, state_of
 

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.machine_parts import OneLoop, plant_of
 
 MS = 1_000_000

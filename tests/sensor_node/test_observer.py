@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.config.resolution import assumed_model, resolve, steady_state, true_model
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.core_library import core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
@@ -24,6 +21,9 @@ from noack.observers.observer_settings import (
 )
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
+from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from sensor_node.sensor import Observer, Sensor
 from tests.machine_parts import OneLoop, machine, sensor_of
 from tests.trigger_rules import absolute_rule

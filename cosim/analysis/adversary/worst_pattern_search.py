@@ -48,9 +48,9 @@ from cosim.simulation.continuous import (
     simulate_continuous,
 )
 from cosim.simulation.sampled_loop import SampledLoop
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.core.random_streams import stream
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError, response
 from noack.theory.bounds.gains import ErrorGains, Output
 from noack.theory.bounds.terms import NetworkConditions

@@ -27,11 +27,11 @@ from cosim.simulation.sampled_loop import (
     pushes_of,
     through_of,
 )
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.number_format import number
 from noack.disturbances.uniform import UniformDisturbance
 from noack.impairments.loss_guarantee import outcome_letters
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 

@@ -40,9 +40,6 @@ from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import loop_of, policy_of, setpoint_of
-from noack.config.runtime_parameters import text_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
 from noack.protocol.record_tables import (
@@ -57,6 +54,9 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.resolution import loop_of, policy_of, setpoint_of
+from noack.scenario.runtime_parameters import text_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint

@@ -34,8 +34,6 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.run_sections import ClocksSection
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
@@ -52,6 +50,8 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import allowed_conditions
 from plant_server.plant import too_old
 

@@ -42,10 +42,10 @@ from cosim.record.align import (
     identity_residual,
 )
 from cosim.record.run_record import RunRecord
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,

@@ -19,8 +19,6 @@ from cosim.record.processes import Life, split_by_life
 from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
-from noack.config.parameter_changes import ParameterChange, settings_of
-from noack.config.scenario import Scenario, loops_of
 from noack.core.cached_method import cached_method
 from noack.core.core_library import core, ffi, pointer_to
 from noack.core.errors import CallerError
@@ -40,6 +38,8 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import RECEIVES, SENDS
 from noack.protocol.wire_format import Flow
+from noack.scenario.parameter_changes import ParameterChange, settings_of
+from noack.scenario.scenario import Scenario, loops_of
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 

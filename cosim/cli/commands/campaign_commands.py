@@ -23,8 +23,8 @@ with lazy_modules():
     from cosim.studies.campaign import campaign_file, campaign_report
     from cosim.studies.design import design_page, design_search, design_space
     from cosim.studies.paper import paper_page
-    from noack.config import scenario, scenario_file
     from noack.core import linear_systems
+    from noack.scenario import scenario, scenario_file
 
 
 @cli.command(cli.CAMPAIGNS, 10)

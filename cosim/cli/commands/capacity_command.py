@@ -17,7 +17,7 @@ from noack.runtime.command_line import print_to_stderr
 with lazy_modules():
     from cosim.studies.campaign import campaign_grid
     from cosim.studies.capacity import capacity_page, capacity_plan, capacity_result
-    from noack.config import run_sections, scenario_file
+    from noack.scenario import run_sections, scenario_file
 
 
 @cli.option_group

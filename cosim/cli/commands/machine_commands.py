@@ -15,7 +15,7 @@ with lazy_modules():
     from cosim.doctor import findings, machine_measures
     from cosim.interactive import draft
     from cosim.lab import lab_server
-    from noack.config import resolution, scenario_file
+    from noack.scenario import resolution, scenario_file
 
 
 @cli.command(cli.FILES, 10)

@@ -24,8 +24,8 @@ with lazy_modules():
     from cosim.live import progress, remote_access, simulated_run
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.simulation import continuous
-    from noack.config import link_load, resolution, runtime_parameters, scenario, scenario_file
     from noack.runtime import control_messages, run_registry
+    from noack.scenario import link_load, resolution, runtime_parameters, scenario, scenario_file
 
 if TYPE_CHECKING:
     from rich.console import Console

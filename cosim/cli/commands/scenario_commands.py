@@ -19,7 +19,7 @@ with lazy_modules():
     from cosim.output import run_verdict
     from cosim.studies.campaign import campaign_file
     from netem import tc_words
-    from noack.config import link_load, resolution, scenario, scenario_file, toml_file
+    from noack.scenario import link_load, resolution, scenario, scenario_file, toml_file
     from noack.theory.certificates import assumptions
     from noack.trigger import trigger_rule
     from plant_server import plant

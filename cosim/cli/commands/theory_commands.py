@@ -18,7 +18,7 @@ with lazy_modules():
     from cosim.live import progress
     from cosim.output import certificate_report, certificates
     from cosim.output.export import mat_export
-    from noack.config import resolution
+    from noack.scenario import resolution
     from noack.theory.certificates import scenario_certificates
 
 

@@ -101,7 +101,7 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
     # Imported here: the command line needs the names of the formats only.
     from cosim.analysis.summary_model import read_summary
     from cosim.record.run_record import load_run
-    from noack.config.scenario import phases_ns
+    from noack.scenario.scenario import phases_ns
 
     run, content = load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
     if loop is not None or not run.names[1:]:

@@ -12,9 +12,9 @@ from cosim.output.certificates import certificates_of
 from cosim.output.export import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.record_source import Rows
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, MachineError
 from noack.core.file_access import write_whole
+from noack.scenario.scenario import Scenario
 
 SUFFIX = ".mat"
 _LONGEST_NAME = 31  # of the format of version 5

@@ -20,10 +20,10 @@ from cosim.output.viewer.network_diagram import DIAGRAM, LEG_S
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, joined
 from cosim.record.align import AlignedRun
 from cosim.record.run_directory import Kind
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError, why
 from noack.core.file_access import open_growing
+from noack.scenario.scenario import Scenario
 
 Floats = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

@@ -27,8 +27,6 @@ from cosim.output.viewer.run_recording import ERROR, SIZE, RunRecording
 from cosim.output.viewer.table_feed import LAG_S, SHOWN, ViewFeed, log_level
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows
-from noack.config.resolution import loop_of, resolved_loops, tables_of
-from noack.config.scenario import Scenario, phases_ns
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Propagator, row_norms
 from noack.protocol.record_tables import (
@@ -39,6 +37,8 @@ from noack.protocol.record_tables import (
     NETEM_PACKET,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.resolution import loop_of, resolved_loops, tables_of
+from noack.scenario.scenario import Scenario, phases_ns
 
 _TURN_S, _SHARE = 0.03, 0.3
 """CPU time of a turn; share of a core."""

@@ -23,8 +23,6 @@ from cosim.record.align import (
 from cosim.record.record_source import joined
 from cosim.record.run_events import claimed_until_s, model_flow, updates_in
 from cosim.record.run_record import Rows
-from noack.config.resolution import loop_of, policy_of, tables_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import row_norms
 from noack.protocol.record_tables import (
@@ -41,6 +39,8 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
+from noack.scenario.resolution import loop_of, policy_of, tables_of
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
     ScenarioCertificate,

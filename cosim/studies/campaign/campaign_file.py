@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_valid
 
 from cosim.simulation.batch import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
-from noack.config import toml_file
+from noack.scenario import toml_file
 from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed
 
 MOST_POINTS = 10_000

@@ -20,12 +20,12 @@ from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, SharedNetworkWork, in_virtual_time
-from noack.config import toml_file
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import completed, put
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.scenario import toml_file
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import completed, put
 from noack.settings.section import Rows, require_shape
 
 SCENARIOS = "scenarios"

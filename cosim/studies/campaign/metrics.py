@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.exact_simulation import OK
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import Output, error_gains
 

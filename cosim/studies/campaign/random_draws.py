@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.batch import Population
-from noack.config.resolution import loop_of, resolve
-from noack.config.run_sections import SeedsSection
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms, words
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.run_sections import SeedsSection
+from noack.scenario.scenario import Scenario
 
 _STREAM = "campaign"
 

@@ -28,9 +28,6 @@ from cosim.simulation.batch import ROW
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
-from noack.config.resolution import policy_of
-from noack.config.run_sections import PortsSection, RealtimeSection, SeedsSection
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import (
@@ -42,6 +39,9 @@ from noack.protocol.record_tables import (
     Fate,
     effective,
 )
+from noack.scenario.resolution import policy_of
+from noack.scenario.run_sections import PortsSection, RealtimeSection, SeedsSection
+from noack.scenario.scenario import Scenario
 
 _UNKNOWN = (
     "inter_event_min_s", "inter_event_mean_s", "settling_s", "cost", "sup_e_c_scaled",

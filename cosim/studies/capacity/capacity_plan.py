@@ -21,13 +21,13 @@ import numpy as np
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
 from cosim.studies.campaign.sampled_draws import cost_of
-from noack.config.resolution import loop_of, resolve
-from noack.config.run_sections import LoopSection
-from noack.config.scenario import Scenario, loop_scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.rate import Rate
 from noack.protocol.wire_format import datagram_bytes
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.run_sections import LoopSection
+from noack.scenario.scenario import Scenario, loop_scenario
 from noack.trigger.periodic_trigger import PeriodicSettings
 
 PERIODIC, ZOH, MODEL = "periodic", "zoh", "model"

@@ -24,9 +24,9 @@ from cosim.output.figure_format import FigureFiles
 from cosim.output.page_kit import templates
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.studies.design.design_search import WORDS, DesignResult, certified
-from noack.config.scenario_file import dumps
 from noack.core.file_access import write_whole
 from noack.core.number_format import plus_minus
+from noack.scenario.scenario_file import dumps
 
 _CAPTION = (
     "Mean number of transmissions and quantile of the settling times of each candidate, all on the "

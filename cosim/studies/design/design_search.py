@@ -18,10 +18,10 @@ from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.design.design_space import Candidate, DesignSpace, space_of
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.number_format import plus_minus
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import ideal_conditions, nominal_conditions
 from noack.theory.certificates.scenario_certificates import certify, certify_box, outside_box

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.weight import choose_weight

@@ -21,12 +21,12 @@ from cosim.simulation.continuous import (
 )
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
-from noack.config.named_models import lane_following
-from noack.config.resolution import LoopMatrices, loop_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
+from noack.scenario.named_models import lane_following
+from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify

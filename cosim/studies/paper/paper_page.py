@@ -25,11 +25,11 @@ from cosim.studies.campaign.metrics import METRICS, Metric, quartiles
 from cosim.studies.paper.paper_evidence import MODES, evidence, resolved_draw
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps
 from noack.core.errors import MachineError, why
 from noack.core.file_access import write_whole
 from noack.protocol.record_tables import Fate, effective
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps
 
 BASE = "base: Bernoulli 0.8"
 POLICIES = ("MB-ET", "ZOH-ET")

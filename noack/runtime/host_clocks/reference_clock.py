@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from time import monotonic_ns
 from typing import NamedTuple
 
-from noack.config.run_sections import ClocksSection
 from noack.core.clock import (
     NS_PER_S,
     SLEW_PPB,
@@ -25,6 +24,7 @@ from noack.protocol.record_tables import LOST_NS, clock_table
 from noack.runtime.address import Address, text_of
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeClient
 from noack.runtime.join_ticket import Ticket
+from noack.scenario.run_sections import ClocksSection
 
 LOST_AFTER_NS = 500_000_000
 """Without an answer of the reference for this time, the bound counts as lost."""

@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import assumed_model, loop_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, discretise
+from noack.scenario.resolution import assumed_model, loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.contraction import largest_gains, spectral_norm, times
 from noack.theory.bounds.enclosure import NotDecayingError, factors
 from noack.theory.bounds.gains import Forcing, NormalForcing

@@ -21,7 +21,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import LoopMatrices
 from noack.core.cached_method import cached_method
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import (
@@ -33,6 +32,7 @@ from noack.core.linear_systems import (
     matrix_of,
     spectral_abscissa,
 )
+from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     Outputs,

@@ -10,17 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import (
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.scenario.resolution import (
     LoopMatrices,
     SteadyState,
     loop_of,
     policy_of,
     steady_state,
 )
-from noack.config.scenario import Scenario
-from noack.config.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
-from noack.core.clock import NS_PER_S
-from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_tables import UNCERTIFIED_ACKNOWLEDGEMENTS
 from noack.theory.bounds.disturbances import normal_bounds
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.conditions import certified_delay_s

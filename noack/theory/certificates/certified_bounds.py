@@ -24,9 +24,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.enclosure import KernelBounds, response
 from noack.theory.bounds.gains import Output, PlantGains, error_gains

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from noack.config.resolution import loop_of, setpoint_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector
 from noack.disturbances.step import StepDisturbance
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 
 OWN_PLANT = "the scenario's plant"

@@ -17,9 +17,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import EstimationError, bound_forcing
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, PlantGains, error_gains

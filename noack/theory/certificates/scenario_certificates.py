@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of, rule_of
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.scenario import Scenario
 from noack.settings.section import Rows
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError

@@ -15,8 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.contraction import Stack, product, spectral_norms
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains

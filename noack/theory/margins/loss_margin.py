@@ -14,8 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of, rule_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
@@ -25,6 +23,8 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     outcome_letters,
 )
+from noack.scenario.resolution import loop_of, rule_of
+from noack.scenario.scenario import Scenario
 from noack.theory.margins.joint_spectral_radius import (
     ACCURACY,
     MOST_VERTICES,

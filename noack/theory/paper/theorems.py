@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
+from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.enclosure import NotDecayingError, response, response_until
 
 _SHARE, _NEAREST = 1e-2, 0.98

@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, spectral_abscissa
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import LossProcess, loss_process
 from noack.impairments.markov_chain import NotPredictableError
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response, response_until
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains, error_gains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError

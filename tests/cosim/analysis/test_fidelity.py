@@ -21,14 +21,14 @@ from cosim.output.run_tables import fidelity_rows
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.record.changed_records import changed
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"

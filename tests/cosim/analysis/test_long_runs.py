@@ -15,9 +15,9 @@ from cosim.record.align import align_tables
 from cosim.record.run_directory import write_scenario
 from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.cosim.summaries import alone
 
 PART_ROWS = 37

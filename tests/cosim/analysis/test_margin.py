@@ -10,9 +10,9 @@ import noack
 from cosim.analysis.margin_search import find_longest_period, find_margin
 from cosim.cli import app
 from cosim.cli.command import load_scenario
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import discretise
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
 
 HELD = {
     "mode": "zoh",

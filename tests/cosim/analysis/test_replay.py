@@ -19,8 +19,6 @@ from cosim.analysis.replay import Replay, replay, run_replay
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import Matrix, discretise
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
@@ -34,6 +32,8 @@ from noack.protocol.record_tables import (
     SETTINGS,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load, validate
 from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
 from tests.machine_parts import controller_of

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from cosim.cli import app
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
-from noack.config.scenario_file import load
+from noack.scenario.scenario_file import load
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
 COMMANDS = ("replay", "fidelity")

@@ -21,8 +21,8 @@ from cosim.output.run_verdict import print_outcome
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, changed_since, kind_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
 from noack.core.errors import ExitStatus
+from noack.scenario.resolution import resolve
 from tests.cosim.summaries import summary_of, with_values
 
 HUGE = 10**400

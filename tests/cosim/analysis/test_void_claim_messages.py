@@ -18,12 +18,12 @@ from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
-from noack.config.resolution import resolve, run_tables
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load
 from noack.core.errors import MachineError
 from noack.protocol.record_tables import OWNER
 from noack.runtime.control_messages import RunProgress, parse_message
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load
 from tests.cosim.live.outage import SCENARIOS, with_outage
 from tests.fuzz.plane import FakePlane, Sample
 

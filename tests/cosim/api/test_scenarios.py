@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import noack
-from noack.config.scenario_file import dumps
+from noack.scenario.scenario_file import dumps
 from tests.cosim.api.conftest import GAIN, SYSTEM, TRUE
 
 

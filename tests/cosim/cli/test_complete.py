@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli.completion import run_directories
-from noack.config.scenario import Scenario
-from noack.config.toml_file import keys
+from noack.scenario.scenario import Scenario
+from noack.scenario.toml_file import keys
 
 
 def completed(line: str) -> list[str]:

@@ -14,14 +14,14 @@ from cosim.cli import app
 from cosim.cli.commands.run_commands import parsed
 from cosim.cli.execute_run import warn_of_other_runs
 from cosim.live.coordinator import Coordinator
-from noack.config.parameter_changes import changed
-from noack.config.resolution import resolve
-from noack.config.runtime_parameters import SHORT, trigger_parameters
-from noack.config.scenario_file import load, validate
-from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.runtime import run_registry
 from noack.runtime.join_ticket import Ticket, new_ticket
+from noack.scenario.parameter_changes import changed
+from noack.scenario.resolution import resolve
+from noack.scenario.runtime_parameters import SHORT, trigger_parameters
+from noack.scenario.scenario_file import load, validate
+from noack.scenario.sections import POLICIES
 from tests.fuzz.plane import Query
 
 

@@ -9,8 +9,8 @@ from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
-from noack.config.resolution import resolved_loops
-from noack.config.scenario_file import load
+from noack.scenario.resolution import resolved_loops
+from noack.scenario.scenario_file import load
 
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))

@@ -9,8 +9,8 @@ from typer.testing import CliRunner, Result
 
 from cosim.cli import app
 from cosim.doctor.machine_measures import requirements_of
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 
 
 def doctor(*arguments: str) -> Result:

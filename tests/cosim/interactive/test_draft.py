@@ -18,9 +18,9 @@ from cosim.interactive.draft import (
     value_text,
 )
 from cosim.shipped_files import shipped_names
-from noack.config import toml_file
-from noack.config.scenario_file import put
 from noack.core.errors import CallerError
+from noack.scenario import toml_file
+from noack.scenario.scenario_file import put
 
 LANE = {"lane_following": "lane_following"}
 

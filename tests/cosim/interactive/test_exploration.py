@@ -13,8 +13,8 @@ from cosim.lab.chart import data_options
 from cosim.output.figure_description import Line
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
-from noack.config.resolution import resolve
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve
 
 
 def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:

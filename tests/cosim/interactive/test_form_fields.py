@@ -10,8 +10,8 @@ import pytest
 from cosim.interactive.controls import Field, by_field, filled, form_of
 from cosim.interactive.draft import DraftError, open_draft
 from cosim.shipped_files import shipped_names
-from noack.config import toml_file
-from noack.config.scenario_file import completed
+from noack.scenario import toml_file
+from noack.scenario.scenario_file import completed
 
 SCHEMA = json.loads(
     (Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8")

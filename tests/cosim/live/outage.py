@@ -10,10 +10,10 @@ from typing import Any
 
 from cosim.record.run_record import RunRecord
 from netem.channel import Network
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from tests.cosim.simulation.shuttle import shuttled
 from tests.machine_interface import Machine
 

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from cosim.live.coordinator import ChangeRequests
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
+from noack.scenario.scenario_file import load
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 

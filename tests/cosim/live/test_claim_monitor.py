@@ -10,11 +10,11 @@ from cosim.analysis.claims.condition_reader import AssumptionMonitor
 from cosim.live.claim_monitor import MOST_CHECKED, ClaimMonitor, Finding
 from cosim.record.run_record import RecordedRun, Rows, RunRecord
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.resolution import run_tables, tables_of
-from noack.config.scenario import phases_ns
-from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, OWNER
+from noack.scenario.resolution import run_tables, tables_of
+from noack.scenario.scenario import phases_ns
+from noack.scenario.scenario_file import validate
 
 Content = dict[str, Any]
 BATCH_NS = 100_000_000

@@ -6,10 +6,10 @@ import pytest
 
 from cosim.live.launcher import launch, require_disk_space, spool_bytes
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.errors import MachineError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 
 
 class Usage(NamedTuple):

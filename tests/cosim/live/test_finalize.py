@@ -27,11 +27,11 @@ from cosim.record.run_record import load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve, run_tables
-from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.record_tables import PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario_file import dumps, load
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import alone
 

@@ -13,10 +13,10 @@ from cosim.record.run_directory import SUMMARY_FILE, RunEnding, write_environmen
 from cosim.record.run_record import load_record, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.summaries import alone
 
 

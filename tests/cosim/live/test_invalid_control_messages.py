@@ -12,11 +12,11 @@ from cosim.live import coordinator
 from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.spool_conversion import finish_record
-from noack.config.resolution import resolve
-from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import PLANT_STEP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.join_ticket import new_ticket
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 JUNK: list[bytes | None] = [

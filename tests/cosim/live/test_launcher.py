@@ -10,12 +10,12 @@ import pytest
 from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.launcher import _Run, launch, overtime_s
 from cosim.live.run_watcher import Watcher
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.join_ticket import new_ticket, published
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 
 KILLED = "sensor died: killed by SIGKILL"
 

@@ -11,8 +11,8 @@ from cosim.output.figure_drawing import draw
 from cosim.output.run_figures import run_figures
 from cosim.output.run_tables import key_numbers, short_numbers
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.cosim.summaries import summary_of
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from cosim.live.remote_access import ConnectionFloodWatch, listen_address, with_clocks
-from noack.config.run_sections import ClocksSection
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
+from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario_file import load
 
 
 @pytest.mark.parametrize(

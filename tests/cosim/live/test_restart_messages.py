@@ -7,10 +7,10 @@ import pytest
 
 from cosim.analysis.run_summary import summarise
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
 

@@ -16,13 +16,13 @@ from cosim.live import recorder
 from cosim.live.recorder import Recorder
 from cosim.output.viewer.recording import ViewError
 from cosim.record.run_directory import SCENARIO_FILE
-from noack.config.resolution import resolve
-from noack.config.scenario_file import dumps, validate
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.plane import FakePlane, Query, Sample
 
 

@@ -33,10 +33,10 @@ from cosim.output.viewer.live_viewer import opening_time_ns
 from cosim.record.align import align_tables
 from cosim.record.run_directory import RunEnding, write_environment
 from cosim.record.run_record import RunRecord, load_record, load_run
-from noack.config.resolution import network_tables
 from noack.core.errors import ExitStatus
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import NETEM_PACKET, PLANT_STEP
+from noack.scenario.resolution import network_tables
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = 11

@@ -18,11 +18,11 @@ from cosim.record.align import align_tables
 from cosim.record.run_directory import write_environment
 from cosim.record.run_record import RecordedRun, load_record
 from cosim.simulation.virtual_time import Progress, simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError, MachineError
 from noack.protocol.record_tables import tables
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 
 ROOT = Path(__file__).parents[3]
 SHORT = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")

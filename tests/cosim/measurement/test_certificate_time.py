@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import noack
 from cosim.measurement.certificate_time import DELAY, ORDER, certificate_time
-from noack.config.scenario import Scenario
+from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 

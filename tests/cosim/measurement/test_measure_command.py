@@ -19,8 +19,8 @@ from cosim.measurement.network_measurement import (
     autocorrelation,
     normal_scores,
 )
-from noack.config import toml_file
-from noack.config.sections import NetworkSection
+from noack.scenario import toml_file
+from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of

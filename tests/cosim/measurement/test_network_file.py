@@ -8,9 +8,9 @@ import pytest
 import noack
 from cosim.measurement.chain_fits import ChainRates
 from cosim.measurement.measurement_outputs import trace_csv
-from noack.config import toml_file
-from noack.config.sections import NetworkSection
 from noack.impairments.loss_prediction import read_files
+from noack.scenario import toml_file
+from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
 from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
 from tests.oracles.link import Link

@@ -12,9 +12,9 @@ from cosim.measurement.trace_sources import SourceOptions, read_source, updates_
 from cosim.record.run_events import packet_outcomes
 from cosim.simulation.virtual_time import simulate
 from netem.fates import description
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.fuzz.parsers.fates import SPECS, TABLE
 
 

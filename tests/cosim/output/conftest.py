@@ -9,10 +9,10 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed, copied
 
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""

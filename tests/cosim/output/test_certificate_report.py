@@ -19,10 +19,10 @@ from cosim.output.certificates import (
     with_weight,
 )
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.assumptions import AssumptionStatus
 from noack.theory.certificates.certified_bounds import ScenarioCertificate

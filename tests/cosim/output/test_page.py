@@ -21,8 +21,8 @@ from cosim.output.report_page import Report, page, write_report
 from cosim.output.run_figures import BOUNDED, run_figures
 from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
-from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
+from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.summaries import alone, summary_of
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from cosim.output.certificates import Certificates
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.impairments.loss_guarantee import LossHistory
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import most_events
 from noack.theory.random_losses.moments import UnlimitedLosses
 

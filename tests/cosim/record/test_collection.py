@@ -22,12 +22,12 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve, run_tables
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter, writer_of
 from noack.runtime.telemetry import OwnSpool
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario_file import validate
 from tests.cosim.summaries import alone
 
 RUN = "0123456789abcdef"

@@ -9,10 +9,10 @@ from cosim.analysis.run_summary import summarise
 from cosim.record.run_events import GROWTH, Divergence, divergence
 from cosim.simulation.continuous import run_continuous, summary
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 
 T_S = np.linspace(0.0, 10.0, 1001)
 

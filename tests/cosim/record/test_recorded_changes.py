@@ -18,10 +18,6 @@ from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from netem.channel import Datagram, channel_of
-from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -35,6 +31,10 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
 from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
 from tests.machine_parts import controller_of, sensor_of

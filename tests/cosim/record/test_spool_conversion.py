@@ -13,12 +13,12 @@ from cosim.record.run_record import RecordedRun, Rows, RunRecord, load_run
 from cosim.record.spool_conversion import finish_record
 from cosim.record.table_files import StoredTables, write_table
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.resolution import network_tables, run_tables
-from noack.config.scenario_file import validate
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from noack.scenario.resolution import network_tables, run_tables
+from noack.scenario.scenario_file import validate
 
 LOOPS = 3
 

@@ -17,9 +17,6 @@ from cosim.output.certificates import Certificates
 from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
@@ -38,6 +35,9 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, read_header
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
 from tests.cosim.summaries import alone

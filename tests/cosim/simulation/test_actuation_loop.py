@@ -13,9 +13,6 @@ from cosim.analysis.replay import replay
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import (
@@ -26,6 +23,9 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
 )
 from noack.protocol.wire_format import Flow
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
 from tests.cosim.record.changed_records import changed, flipped
 from tests.oracles.comparison import Comparison
 

@@ -9,10 +9,10 @@ from cosim.analysis.replay import replay
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario, loop_names, loops_of, phases_ns
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import OWNER
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
+from noack.scenario.scenario_file import load
 
 NETWORKS: dict[str, Sequence[str]] = {
     "no losses": ('network.loss={ model = "lossless" }',),

@@ -8,11 +8,11 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import VirtualRun, simulate, simulate_loops
-from noack.config.resolution import resolve, tables_of
-from noack.config.scenario import loops_of
-from noack.config.scenario_file import load, validate
 from noack.core.core_library import core, ffi
 from noack.protocol.record_tables import OWNER
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import loops_of
+from noack.scenario.scenario_file import load, validate
 from tests.cosim.simulation.shuttle import Shuttle, shuttled
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"

@@ -17,13 +17,13 @@ from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.design_search import DesignLimits, design
-from noack.config.resolution import resolve, steady_state
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, validate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve, steady_state
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, validate
 from noack.theory.certificates.assumptions import assumptions
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed

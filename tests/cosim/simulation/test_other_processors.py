@@ -10,8 +10,8 @@ _PRINT_DIGESTS = """
 import hashlib
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 for name in ("lane_following", "f16_lateral", "unstable_pendulum"):
     record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=2"])))
     for table in sorted(record.tables):

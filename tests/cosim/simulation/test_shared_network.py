@@ -10,12 +10,12 @@ from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.config.resolution import resolve
-from noack.config.scenario import loops_of, phases_ns
-from noack.config.scenario_file import validate
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import loops_of, phases_ns
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
 Content = dict[str, Any]

@@ -16,11 +16,11 @@ from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord, load_record
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.controllers.controller_settings import ControlModel
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 EXAMPLES = ("saturated_lqr", "model_predictive")

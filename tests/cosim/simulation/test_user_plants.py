@@ -17,10 +17,10 @@ from cosim.cli import app
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import load_record
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.plant_server.fmus.build import build
 
 SCENARIO = """

@@ -9,9 +9,6 @@ import pytest
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import RowMemory, simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -22,6 +19,9 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import read_header
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 
 MS = 1_000_000
 

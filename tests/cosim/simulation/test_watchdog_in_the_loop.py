@@ -11,9 +11,9 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.output.run_tables import key_numbers
 from cosim.record.run_record import RunRecord
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.live.outage import CASES, SCENARIOS, row, with_outage
 from tests.cosim.summaries import summary_of
 

@@ -10,9 +10,9 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load, validate
-from noack.config.sections import POLICIES as POLICY_KINDS
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load, validate
+from noack.scenario.sections import POLICIES as POLICY_KINDS
 from tests.oracles import whole_loop
 from tests.oracles.comparison import Comparison
 from tests.oracles.random_scenarios import POLICIES, random_scenario

@@ -7,12 +7,6 @@ from typing import Any
 from unittest.mock import patch
 
 from cosim.live import coordinator
-from noack.config.parameter_changes import (
-    ChangeSchedule,
-    settings_bytes,
-    settings_of,
-)
-from noack.config.runtime_parameters import SHORT
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.runtime import run_registry
@@ -23,6 +17,12 @@ from noack.runtime.control_messages import (
     parse_message,
 )
 from noack.runtime.private_folder import open_private
+from noack.scenario.parameter_changes import (
+    ChangeSchedule,
+    settings_bytes,
+    settings_of,
+)
+from noack.scenario.runtime_parameters import SHORT
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace

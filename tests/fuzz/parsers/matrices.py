@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 
-from noack.config.matrix_files import read_matrices
+from noack.scenario.matrix_files import read_matrices
 from noack.settings.user_files import NamedFile
 from tests.fuzz.harness import refusal, workspace
 

@@ -32,9 +32,9 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve, run_tables
-from noack.config.scenario_file import dumps, validate
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.summaries import alone
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited

@@ -5,10 +5,10 @@ from typing import Any
 
 import tomli_w
 
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load, validate
-from noack.config.toml_file import json_schema
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load, validate
+from noack.scenario.toml_file import json_schema
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import bases, edited, key, quoted, value, vocabulary, write_named
 from tests.fuzz.harness import FOLDER, refusal, workspace

@@ -11,10 +11,10 @@ import numpy as np
 from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.spool_conversion import finish_record
-from noack.config.resolution import resolve, run_tables
-from noack.config.scenario_file import dumps, validate
 from noack.protocol.record_tables import OWNER
 from noack.runtime.spool import NOTICES, batch_of
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario_file import dumps, validate
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import workspace

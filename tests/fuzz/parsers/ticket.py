@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
-from noack.config.toml_file import json_schema
 from noack.runtime import join_ticket
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
+from noack.scenario.toml_file import json_schema
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, bases, edited, vocabulary
 from tests.fuzz.harness import refusal

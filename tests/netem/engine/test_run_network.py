@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 
 from netem.run_network import RunNetwork
 from netem.tc_words import settings_of
-from noack.config.parameter_changes import ParameterChange
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.clock import RunClock
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Record, Start
 from noack.protocol.record_tables import NETEM_RELEASE
 from noack.protocol.wire_format import Flow
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from tests.machine_interface import Machine
 from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, name_of

@@ -14,9 +14,9 @@ from hypothesis import given
 
 from netem.relay_links import LinkSpec
 from netem.tc_words import LinksFile, json_schema, load_links, settings_of, text_of
-from noack.config import toml_file
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
+from noack.scenario import toml_file
 from tests.netem.any_settings import settings, words_can_say
 
 ROOT = Path(__file__).parents[3]

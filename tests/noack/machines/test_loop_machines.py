@@ -12,10 +12,6 @@ from hypothesis import strategies as st
 import noack.core.core_memory
 import sensor_node.sensor
 from controller_node.controller import Controller
-from noack.config.parameter_changes import LATE, ParameterChange
-from noack.config.resolution import resolve, tables_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.errors import CallerError
 from noack.core.linear_systems import discretise
@@ -33,6 +29,10 @@ from noack.protocol.record_tables import (
     tables,
 )
 from noack.protocol.wire_format import Flow, Message
+from noack.scenario.parameter_changes import LATE, ParameterChange
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.trigger.trigger_rule import CodedPolicy
 from plant_server.plant import BLOCK, Plant
 from sensor_node.sensor import Sensor, sensors_of

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
-from noack.config.sections import PLANTS
 from noack.plants.plant_settings import PlantSettings
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.scenario.sections import PLANTS
 from plant_server.plant import system_of
 from tests.noack.plants.motion import motion
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from noack.config.named_models import single_track_lane
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
 from noack.plants.four_tank import FourTankSettings
@@ -22,6 +21,7 @@ from noack.plants.vehicle import (
     equations,
     library,
 )
+from noack.scenario.named_models import single_track_lane
 from tests.noack.plants.motion import H_NS, motion
 
 X0 = np.array([0.2, -0.1, 0.05, 3.0])

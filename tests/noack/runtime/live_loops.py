@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import controllers_of
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.clock import RunClock
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import Notice, Record
@@ -19,6 +16,9 @@ from noack.protocol.topology import SENDS
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.runtime.live_driver import LiveDriver, LoopChannel
 from noack.runtime.udp_sockets import bind
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 from tests.machine_parts import SteppedMachines

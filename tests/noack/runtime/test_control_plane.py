@@ -18,8 +18,6 @@ from zenoh.handlers import FifoChannel
 import noack.runtime.control_plane
 import noack.runtime.run_process
 from cosim.live.coordinator import Coordinator
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES
 from noack.runtime.command_line import Signals
@@ -28,6 +26,8 @@ from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.private_folder import private_folder
 from noack.runtime.run_process import RunProcess, _admitted
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
 from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for

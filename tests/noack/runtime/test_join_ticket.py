@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.runtime.join_ticket import find_ticket, loads, new_ticket, published
 from noack.runtime.private_folder import private_folder
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 
 KEY = "ab" * 32
 

@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.clock import ClockOffset, Exchange, SlewedClock, SlewedRunClock
 from noack.core.core_library import core
 from noack.protocol.machine_interface import Record
@@ -30,6 +28,8 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.noack.runtime.live_loops import (
     HOUR_NS,
     Live,

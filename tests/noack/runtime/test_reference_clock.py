@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 
 from benchmarks.hosts import DrivenClocks
-from noack.config.run_sections import ClocksSection
-from noack.config.scenario_file import validate
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import PeerError
 from noack.protocol.machine_interface import BEGINNING, Notice, Record
@@ -26,6 +24,8 @@ from noack.runtime.host_clocks.reference_clock import (
 )
 from noack.runtime.host_clocks.time_exchange import HostClocks, TimeReference, answering
 from noack.runtime.join_ticket import new_ticket
+from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario_file import validate
 
 KEY = bytes(range(32))
 ROOMY = ClocksSection(largest_error_us=1e6)  # a busy machine gives wide bounds

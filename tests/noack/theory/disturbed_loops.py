@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.bounds.gains import ErrorGains, Forcing, Growth, PlantGains
 from noack.theory.bounds.terms import Constants, EstimationBound, Part, TriggerBound
 from noack.theory.certificates.certified_bounds import ScenarioCertificate

@@ -12,8 +12,8 @@ from cosim.simulation.continuous import (
     TooManyEventsError,
     simulate_continuous,
 )
-from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
+from noack.scenario.resolution import LoopMatrices
 from noack.trigger.trigger_rule import Policy
 from tests.oracles.lossy_loops import System
 from tests.trigger_rules import decaying_rule

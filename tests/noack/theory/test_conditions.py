@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import MOST_S, largest

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import ErrorGains, Forcing, NormalForcing, PlantGains

@@ -10,9 +10,6 @@ import pytest
 from scipy.linalg import expm
 
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.impairments.loss_guarantee import (
@@ -22,6 +19,9 @@ from noack.impairments.loss_guarantee import (
     LossGuarantee,
     LossHistory,
 )
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.theory.margins.loss_margin import EventTimes, LossMargin, capped, list_bursts
 
 ROOT = Path(__file__).parents[3]

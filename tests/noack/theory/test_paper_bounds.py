@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from scipy.linalg import expm
 
-from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe

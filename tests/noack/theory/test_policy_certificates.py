@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noack.config.resolution import policy_of, resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.scenario_file import load
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import known_state_bounds
 from noack.theory.certificates.conditions import allowed_conditions

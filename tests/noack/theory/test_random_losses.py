@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.margins.loss_margin import LossMargin

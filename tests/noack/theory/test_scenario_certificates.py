@@ -15,10 +15,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_continuous_lyapunov
 
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario, loops_of
-from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario, loops_of
+from noack.scenario.scenario_file import load, validate
 from noack.theory.bounds.gains import ErrorGains
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.assumptions import AssumptionStatus

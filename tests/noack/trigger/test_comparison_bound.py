@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from noack.config.scenario_file import validate
+from noack.scenario.scenario_file import validate
 from noack.trigger.comparison_bound import comparison_bound
 from noack.trigger.dynamic import DynamicSettings
 from noack.trigger.lyapunov import LyapunovSettings

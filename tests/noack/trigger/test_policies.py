@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from noack.config.sections import POLICIES
 from noack.core.errors import CallerError
 from noack.core.linear_systems import norm as exact_norm
+from noack.scenario.sections import POLICIES
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import Forecast

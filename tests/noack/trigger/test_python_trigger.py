@@ -14,11 +14,11 @@ from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import OK
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEND_ON_DELTA = """

@@ -20,9 +20,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.output.palette import CONTROLLER, PLANT, SENSOR, Colour
-from noack.config.resolution import LoopMatrices, loop_of
-from noack.config.scenario import Scenario
 from noack.core.linear_systems import Propagator
+from noack.scenario.resolution import LoopMatrices, loop_of
+from noack.scenario.scenario import Scenario
 
 Reals = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from cosim.analysis.adversary.loop_flows import SegmentFlow
 from cosim.analysis.adversary.objective import Objective, Pattern, measure_of
 from cosim.simulation.continuous import ContinuousRun, continuous_loop_of, simulate_continuous
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from tests.oracles.lossy_loops import System, systems
 
 ALL_LOST = (False,) * 1000

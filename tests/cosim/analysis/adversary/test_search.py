@@ -16,10 +16,10 @@ from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.pattern_search import Nodes, PatternSearch, search_beam, search_tree
 from cosim.analysis.adversary.worst_pattern_search import cost_ceiling
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load, validate
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load, validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate

@@ -12,8 +12,8 @@ from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.pattern_search import follow
 from cosim.simulation.continuous import LoopState
-from noack.config.scenario import Scenario
 from noack.impairments.loss_guarantee import LossAutomaton
+from noack.scenario.scenario import Scenario
 from tests.cosim.analysis.adversary.scenarios import flow_of, scenarios, simulate
 from tests.cosim.simulation.continuous.next_event import next_event
 

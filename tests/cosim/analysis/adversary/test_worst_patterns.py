@@ -16,10 +16,10 @@ from cosim.analysis.adversary.worst_run import bounds_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.scenario_certificates import certify
 from tests.trigger_rules import EXAMPLES

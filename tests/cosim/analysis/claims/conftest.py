@@ -8,11 +8,11 @@ import pytest
 
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import Network, simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.protocol.record_tables import OWNER, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import read_header
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
 MS = 1_000_000

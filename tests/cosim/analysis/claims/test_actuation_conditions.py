@@ -10,12 +10,12 @@ from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.output.certificate_report import Certificates
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.core.linear_systems import transition
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import nominal_conditions
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"

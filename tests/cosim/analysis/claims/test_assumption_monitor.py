@@ -24,7 +24,6 @@ from cosim.analysis.claims.observed_conditions import (
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -33,6 +32,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.trigger.absolute import AbsoluteSettings
 from tests.cosim.analysis.claims.conftest import Make, event_s, network_of

@@ -18,7 +18,7 @@ from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.scenario import Scenario
+from noack.scenario.scenario import Scenario
 from noack.theory.certificates.conditions import allowed_conditions
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.simulation.shuttle import shuttled

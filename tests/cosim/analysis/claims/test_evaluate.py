@@ -21,9 +21,6 @@ from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.align import UNKNOWN, align_tables
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import spectral_abscissa
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -31,6 +28,9 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import (
     Make,
     event_s,

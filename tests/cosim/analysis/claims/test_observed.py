@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.scenario import Scenario
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -17,6 +16,7 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.conditions import nominal_conditions
 from tests.cosim.analysis.claims.conftest import (

@@ -16,8 +16,6 @@ from cosim.analysis.claims.claim_evaluation import (
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import validate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_SETTING,
@@ -26,6 +24,8 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.cosim.analysis.claims.conftest import MS, Make
 from tests.cosim.record.changed_records import changed
 

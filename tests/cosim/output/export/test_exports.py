@@ -17,8 +17,8 @@ import noack
 from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
-from noack.config.scenario import phases_ns
 from noack.core.errors import CallerError
+from noack.scenario.scenario import phases_ns
 
 SCENARIO: dict[str, Any] = {
     "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],

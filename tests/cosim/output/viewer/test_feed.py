@@ -11,10 +11,10 @@ import pytest
 import cosim.output.viewer.table_feed
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.table_feed import ViewFeed
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import PACKET_HEAD_BYTES, Fate, tables
 from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario_file import load
 
 ROOT = Path(__file__).parents[4]
 SCENARIO = resolve(load(ROOT / "scenarios" / "lane_following.toml"))

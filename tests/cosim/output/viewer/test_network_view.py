@@ -23,7 +23,7 @@ from cosim.record.run_directory import RECORDING_FILE, write_environment, write_
 from cosim.record.run_record import RecordedRun, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.scenario_file import load
+from noack.scenario.scenario_file import load
 from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series
 
 MAX_BYTES = 3_000_000

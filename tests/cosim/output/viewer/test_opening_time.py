@@ -18,8 +18,8 @@ from cosim.output.viewer.live_viewer import (
 )
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.summaries import summary_of
 
 T_NS = 4_244_000_000

@@ -22,11 +22,11 @@ from cosim.output.viewer.pictures.picture import (
 )
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario_file import load
 from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
 from noack.protocol.wire_format import Flow
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario_file import load
 
 ROOT = Path(__file__).parents[4]
 S = 1_000_000_000

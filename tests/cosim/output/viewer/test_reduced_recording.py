@@ -17,10 +17,10 @@ from cosim.record.run_directory import RECORDING_FILE, RunEnding, write_environm
 from cosim.record.run_record import RunRecord, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.cosim.record.changed_records import changed, copied
 from tests.cosim.summaries import alone

@@ -27,9 +27,9 @@ from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.scenario_file import load
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import NETEM_PACKET
+from noack.scenario.scenario_file import load
 from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
 

@@ -32,10 +32,10 @@ from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFil
 from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
 from cosim.shipped_files import find_shipped
-from noack.config.resolution import resolve
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import Fate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import load
 from tests.cosim.output.test_approved import compare
 from tests.integration.conftest import wait_for
 

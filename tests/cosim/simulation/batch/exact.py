@@ -16,7 +16,6 @@ from cosim.simulation.batch import (
 )
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
 from cosim.simulation.exact_simulation import OK
-from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt
@@ -30,6 +29,7 @@ from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
+from noack.scenario.resolution import LoopMatrices
 from noack.trigger.trigger_rule import QuadraticForm
 from tests.oracles.link import UPDATE_LINK, Link
 from tests.trigger_rules import decaying_rule

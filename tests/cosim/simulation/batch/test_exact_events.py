@@ -11,14 +11,14 @@ from cosim.shipped_files import find_shipped
 from cosim.simulation.batch import Population, Setting, run_batch, run_events, setting_of
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import (
     check_events,

@@ -19,9 +19,9 @@ from cosim.simulation.continuous import (
     reset,
     simulate_continuous,
 )
-from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import LoopMatrices
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.continuous.next_event import next_event
 from tests.trigger_rules import decaying_rule

@@ -17,7 +17,7 @@ from cosim.simulation.continuous import (
     TooManyEventsError,
     simulate_continuous,
 )
-from noack.config.resolution import LoopMatrices
+from noack.scenario.resolution import LoopMatrices
 from noack.trigger.trigger_rule import Forecast, TriggerRule
 from tests.trigger_rules import (
     lyapunov_rule,

@@ -19,8 +19,8 @@ from cosim.simulation.continuous import (
     continuous_loop_of,
     simulate_continuous,
 )
-from noack.config.resolution import LoopMatrices, resolve
-from noack.config.scenario_file import load
+from noack.scenario.resolution import LoopMatrices, resolve
+from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
 from tests.trigger_rules import absolute_rule, lyapunov_rule, mixed_rule, quadratic_rule
 

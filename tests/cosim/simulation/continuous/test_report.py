@@ -10,10 +10,10 @@ from typer.testing import CliRunner, Result
 from cosim.cli import app
 from cosim.simulation.continuous import POINTS, document, network_fates, run_continuous
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import NETEM_PACKET, Fate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 

@@ -15,10 +15,10 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import LoopMatrices, policy_of, resolve
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import PLANT_STEP
+from noack.scenario.resolution import LoopMatrices, policy_of, resolve
+from noack.scenario.scenario_file import validate
 from noack.trigger.trigger_rule import TriggerRule
 from tests.trigger_rules import decaying_rule
 

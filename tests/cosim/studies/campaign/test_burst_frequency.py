@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cosim.studies.campaign.metrics import burst_frequency
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 
 LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 

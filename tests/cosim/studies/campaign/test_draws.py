@@ -8,11 +8,11 @@ import pytest
 from cosim.simulation.batch import run_batch
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
-from noack.config.resolution import loop_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from tests.cosim.studies.campaign.conftest import Few
 from tests.oracles.link import update_link_of
 

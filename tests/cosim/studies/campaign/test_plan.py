@@ -10,8 +10,8 @@ import pytest
 
 from cosim.studies.campaign.campaign_file import Campaign, json_schema, load
 from cosim.studies.campaign.campaign_grid import grid
-from noack.config.scenario_file import load as load_scenario
 from noack.core.errors import CallerError
+from noack.scenario.scenario_file import load as load_scenario
 from tests.cosim.studies.campaign.conftest import Write, few_of
 
 ROOT = Path(__file__).parents[4]

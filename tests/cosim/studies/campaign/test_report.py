@@ -34,10 +34,10 @@ from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.metrics import METRICS, certified_error, estimate, measured
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load as load_scenario
-from noack.config.scenario_file import validate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load as load_scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of

@@ -16,9 +16,9 @@ from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import drawn_scenario
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load as load_scenario
 from noack.core.errors import ExitStatus
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load as load_scenario
 from tests.cosim.studies.campaign.conftest import Write, few_of
 
 SHIPPED = Path(__file__).parents[4] / "scenarios"

@@ -11,8 +11,8 @@ from cosim.simulation.virtual_time import simulate_loops
 from cosim.studies.campaign.campaign_grid import grid, row_type
 from cosim.studies.campaign.random_draws import seeds_of
 from cosim.studies.campaign.sampled_draws import LOOPS_ROW, SharedNetworkWork, in_virtual_time
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
+from noack.scenario.scenario_file import load
 from tests.cosim.studies.campaign.conftest import Write
 
 SCENARIO = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"

@@ -26,8 +26,8 @@ from cosim.studies.capacity.capacity_result import (
     capacity_of,
     carried,
 )
-from noack.config.scenario_file import load
 from noack.protocol.record_tables import Fate
+from noack.scenario.scenario_file import load
 
 FILE = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 PERIOD_S = 0.1

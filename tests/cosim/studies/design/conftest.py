@@ -6,8 +6,8 @@ import pytest
 
 from cosim.studies.design.design_search import DesignLimits, DesignResult, design
 from cosim.studies.design.design_space import families_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 
 SCENARIO = """
 name = "mass"

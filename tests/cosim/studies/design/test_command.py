@@ -15,7 +15,7 @@ from cosim.cli import app
 from cosim.studies.design.design_page import page
 from cosim.studies.design.design_search import DesignResult
 from cosim.studies.design.design_space import lqr_gain
-from noack.config.scenario_file import load
+from noack.scenario.scenario_file import load
 
 ONE = """
 name = "one"

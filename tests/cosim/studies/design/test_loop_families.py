@@ -12,12 +12,12 @@ from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import DesignLimits, certificate_of, design
 from cosim.studies.design.design_space import families_of, lqr_gain
-from noack.config.named_models import lane_following
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import load
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.named_models import lane_following
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from tests.cosim.studies.design.conftest import designed
 from tests.cosim.studies.design.test_command import ONE
 

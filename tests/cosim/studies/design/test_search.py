@@ -16,10 +16,10 @@ from cosim.studies.design.design_search import (
     require_draws,
 )
 from cosim.studies.design.design_space import LEVELS
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
 from tests.cosim.studies.design.conftest import LIMITS, designed

@@ -17,8 +17,8 @@ from cosim.studies.paper.paper_evidence import (
     resolved_draw,
 )
 from cosim.studies.paper.paper_page import _rounded
-from noack.config.named_models import lane_following
-from noack.config.resolution import loop_of
+from noack.scenario.named_models import lane_following
+from noack.scenario.resolution import loop_of
 
 ROOT = Path(__file__).parents[4]
 CAMPAIGN = ROOT / "campaigns" / "paper.toml"

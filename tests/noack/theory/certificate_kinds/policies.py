@@ -14,10 +14,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix, Vector
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import TriggerBounds
 from noack.theory.certificates import scenario_certificates, solution

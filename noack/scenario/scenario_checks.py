@@ -15,14 +15,6 @@ from typing import TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from noack.config.runtime_parameters import (
-    LOSS,
-    put_settings,
-    require_runtime_parameters,
-)
-from noack.config.scenario_tables import ScenarioTables
-from noack.config.sections import AnyController, AnyTrigger
-from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.constraints import require_consistent
@@ -31,6 +23,14 @@ from noack.impairments.loss_models import Loss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import with_kept_loss
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.scenario.runtime_parameters import (
+    LOSS,
+    put_settings,
+    require_runtime_parameters,
+)
+from noack.scenario.scenario_tables import ScenarioTables
+from noack.scenario.sections import AnyController, AnyTrigger
+from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table, require_length, require_shape
 
 S = TypeVar("S", bound=ScenarioTables)

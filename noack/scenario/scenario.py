@@ -1,7 +1,8 @@
 """The scenario: everything that defines a run, validated into frozen objects; and its loops.
 
 A scenario file is TOML; every key is documented in its table, and in the exported JSON Schema.
-Unknown keys are errors. :mod:`noack.config.resolution` replaces names and random draws by numbers.
+Unknown keys are errors. :mod:`noack.scenario.resolution` replaces names and random draws by
+numbers.
 
 A run has one or more loops on one network, each an ordinary scenario. The number of a loop is its
 place in :func:`loops_of`. A loop begins at its phase: its time 0 is that time of the run.
@@ -15,12 +16,12 @@ from typing import Any, Self
 import numpy as np
 from pydantic import ValidationError, create_model, model_validator
 
-from noack.config.run_sections import MOST_LOOPS, LoopSection, SeedsSection
-from noack.config.scenario_checks import check_changes, check_sections
-from noack.config.scenario_tables import ScenarioTables
-from noack.config.toml_file import explain
 from noack.core.clock import NS_PER_S
 from noack.core.random_streams import named_stream_keys, stream
+from noack.scenario.run_sections import MOST_LOOPS, LoopSection, SeedsSection
+from noack.scenario.scenario_checks import check_changes, check_sections
+from noack.scenario.scenario_tables import ScenarioTables
+from noack.scenario.toml_file import explain
 from noack.settings.section import ReadTable, ScenarioSection, Table
 from noack.trigger.periodic_trigger import PeriodicSettings
 

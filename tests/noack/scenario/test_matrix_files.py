@@ -11,13 +11,13 @@ from scipy import signal
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_matrix
 
-from noack.config import matrix_files
-from noack.config.matrix_files import model_of, save_model
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load
-from noack.config.sections import ModelSection
 from noack.core.errors import CallerError
+from noack.scenario import matrix_files
+from noack.scenario.matrix_files import model_of, save_model
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load
+from noack.scenario.sections import ModelSection
 
 A = np.array([[0.0, 1.0], [4.0, -0.25]])
 B = np.array([[0.0], [1.0]])

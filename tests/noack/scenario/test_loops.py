@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.resolution import loop_of, resolve, resolve_run, resolved_loops
-from noack.config.scenario import Scenario, loop_names, loops_of, phases_ns
-from noack.config.scenario_file import completed, dumps, load, toml_text, validate
 from noack.core.errors import CallerError
+from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_loops
+from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
+from noack.scenario.scenario_file import completed, dumps, load, toml_text, validate
 
 
 def with_loops(content: dict[str, Any], *loops: dict[str, Any]) -> Scenario:

@@ -1,6 +1,6 @@
 """The keys of a scenario, and what follows from them: times, sizes of messages, covering theory.
 
-:mod:`noack.config.scenario_checks` checks tables that depend on each other.
+:mod:`noack.scenario.scenario_checks` checks tables that depend on each other.
 """
 
 import math
@@ -9,7 +9,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat
 
-from noack.config.run_sections import (
+from noack.controllers.linear_feedback import LinearFeedbackSettings
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.number_format import as_html, as_text
+from noack.plants.linear import LinearSettings
+from noack.protocol.topology import PROTOCOLS, LoopProtocol
+from noack.protocol.wire_format import Flow
+from noack.scenario.run_sections import (
     NAME_PATTERN,
     CertificateSection,
     ClocksSection,
@@ -20,7 +27,7 @@ from noack.config.run_sections import (
     ScheduledChange,
     SeedsSection,
 )
-from noack.config.sections import (
+from noack.scenario.sections import (
     AnyController,
     AnyObserver,
     AnyTrigger,
@@ -28,13 +35,6 @@ from noack.config.sections import (
     NetworkSection,
     PlantSection,
 )
-from noack.controllers.linear_feedback import LinearFeedbackSettings
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.core.number_format import as_html, as_text
-from noack.plants.linear import LinearSettings
-from noack.protocol.topology import PROTOCOLS, LoopProtocol
-from noack.protocol.wire_format import Flow
 from noack.settings.section import ScenarioSection, period_ns
 from noack.trigger.decaying import DecayingSettings
 
@@ -42,7 +42,7 @@ MOST_CHANGES = 256  # largest number of scheduled changes in a run
 
 
 class ScenarioTables(ScenarioSection):
-    """The keys of a scenario; :class:`noack.config.scenario.Scenario` checks them together."""
+    """The keys of a scenario; :class:`noack.scenario.scenario.Scenario` checks them together."""
 
     name: Annotated[str, Field(pattern=NAME_PATTERN)]
     """Names the run's directory: letters, digits, _ and -."""

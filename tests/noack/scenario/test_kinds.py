@@ -7,10 +7,10 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
-from noack.config.sections import DISTURBANCES, OBSERVERS, POLICIES
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
+from noack.scenario.sections import DISTURBANCES, OBSERVERS, POLICIES
 
 
 def cases() -> Iterator[Any]:

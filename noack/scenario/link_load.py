@@ -26,10 +26,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from noack.config.resolution import policy_of, resolve
-from noack.config.scenario import Scenario, loop_scenario, loop_sections
-from noack.config.scenario_checks import with_settings
-from noack.config.sections import DirectionSection
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.impairments.constraints import join_guarantee
@@ -38,6 +34,10 @@ from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.loss_guarantee import LossWindow
 from noack.protocol.wire_format import Flow, datagram_bytes
+from noack.scenario.resolution import policy_of, resolve
+from noack.scenario.scenario import Scenario, loop_scenario, loop_sections
+from noack.scenario.scenario_checks import with_settings
+from noack.scenario.sections import DirectionSection
 from noack.trigger.periodic_trigger import PeriodicSettings
 from noack.trigger.trigger_rule import CodedPolicy
 

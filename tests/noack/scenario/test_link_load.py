@@ -10,9 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.simulation.virtual_time import simulate_loops
-from noack.config.link_load import link_loads, load_warnings, require_capacity, update_delay
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
 from noack.impairments.feature import Impairment
 from noack.impairments.kinds.delay import Delay
@@ -20,6 +17,9 @@ from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import require_scores
 from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
+from noack.scenario.link_load import link_loads, load_warnings, require_capacity, update_delay
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import dumps, validate
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import Flow
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import dumps, validate
 
 KALMAN: dict[str, Any] = {"kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0]}
 POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}

@@ -13,7 +13,11 @@ from collections.abc import Callable, Iterator
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-from noack.config.runtime_parameters import (
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import CHANGE_BYTES
+from noack.scenario.runtime_parameters import (
     CONSTRAINTS,
     LOSS,
     MANSD,
@@ -21,13 +25,9 @@ from noack.config.runtime_parameters import (
     text_of,
     trigger_parameters,
 )
-from noack.config.scenario import Scenario
-from noack.config.scenario_checks import with_settings
-from noack.config.sections import PlantSection
-from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError
-from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.record_tables import CHANGE_BYTES
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_checks import with_settings
+from noack.scenario.sections import PlantSection
 from noack.settings.section import ReadTable, Table
 
 _shared_tables = attrgetter(*(Scenario.model_fields.keys() - {"name", "plant", "seeds"}))

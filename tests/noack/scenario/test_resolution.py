@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.config.named_models import lane_following
-from noack.config.resolution import loop_of, resolve
-from noack.config.scenario import Scenario
-from noack.config.scenario_checks import input_at
-from noack.config.scenario_file import dumps, load, validate
+from noack.scenario.named_models import lane_following
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_checks import input_at
+from noack.scenario.scenario_file import dumps, load, validate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from noack.config.mat_file import matrices_as_npz
-from noack.config.sections import ModelSection, instability
-from noack.config.toml_file import brief
 from noack.core.errors import CallerError
 from noack.core.file_access import new_file
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.scenario.mat_file import matrices_as_npz
+from noack.scenario.sections import ModelSection, instability
+from noack.scenario.toml_file import brief
 from noack.settings.section import ReadTable, require_shape, rows_of
 from noack.settings.user_files import NamedFile
 

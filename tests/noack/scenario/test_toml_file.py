@@ -11,9 +11,9 @@ import pytest
 
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from netem.tc_words import load_links
-from noack.config import toml_file
-from noack.config.scenario_file import load, put, validate
 from noack.core.errors import CallerError
+from noack.scenario import toml_file
+from noack.scenario.scenario_file import load, put, validate
 from noack.settings.section import ScenarioSection
 from noack.settings.user_files import NamedFile
 
@@ -81,7 +81,7 @@ def test_text_without_long_keys_is_checked_in_linear_time(part: str) -> None:
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from noack.config.toml_file import read
+from noack.scenario.toml_file import read
 from noack.core.errors import CallerError
 usage = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 limit = usage + 64 * 2**20

@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import noack
-from noack.config.resolution import resolve, resolved_loops
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, load, put, validate, value_of
 from noack.core.errors import CallerError
+from noack.scenario.resolution import resolve, resolved_loops
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 Content = dict[str, Any]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from noack.config.named_models import (
+from noack.scenario.named_models import (
     NAMED_MODELS,
     double_integrator,
     lane_following,

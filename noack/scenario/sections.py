@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.named_models import NAMED_MODELS, NamedModel, parameters_of
 from noack.controllers.controller_settings import ControllerSettings
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.disturbances.disturbance_settings import DisturbanceSettings, Place
@@ -25,6 +24,7 @@ from noack.observers.observer_settings import NoiseVariances, ObserverSettings
 from noack.plants.linear import LinearSettings
 from noack.plants.plant_settings import PlantSettings
 from noack.protocol.wire_format import Flow
+from noack.scenario.named_models import NAMED_MODELS, NamedModel, parameters_of
 from noack.settings.section import (
     Bounds,
     Deviations,
@@ -74,7 +74,7 @@ class ModelSection(ScenarioSection):
     """
 
     name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
-    """A named model; see noack/config/named_models.py."""
+    """A named model; see noack/scenario/named_models.py."""
     parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""
     A: Rows | None = None

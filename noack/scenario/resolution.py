@@ -11,9 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from noack.config.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
-from noack.config.scenario_checks import input_at
-from noack.config.sections import AnyObserver, ModelSection
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
@@ -27,6 +24,9 @@ from noack.protocol.record_tables import (
     largest,
     tables,
 )
+from noack.scenario.scenario import Scenario, loop_scenario, loop_sections, loops_by_entry, loops_of
+from noack.scenario.scenario_checks import input_at
+from noack.scenario.sections import AnyObserver, ModelSection
 from noack.settings.section import rows_of
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import Policy, TriggerRule, require_rule

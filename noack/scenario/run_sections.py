@@ -4,8 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from noack.config.runtime_parameters import full_key
 from noack.core.clock import NS_PER_S
+from noack.scenario.runtime_parameters import full_key
 from noack.settings.section import ScenarioSection, Seed, Table
 
 Port = Annotated[int, Field(ge=0, le=65535)]

@@ -11,9 +11,9 @@ from unittest.mock import Mock
 import pytest
 
 from netem.tc_words import LinksFile
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import put, value_of
-from noack.config.toml_file import json_schema
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import put, value_of
+from noack.scenario.toml_file import json_schema
 from noack.settings import section as section_module
 from noack.settings.section import ScenarioSection
 
@@ -104,4 +104,4 @@ def test_sections_without_their_source_have_no_descriptions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(inspect, "getsource", Mock(side_effect=OSError("no source")))
-    assert section_module._docstrings.__wrapped__("noack.config.scenario") == {}
+    assert section_module._docstrings.__wrapped__("noack.scenario.scenario") == {}

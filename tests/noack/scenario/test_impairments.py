@@ -12,8 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.resolution import resolve
-from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
@@ -24,6 +22,8 @@ from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import read_files
 from noack.protocol.record_tables import Fate
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import dumps, load, validate
 from tests.oracles.link import Link
 
 

@@ -5,7 +5,12 @@ from typing import Any
 
 import pytest
 
-from noack.config.parameter_changes import (
+from noack.core.errors import CallerError
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import CHANGE_BYTES
+from noack.scenario.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
     changed,
@@ -13,15 +18,10 @@ from noack.config.parameter_changes import (
     settings_bytes,
     settings_of,
 )
-from noack.config.resolution import resolve
-from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
-from noack.config.scenario import Scenario
-from noack.config.scenario_file import dumps, validate
-from noack.core.errors import CallerError
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.record_tables import CHANGE_BYTES
+from noack.scenario.resolution import resolve
+from noack.scenario.runtime_parameters import full_key, is_of_loss_alone, text_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, validate
 
 
 @pytest.fixture

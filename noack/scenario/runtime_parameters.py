@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import NoneType
 from typing import get_args
 
-from noack.config.toml_file import nearest_key
+from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
 from noack.trigger.policy_settings import PolicySettings
 

@@ -16,16 +16,16 @@ from typing import Any
 
 import tomli_w
 
-from noack.config import toml_file
-from noack.config.matrix_files import with_matrices
-from noack.config.runtime_parameters import SHORT, full_key
-from noack.config.scenario import PARTS, Scenario, parts_model, with_loop_tables
-from noack.config.scenario_checks import check_kept_loss
-from noack.config.sections import DirectionSection
-from noack.config.toml_file import keys as known_keys
-from noack.config.toml_file import nearest_key
 from noack.core.errors import CallerError, did_you_mean, printable, shortened
 from noack.core.file_access import shipped_folder
+from noack.scenario import toml_file
+from noack.scenario.matrix_files import with_matrices
+from noack.scenario.runtime_parameters import SHORT, full_key
+from noack.scenario.scenario import PARTS, Scenario, parts_model, with_loop_tables
+from noack.scenario.scenario_checks import check_kept_loss
+from noack.scenario.sections import DirectionSection
+from noack.scenario.toml_file import keys as known_keys
+from noack.scenario.toml_file import nearest_key
 from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import FileSettings, file_tables, located, with_tables
 
