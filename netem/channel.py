@@ -122,7 +122,7 @@ class Channel:
             self.decide(encoded(self.core.asked.message))
         else:
             assert question == core.NOACK_ROWS_FULL
-            self._taken += self.take_rows()
+            self._taken = self.take_rows()
 
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""

@@ -29,7 +29,7 @@ from cosim.analysis.summary_model import (
     RunSummary,
     read_summary,
 )
-from cosim.live.process_pool import interrupts_held, processes
+from cosim.live.process_pool import process_starts, processes
 from cosim.live.progress import work_bar
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -220,7 +220,7 @@ def _helpers(run: RecordedRun) -> Iterator[ProcessPoolExecutor | None]:
 def _judged_by(pool: ProcessPoolExecutor, ending: RunEnding, block: range) -> list[_Judged]:
     """Let a process of a pool judge loops; do it here if the process is killed."""
     try:
-        with interrupts_held():
+        with process_starts():
             judged = pool.submit(_judged_stored, ending, block)
         return judged.result()
     except BrokenProcessPool:
@@ -270,7 +270,7 @@ class ReplayBeside:
     """The replay of the only loop of a run by another process."""
 
     def __init__(self, pool: ProcessPoolExecutor, run_dir: Path) -> None:
-        with interrupts_held():
+        with process_starts():
             self._verdict = pool.submit(stored_verdict, run_dir)
 
     def part(self) -> ReplayPart | None:

@@ -3,11 +3,13 @@
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
+from types import ModuleType
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(
@@ -21,11 +23,12 @@ _ENVIRONMENT = dict.fromkeys(
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 
 _ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+_STARTS = threading.Lock()
 
 
 @contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Start processes of one thread each; submit to them within :func:`interrupts_held`.
+    """Start processes of one thread each; submit to them within :func:`process_starts`.
 
     They end with the parent, however it ends.
     """
@@ -34,7 +37,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     theirs, ours = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     os.environ.update(_ENVIRONMENT)  # inherited by the children
-    with interrupts_held():  # it starts a process for semaphores
+    with process_starts():  # it starts a process for semaphores
         pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
     try:
         yield pool
@@ -61,13 +64,18 @@ def _depend_on(parent: Connection) -> None:
 
 
 @contextmanager
-def interrupts_held() -> Iterator[None]:
-    """Block the signals that end a program in processes that are started meanwhile.
+def process_starts() -> Iterator[None]:
+    """Start processes within this context.
 
-    The parent handles them.
+    In them, the signals that end a program are blocked: the parent handles them. They do not
+    import the parent's main module, as multiprocessing lets them do: a user's program need not
+    have an ``if __name__ == "__main__"``.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with _STARTS:
+        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            sys.modules["__main__"] = main

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from cosim.live.process_pool import interrupts_held, processes
+from cosim.live.process_pool import process_starts, processes
 from noack.core.core_library import SOURCES
 from noack.core.errors import CallerError, PeerError
 
@@ -284,7 +284,7 @@ def _windowed(
     in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(in_flight), 0)):
-            with interrupts_held():
+            with process_starts():
                 future = executor.submit(run_alike, works[chunk.point], chunk.draws, wanted)
             in_flight[future] = chunk
         if not in_flight:

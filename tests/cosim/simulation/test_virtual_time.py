@@ -165,6 +165,14 @@ def test_progress_is_reported_during_a_run(busy: Scenario) -> None:
     assert 0 <= reported_ns[0] < reported_ns[-1] <= longer.timing.horizon_ns
 
 
+def test_each_packet_of_a_long_run_is_recorded_once(busy_content: dict[str, Any]) -> None:
+    """The network's memory for rows is full three times."""
+    busy_content["trigger"] = {"policy": "periodic", "period_s": 0.01}
+    busy_content["horizon_s"] = 150.0
+    record = simulate(resolve(validate(busy_content, "test")))
+    assert record[NETEM_PACKET]["input"].tolist() == list(range(15_001))
+
+
 def test_no_two_tables_share_memory() -> None:
     memory, wide = RowMemory(), np.dtype([("a", "<u2"), ("b", "<f8", (1000,))])
     tables = [memory.rows(places, wide) for places in (10, 1500, 1500, 1, 5000)]

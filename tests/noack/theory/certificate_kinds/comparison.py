@@ -11,7 +11,7 @@ from functools import reduce
 
 import numpy as np
 
-from cosim.live.process_pool import interrupts_held, processes
+from cosim.live.process_pool import process_starts, processes
 from tests.noack.theory.certificate_kinds import Broken, Kind, Tally
 from tests.noack.theory.certificate_kinds.continuous import CONTINUOUS
 from tests.noack.theory.certificate_kinds.decaying import DECAYING
@@ -64,7 +64,7 @@ def _examine_all(kind: Kind, broken: str, loops: int, first: int) -> bool:
     begin, count = first // part, max(loops // part, 1)
     seeds = range(begin, begin + count)
     with processes(_WORKERS) as pool:
-        with interrupts_held():
+        with process_starts():
             parts = [
                 pool.submit(_examine_chunk, kind.name, broken, seeds[at : at + _CHUNK])
                 for at in range(0, count, _CHUNK)
