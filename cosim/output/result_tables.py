@@ -64,7 +64,6 @@ def terminal_table(
     *,
     left: Collection[int] = (0,),
     styles: Mapping[str, str] | None = None,
-    note: str | None = None,
     dense: bool = False,
 ) -> Table:
     """Return a table for a terminal.
@@ -73,11 +72,10 @@ def terminal_table(
         table: the table.
         left: numbers of the columns that begin at the left; the others end at the right.
         styles: styles of texts in the last column, by their first words.
-        note: a text below the table.
         dense: save width, and break no words.
     """
     shown = Table(
-        title=escape(table.caption) if table.caption else None, caption=note,
+        title=escape(table.caption) if table.caption else None,
         box=SIMPLE_HEAD if dense else HEAVY_HEAD, collapse_padding=dense, pad_edge=not dense,
     )  # fmt: skip
     for i, heading in enumerate(table.headings):

@@ -269,7 +269,8 @@ def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> Non
     if not verbose and len(loops) > _MOST_LOOPS:
         loops = sorted(loops, key=badness, reverse=True)[:_MOST_LOOPS]
         title += ", the worst first"
-    console.print(terminal_table(loops_table(loops, title), note=LOOPS_CAPTION, dense=True))
+    console.print(terminal_table(loops_table(loops, title), dense=True))
+    console.print(LOOPS_CAPTION, style="table.caption")
     if more := len(summary.loops) - len(loops):
         console.print(f"and {more} more loops: --verbose shows all")
 
