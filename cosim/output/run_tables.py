@@ -27,6 +27,7 @@ from cosim.output.result_tables import KEY_VALUE, ResultTable
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
 from noack.core.number_format import NONE, duration, number, percent, ratio, seconds, whole
+from noack.scenario.runtime_parameters import MANSD
 
 Numbers = tuple[tuple[str, str], ...]
 """Quantities and their values, as text."""
@@ -158,7 +159,7 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
             yield name, str(sent.sent)
             yield f"{name} lost", f"{sent.lost} ({ratio(sent.lost, sent.sent)})"
             yield f"longest loss burst of {name}", str(sent.longest_loss_burst)
-    yield longest_burst(summary.mansd, summary.constraints, loop.longest_loss_burst)
+    yield longest_burst(largest_cap(summary), summary.constraints, loop.longest_loss_burst)
     violated = [violation.cause for violation in loop.assumption_violations]
     yield "loss bursts beyond M − 1", str(violated.count("dropouts"))
     for constraint in summary.constraints:
@@ -168,6 +169,12 @@ def _losses(summary: RunSummary, loop: LoopSummary) -> Iterator[tuple[str, str]]
 def lost_row(lost: int, delivered: int) -> tuple[str, str]:
     """Return the row of the lost updates."""
     return "lost in the network", f"{lost} ({ratio(lost, lost + delivered)})"
+
+
+def largest_cap(summary: RunSummary) -> int:
+    """Return the largest M − 1 of a run, which may have changed it."""
+    changed = [change.settings.get(MANSD, 0) for change in summary.changes]
+    return max(summary.mansd, *changed, 0)
 
 
 def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:
@@ -344,7 +351,7 @@ def network_rows(summary: RunSummary) -> list[tuple[str, str]]:
     rows = [
         ("updates of all loops", f"{sent} ({sent / reached_s:.4g} /s)"),
         ("lost", f"{lost} ({ratio(lost, sent)}){causes}"),
-        longest_burst(summary.mansd, summary.constraints, network.longest_loss_burst),
+        longest_burst(largest_cap(summary), summary.constraints, network.longest_loss_burst),
         ("forced by the guarantee", str(network.forced_deliveries)),
         ("datagrams in flight: mean, max", f"{flying.mean:.3g}, {flying.max}"),
     ]
