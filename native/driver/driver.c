@@ -21,7 +21,7 @@ enum {
     BUFFER_BYTES = 576, /* a longer datagram is cut, and rejected by its length */
     MESSAGES = 16,      /* received at once; the last place is for a datagram that Python adds */
     MESSAGE_BYTES = BUFFERS * BUFFER_BYTES, /* a message of the kernel has several datagrams */
-    MANY_BYTES = 49152, /* of rows: as many go to the recorder without a pause */
+    MANY_BYTES = 98304, /* of rows: as many go to the recorder without a pause */
     EARLY_NS = 1000     /* a timer may expire so much before its time */
 };
 

@@ -288,7 +288,7 @@ def test_many_rows_are_passed_on_in_portions(content: dict[str, Any]) -> None:
         live.drive_until_accepted(1200)
         assert len(live.rows.tables[SENSOR_MEASUREMENT]) == 1200
     assert len(portions) > 1
-    assert max(portions) < 65_000
+    assert max(portions) < 130_000
 
 
 def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -> None:
