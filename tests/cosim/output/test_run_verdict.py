@@ -162,10 +162,8 @@ def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> 
 
 def test_the_longest_burst_is_shown_with_the_limit_of_all_rules(outcome: Outcome) -> None:
     assert "longest loss burst (cap M − 1 = 4)" in dict(short_numbers(outcome.summary))
-    change = {
-        "number": 1, "t_s": 1.0, "settings": {"network.mansd": 9}, "what": "", "in_force_from_s": {},
-    }  # fmt: skip
-    raised = with_values(outcome.summary, changes=[change])
+    change = {"number": 1, "t_s": 1.0, "settings": {"network.mansd": 9}, "what": ""}
+    raised = with_values(outcome.summary, changes=[change | {"in_force_from_s": {}}])
     assert "longest loss burst (cap M − 1 = 9)" in dict(short_numbers(raised))
     limited = with_values(outcome.summary, constraints=["atmost 3 in 8"])
     assert "longest loss burst (at most 3 allowed)" in dict(short_numbers(limited))
