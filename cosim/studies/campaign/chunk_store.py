@@ -246,9 +246,12 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         LostWorkersError: workers have died.
         MachineError: the results cannot be written.
     """
-    missing = list(store.missing())
     total = len(store.points) * store.draws
-    before = done = total - sum(len(chunk.draws) for chunk in missing)
+
+    def stored() -> int:
+        return total - sum(len(chunk.draws) for chunk in store.missing())
+
+    before = done = stored()
     report = progress or (lambda done, total: None)
     report(done, total)
 
@@ -259,12 +262,13 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         )
 
     try:
-        for chunk, rows in runner([point.work for point in store.points], missing):
+        for chunk, rows in runner([point.work for point in store.points], list(store.missing())):
             store.write(chunk, rows)
             done += len(chunk.draws)
             report(done, total)
     except KeyboardInterrupt as error:
         status = getattr(error, "exit_status", ExitStatus.INTERRUPTED)
+        done = stored()  # it may have come after a chunk was written, and before it was counted
         raise InterruptedCampaignError(message(str(error) or "interrupted"), status) from None
     except (LostWorkersError, OtherArithmeticError, MachineError) as error:
         raise type(error)(message(error)) from None
