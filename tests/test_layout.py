@@ -45,7 +45,7 @@ LINES = {
     "cosim/output": 8135,
     "cosim/record": 3280,
     "cosim/simulation": 1650,
-    "cosim/studies": 5955,
+    "cosim/studies": 5960,
     "plant_server": 405,
     "sensor_node": 370,
     "controller_node": 390,
