@@ -74,7 +74,8 @@ class _LazyFinder(MetaPathFinder):
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         for finder in sys.meta_path if _IS_LAZY.get() else ():
-            spec = None if finder is self else finder.find_spec(name, path, target)
+            is_lazy = isinstance(finder, _LazyFinder)  # this one, or of a context around it
+            spec = None if is_lazy else finder.find_spec(name, path, target)
             if spec is not None and spec.loader is not None:
                 spec.loader = _LazyLoader(spec.loader, name.rpartition(".")[0])
                 return spec

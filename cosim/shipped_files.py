@@ -4,8 +4,12 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError, did_you_mean, shortened
 from noack.core.file_access import shipped_folder
+
+with lazy_modules():
+    from noack.scenario import toml_file
 
 KINDS = ("scenarios", "campaigns")
 """Kinds of shipped files, and their folders."""
@@ -64,8 +68,6 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
-    from noack.scenario import toml_file
-
     return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
 
 

@@ -319,7 +319,7 @@ def has_data(endpoint: Endpoint) -> bool:
 def raise_file_limit() -> None:
     """Raise this process's limit of open files to the hard limit."""
     with suppress(ImportError, OSError, ValueError):
-        import resource
+        import resource  # POSIX only
 
         _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

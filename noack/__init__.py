@@ -17,7 +17,7 @@ else:
         """Look up a name of the library (PEP 562)."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from cosim import api
+        from cosim import api  # upward, and it takes time: for programs only
 
         value = globals()[name] = getattr(api, name)
         return value

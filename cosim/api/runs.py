@@ -22,14 +22,13 @@ from cosim.record.run_directory import (
 )
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
-from noack.scenario.resolution import run_tables
+from noack.scenario import resolution
 from noack.scenario.scenario import Scenario
 
 with lazy_modules():
     import cosim.analysis.replay.run_replay as run_replay
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis import run_summary
-    from cosim.api import studies
     from cosim.live import finalize as run_end
     from cosim.live import launcher, simulated_run
     from cosim.live import progress as progress_display
@@ -39,9 +38,10 @@ with lazy_modules():
         figure_files,
         figure_format,
         network_figures,
+        result_tables,
         run_figures,
+        run_tables,
     )
-    from cosim.output import run_tables as result_tables
     from cosim.record import data_frames, run_record, table_files
     from cosim.studies import run_archive, run_comparison
 
@@ -131,7 +131,7 @@ class Run:
     @property
     def tables(self) -> tuple[str, ...]:
         """Names of the record's tables."""
-        return tuple(run_tables(self._run.scenario))
+        return tuple(resolution.run_tables(self._run.scenario))
 
     def table(self, name: str) -> "pa.Table":
         """Return a table of the record, one row per input of a machine.
@@ -154,7 +154,7 @@ class Run:
         if self._loop is not None:
             return data_frames.with_seconds(table_files.arrow_table(self._record[name]))
         path = self.directory / RECORD / f"{name}.parquet"
-        file = table_files.TableFile(path, run_tables(self._run.scenario)[name])
+        file = table_files.TableFile(path, resolution.run_tables(self._run.scenario)[name])
         return data_frames.with_seconds(file.whole())
 
     def samples(self) -> "pa.Table":
@@ -226,7 +226,8 @@ class Run:
         Raises:
             NoackError: a file cannot be written.
         """
-        return studies.save_tables(self, folder)
+        tables = run_tables.summary_tables(self.summary)
+        return result_tables.save_tables(tables, Path(folder))
 
     def report(self) -> Path:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
@@ -294,7 +295,6 @@ class Run:
 
     @cached_property
     def _run(self) -> "run_record.RecordedRun":
-
         return run_record.load_run(self.directory)
 
     @cached_property
@@ -302,8 +302,7 @@ class Run:
         return self._run.loop(self._loop)
 
     def _facts(self) -> list[tuple[str, str]]:
-
-        return result_tables.run_facts(self.summary, self.directory)
+        return run_tables.run_facts(self.summary, self.directory)
 
     def __repr__(self) -> str:
         return as_text(self._facts())

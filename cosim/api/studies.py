@@ -32,7 +32,7 @@ from noack.traces.trace_formats import find_trace
 with lazy_modules():
     from cosim.live import progress as progress_display
     from cosim.measurement import measurement_outputs
-    from cosim.output import certificate_report, figure_drawing, result_tables, run_tables
+    from cosim.output import certificate_report, figure_drawing, result_tables
     from cosim.studies.campaign import (
         campaign_figures,
         campaign_file,
@@ -251,7 +251,6 @@ class CampaignResult:
         return self.folder / campaign_report.PAGE
 
     def _rows(self) -> Rows:
-
         table = next(iter(campaign_report.campaign_tables(self._finished.summary)))
         return [(*table.headings,), *((*row,) for row in table.rows)]
 
@@ -357,18 +356,16 @@ def save_tables(result: Result, folder: str | PathLike[str]) -> list[Path]:
     Raises:
         NoackError: it is another object, or a file cannot be written.
     """
-    return result_tables.save_tables(_tables(result), Path(folder))
-
-
-def _tables(result: Result) -> "Iterable[result_tables.ResultTable]":
-    """Return the tables that the command of such a result prints."""
+    tables: Iterable[result_tables.ResultTable]
     match result:
         case Run():
-            return run_tables.summary_tables(result.summary)
+            return result.save_tables(folder)
         case Certificates():
-            return certificate_report.certificate_tables(result)
+            tables = certificate_report.certificate_tables(result)
         case MarginResult():
-            return certificate_report.margin_tables(result)
+            tables = certificate_report.margin_tables(result)
         case CampaignResult():
-            return campaign_report.campaign_tables(result._finished.summary)
-    raise CallerError(f"{type(result).__name__}: has no tables")
+            tables = campaign_report.campaign_tables(result._finished.summary)
+        case _:
+            raise CallerError(f"{type(result).__name__}: has no tables")
+    return result_tables.save_tables(tables, Path(folder))

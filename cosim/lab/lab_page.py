@@ -290,9 +290,8 @@ def csv_of(run: Exploration) -> bytes:
 
 def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
     """Return the figure as a file's content; called in the worker process."""
-    # Imported here: only the worker needs matplotlib.
-    from cosim.interactive.exploration_figure import exploration_figure
-    from cosim.output.figure_files import file_content
+    from cosim.interactive.exploration_figure import exploration_figure  # the worker alone
+    from cosim.output.figure_files import file_content  # needs matplotlib
 
     return file_content(exploration_figure(shown), kind, figure_width_in(kind, None))
 

@@ -198,8 +198,7 @@ def main() -> int:
         ending = launch(draft.scenario, runs, live=True, watcher=watcher)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
         _say("finalising", reason=ending.reason)
-        # Imported here, after the loop: before, it would take time from the loop.
-        from cosim.live.finalize import finalize
+        from cosim.live.finalize import finalize  # not earlier: it would take time from the loop
         from cosim.output.run_verdict import verdict
 
         outcome = finalize(ending, report=False)

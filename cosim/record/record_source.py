@@ -8,7 +8,7 @@ phase; its flows are numbered as if the loop were alone; and its inputs are numb
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,23 @@ Slice = Mapping[str, Rows]
 
 BATCH_ROWS = 16_384
 """A table with at most so many rows is read as a whole; of a longer one, so many at a time."""
+
+
+class Segment(NamedTuple):
+    """Rows of a table that can be read at once; the numbers of their inputs."""
+
+    first: int
+    last: int
+    read: Callable[[], Rows]
+
+    def of_loop(self, number: int) -> "Segment":
+        """Return the rows of a loop."""
+
+        def read() -> Rows:
+            rows = self.read()
+            return rows.compress(rows[LOOP] == number)
+
+        return self._replace(read=read)
 
 
 def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:

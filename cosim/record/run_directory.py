@@ -27,6 +27,10 @@ from noack.core.process_limits import cores
 with lazy_modules():
     from importlib import metadata
 
+    from noack.scenario import scenario as scenarios
+    from noack.scenario import scenario_file
+    from noack.settings import user_files
+
 if TYPE_CHECKING:
     from noack.scenario.scenario import Scenario
     from noack.settings.user_files import FileSettings
@@ -99,19 +103,14 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         CallerError: a file has changed since the scenario was loaded.
         MachineError, OSError: the directory cannot be written.
     """
-    # The command line needs this module for shell completion, and not the settings.
-    from noack.scenario.scenario import with_loop_tables
-    from noack.scenario.scenario_file import dumps
-    from noack.settings.user_files import file_tables, unchanged, with_tables
-
-    common = dict(file_tables(scenario))
+    common = dict(user_files.file_tables(scenario))
 
     def copied(within: str, one: "Scenario", folder: str) -> dict[str, "FileSettings"]:
         found = {}
-        for place, table in file_tables(one):
+        for place, table in user_files.file_tables(one):
             if within and table == common.get(place):
                 continue  # the entry does not set it
-            file = unchanged(table, f"{within}{place}")
+            file = user_files.unchanged(table, f"{within}{place}")
             name = f"{place.split('.')[0]}/{within.replace('.', '_')}{file.name}"
             if not (run_dir / name).is_file():
                 (run_dir / name).parent.mkdir(exist_ok=True)
@@ -120,10 +119,12 @@ def write_scenario(scenario: "Scenario", run_dir: Path) -> "Scenario":
         return found
 
     def located(folder: str) -> "Scenario":
-        moved = with_loop_tables(scenario, lambda place, one: copied(f"{place}.", one, folder))
-        return with_tables(moved, copied("", scenario, folder))
+        moved = scenarios.with_loop_tables(
+            scenario, lambda place, one: copied(f"{place}.", one, folder)
+        )
+        return user_files.with_tables(moved, copied("", scenario, folder))
 
-    write_whole(run_dir / SCENARIO_FILE, dumps(located("")))
+    write_whole(run_dir / SCENARIO_FILE, scenario_file.dumps(located("")))
     return located(f"{run_dir.absolute()}/")
 
 

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import (
     LIFE_COLUMNS,
     Life,
@@ -75,8 +76,8 @@ from noack.scenario.scenario import (
 )
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
-if TYPE_CHECKING:
-    from cosim.record.table_files import StoredTables
+with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
+    from cosim.record import table_files
 
 _NOTICES_FILE = "notices.jsonl"
 Notice = dict[str, Any]
@@ -88,8 +89,6 @@ _CLOCK_EXCHANGE_NS = 20_000_000
 """Shortest wall time between two rows of a clock's offset."""
 _COLUMNS = 6_000
 """Columns of a whole run: short runs are not reduced, and figures have far fewer columns."""
-
-
 NETWORK_ROLES = ("netem",)
 
 
@@ -333,7 +332,9 @@ def no_such_loop(name: str | None, names: Sequence[str]) -> CallerError:
 class StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 
-    def __init__(self, run_dir: Path, network: RunRecord, stored: "StoredTables") -> None:
+    def __init__(
+        self, run_dir: Path, network: RunRecord, stored: "table_files.StoredTables"
+    ) -> None:
         self._kind, self._stored, self._scenario = network.kind, stored, network.scenario
         self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
@@ -393,9 +394,6 @@ def load_run(run_dir: Path) -> RecordedRun:
         CallerError: the path is no run directory, or the record is unfinished, damaged, or of an
             earlier version of noack.
     """
-    # Imported here because pyarrow takes 0.1 s: a run does not wait for it.
-    from cosim.record.table_files import StoredTables
-
     folder = run_dir / RECORD
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
@@ -405,7 +403,7 @@ def load_run(run_dir: Path) -> RecordedRun:
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
-    stored = StoredTables(folder, run_tables(scenario), most_rows)
+    stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)
     reports, earlier = valid_reports(report_entries(run_dir), stored, network_tables())
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
     kind = kind_of(run_dir)
@@ -489,14 +487,14 @@ def write_tables(
     notices: Iterable[Notice],
 ) -> None:
     """Write tables, with the names of states and inputs, and the run's log."""
-    from cosim.record.table_files import write_table
-
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
     with ThreadPoolExecutor(cores()) as threads:  # most of the work is done without the lock
         written = [
-            threads.submit(write_table, folder / f"{table}.parquet", batches, types[table], names)
+            threads.submit(
+                table_files.write_table, folder / f"{table}.parquet", batches, types[table], names
+            )
             for table, batches in tables
         ]
     for one in written:

@@ -10,12 +10,12 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
+from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
-from cosim.record.record_source import BATCH_ROWS, Rows, joined
+from cosim.record.record_source import BATCH_ROWS, Rows, Segment, joined
 from cosim.record.run_directory import RECORD, SCENARIO_FILE
 from cosim.record.run_record import (
     Notice,
@@ -35,24 +35,10 @@ from noack.scenario.resolution import has_loop, run_tables
 from noack.scenario.scenario import loop_names
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
+with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
+    from cosim.record import table_files
+
 _SEGMENT_BYTES = 1024 * 1024
-
-
-class Segment(NamedTuple):
-    """Rows of a table that can be read at once; the numbers of their inputs."""
-
-    first: int
-    last: int
-    read: Callable[[], Rows]
-
-    def of_loop(self, number: int) -> "Segment":
-        """Return the rows of a loop."""
-
-        def read() -> Rows:
-            rows = self.read()
-            return rows.compress(rows[LOOP] == number)
-
-        return self._replace(read=read)
 
 
 def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
@@ -171,10 +157,8 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     Of many loops, as many are sorted at once as fit into memory; one loop is never in memory as a
     whole.
     """
-    from cosim.record.table_files import TableFile  # imports pyarrow
-
     path = run_dir / RECORD / f"{table}.parquet"
-    segments = [*TableFile(path, dtype).segments()] if path.is_file() else []
+    segments = [*table_files.TableFile(path, dtype).segments()] if path.is_file() else []
     segments += spool_segments(run_dir / SPOOL, table, dtype)
     if not has_loop(table):
         yield from merged(segments, dtype)

@@ -20,11 +20,11 @@ from cosim.record.record_source import (
     BATCH_ROWS,
     RecordSource,
     Rows,
+    Segment,
     joined,
     packed,
     with_columns,
 )
-from cosim.record.spool_conversion import Segment
 from noack.core.cached_method import cached_method
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import new_file

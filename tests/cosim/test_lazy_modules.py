@@ -21,6 +21,11 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         ("__init__", ""),
         ("slow", "import time\nfirst = 1\ntime.sleep(0.2)\nsecond = 2\n"),
         ("wrong", "raise RuntimeError\n"),
+        (
+            "outer",
+            "from cosim.lazy_modules import lazy_modules\nwith lazy_modules():\n"
+            "    from some_package import slow\n",
+        ),
         ("inner/__init__", "from some_package.inner.one import name\n"),
         ("inner/one", "from some_package.inner import two\nname = two.name\n"),
         ("inner/two", "name = 2\n"),
@@ -53,6 +58,14 @@ def test_an_ordinary_import_loads_it(package: str) -> None:
     imported(package, "slow")
     importlib.import_module(f"{package}.slow")
     assert sys.argv[-1] == f"{package}.slow"
+
+
+def test_a_module_that_is_loaded_within_lazy_imports_has_lazy_imports(package: str) -> None:
+    with lazy_modules():
+        outer = importlib.import_module(f"{package}.outer")
+        assert type(outer.slow) is not ModuleType
+    assert sys.argv == [package, f"{package}.outer"]
+    assert outer.slow.second == 2
 
 
 def test_a_package_is_loaded_before_its_modules(package: str) -> None:

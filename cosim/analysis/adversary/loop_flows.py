@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 
 from cosim.analysis.adversary.objective import (
     Flags,
@@ -160,8 +161,6 @@ def _gramian(system: ContinuousLoop, measure: Measure, window_s: float) -> Matri
     if measure.output is None:  # the initial speed of e_s
         speed = weight_of(system) @ system.generator[n : 2 * n]
         return np.asarray(speed.T @ speed)
-    from scipy.linalg import expm
-
     generator = system.generator + measure.rate_per_s * np.eye(3 * n)
     points, weights = np.polynomial.legendre.leggauss(_GRAMIAN_POINTS)
     total = np.zeros_like(generator)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
 
 from cosim.analysis.adversary.loop_flows import (
     SampledFlow,
@@ -230,8 +231,6 @@ def cost_ceiling(
 
     None if A + BK is not stable, or bursts may be of any length.
     """
-    from scipy.linalg import solve_continuous_lyapunov
-
     if longest_burst is None:
         return None
     loop, trigger = system.loop, system.decaying

@@ -118,8 +118,7 @@ def _simulate_continuously(loaded: "scenario.Scenario", *, json: bool) -> int:
 
 def _print_run(console: "Console", run: "continuous.ContinuousRun", found: dict[str, Any]) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
-    # help and completion need neither
-    import numpy as np
+    import numpy as np  # help and completion need neither of the two
     from rich.text import Text
 
     ending = run_verdict.ending_line(

@@ -11,8 +11,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
 from noack.core.errors import CallerError
+
+with lazy_modules():
+    from cosim.analysis import summary_model
+    from cosim.record import run_record
 
 if TYPE_CHECKING:
     from cosim.record.run_record import RunRecord
@@ -98,22 +103,15 @@ def _exported_run(run_dir: Path, loop: str | None) -> ExportedRun:
     Raises:
         CallerError: it is not a run directory, its record is damaged, or there is no such loop.
     """
-    # Imported here: the command line needs the names of the formats only.
-    from cosim.analysis.summary_model import read_summary
-    from cosim.record.run_record import load_run
-    from noack.scenario.scenario import phases_ns
-
-    run, content = load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
+    run, content = run_record.load_run(run_dir), read_object(run_dir / SUMMARY_FILE)
     if loop is not None or not run.names[1:]:
         record = run.loop(loop)
-        summary = read_summary(content)
+        summary = summary_model.read_summary(content)
         own = summary.of_loop(record.scenario.name).to_json() if summary else content
         return ExportedRun(run_dir, record, own)
     parts = dict(zip(run.names, content.get("loops", []), strict=False))
     inner = [
         ExportedRun(run_dir, record, parts.get(name, {}), (), name, phase_ns)
-        for name, record, phase_ns in zip(
-            run.names, run.loops, phases_ns(run.scenario), strict=True
-        )
+        for name, record, phase_ns in zip(run.names, run.loops, run.phases_ns, strict=True)
     ]
     return ExportedRun(run_dir, run.network, content, inner)

@@ -200,7 +200,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         PeerError: the scheduler does not answer.
     """
     try:
-        import distributed
+        import distributed  # an extra
     except ImportError:
         raise CallerError(
             "--scheduler needs Dask, which is not installed; pip install 'noack[cluster]'"

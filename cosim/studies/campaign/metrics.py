@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from cosim.simulation.exact_simulation import OK
 from noack.core.linear_systems import Vector
@@ -223,8 +224,6 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
 @cache
 def _student(count: int) -> float:
     """Return Student's factor t for the mean of this number of values."""
-    from scipy.special import stdtrit
-
     return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
 
 
@@ -244,7 +243,7 @@ def interval_ranks(count: int, share: float) -> tuple[int, int]:
 
     They are −1 and ``count`` if no draw bounds the quantile.
     """
-    from scipy.stats import binom
+    from scipy.stats import binom  # slow to import
 
     # The j-th smallest draw, from 1, exceeds the quantile if fewer than j draws lie below it.
     tail = (1.0 - CONFIDENCE) / 2
@@ -281,7 +280,7 @@ class BurstFrequency(NamedTuple):
 
 def burst_frequency(scenario: Scenario, metrics: Mapping[Metric, Vector]) -> BurstFrequency | None:
     """Compare; None if the network enforces the guarantee or the losses cannot be predicted."""
-    from scipy.stats import binomtest
+    from scipy.stats import binomtest  # slow to import
 
     network = scenario.network
     if network.enforce_mansd or scenario.loops:

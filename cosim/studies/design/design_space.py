@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_continuous_are
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
@@ -188,8 +189,6 @@ def lqr_gain(A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     Raises:
         CallerError: Q or R is not a valid weight, or no P makes the loop stable.
     """
-    from scipy.linalg import solve_continuous_are
-
     for name, matrix, least in (("--Q", Q, "semidefinite"), ("--R", R, "definite")):
         if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
             raise CallerError(f"{name}: must be symmetric")

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import schur
+from scipy.optimize import brentq
 
 from cosim.record.align import align_tables
 from cosim.simulation.continuous import (
@@ -361,8 +362,6 @@ def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
 
     It uses γ of the nominal plant and η_j = ‖x(t_j)‖, the largest that the theorem permits.
     """
-    from scipy.optimize import brentq
-
     run = run_continuous(resolved_draw(scenario, representative, "zoh"))
     beta, alpha_per_s = run.system.decaying.level, run.system.decaying.rate_per_s
     gamma = float(open_loop_eigenvalues(lane_following().A).real.max())

@@ -44,7 +44,7 @@ def choose_weight(
     Raises:
         NotDecayingError: α is not below the decay rate of e^{Ht} and e^{(A+BK)t}.
     """
-    from scipy.optimize import minimize
+    from scipy.optimize import minimize  # slow to import
 
     n = loop.n
     for name, matrix in (("the models", loop.H), ("A + BK", loop.A + loop.B @ loop.K)):
@@ -180,7 +180,7 @@ def _sampled(nodes_s: Vector, values: Stack) -> KernelBounds:
 
 def _weight(H: Matrix, alpha_per_s: float, L: Matrix) -> Matrix | None:
     """Return W for Q = L Lᵀ; None if it fails the inequality by rounding."""
-    from scipy.linalg import solve_continuous_lyapunov
+    from scipy.linalg import solve_continuous_lyapunov  # slow to import
 
     n = len(H)
     Q = L @ L.T
