@@ -41,8 +41,7 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
-from noack.plants.plant_settings import PlantSystem
-from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.plant_settings import PlantSystem, linearise
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,

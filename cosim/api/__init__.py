@@ -6,6 +6,7 @@ function imports these modules when it is first called.
 
 from importlib.metadata import version
 
+from cosim.analysis.certificates import Certificates as Certificates
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
 from cosim.api.runs import Run as Run
@@ -24,7 +25,6 @@ from cosim.api.studies import certify as certify
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
-from cosim.output.certificates import Certificates as Certificates
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 

@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
 from cosim.api.runs import Run
 from cosim.api.scenarios import Source, load
@@ -19,7 +20,6 @@ from cosim.measurement.measurement_outputs import write_network
 from cosim.measurement.network_measurement import Measurement as NetworkMeasurement
 from cosim.measurement.network_measurement import MeasurementOptions
 from cosim.measurement.trace_sources import read_source
-from cosim.output.certificates import Certificates, certificates_of
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
 from noack.core.number_format import Rows, as_html, as_text

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cosim.analysis.certificates import constant_rows
 from cosim.analysis.margin_search import find_margin
 from cosim.interactive.exploration import Exploration
-from cosim.output.certificates import constant_rows
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.core.number_format import number

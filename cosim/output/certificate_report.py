@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.markup import escape
 
+from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.analysis.margin_search import MarginResult
-from cosim.output.certificates import SCHEDULE, Certificates, constant_rows, plants_of
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
 from noack.core.number_format import duration, number

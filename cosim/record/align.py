@@ -33,7 +33,7 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import LoopMatrices, loop_of, policy_of, steady_state
 from noack.scenario.scenario import Scenario
-from noack.theory.paper.error_bounds import ErrorBounds, ErrorMonitor
+from noack.theory.paper import ErrorBounds, ErrorMonitor
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]

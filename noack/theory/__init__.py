@@ -1,6 +1,6 @@
-"""What is certified of a loop, and why: five folders, to be read in this order.
+"""What is certified of a loop, and why, in five parts, to be read in this order.
 
-1. ``paper``: the identity (I1), the bounds of ‖e_c‖ that follow from it along a run, and the
+1. ``paper.py``: the identity (I1), the bounds of ‖e_c‖ that follow from it along a run, and the
    paper's theorems as printed.
 2. ``bounds``: the numbers on which certificates rest. Suprema and integrals of responses, enclosed
    between samples; the gains of a loop; what a trigger and the disturbances contribute.
@@ -11,7 +11,7 @@
    signals.
 5. ``random_losses``: what holds if nothing limits the number of consecutive losses.
 
-The docstring of each folder has its chain of arguments. Labels such as eq:LossEv3 are those of the
+The docstring of each part has its chain of arguments. Labels such as eq:LossEv3 are those of the
 paper's source. docs/theory.md states the results, docs/derivations.md has the proofs and a table of
 the files. Modules are imported in the order bounds, paper, certificates, random_losses, margins:
 the paper's formulas need enclosed suprema, too.

@@ -22,9 +22,8 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.core.linear_systems import Matrix
 from noack.plants.four_tank import FourTankSettings
-from noack.plants.plant_settings import OdeSystem
+from noack.plants.plant_settings import OdeSystem, linearise
 from noack.plants.quadrotor import QuadrotorSettings
-from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.link_load import require_capacity
 from noack.scenario.resolution import LoopMatrices, loop_of, resolve

@@ -59,7 +59,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.scenario_certificates import box, certify, own_plant
 from noack.theory.certificates.solution import Search, completed
-from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)

@@ -5,7 +5,7 @@ and at their recorded ``now_ns``. The replay compares
 
 * every emitted row with the recorded row, byte for byte (``machine_replay.py``), and
 * every emitted message with the message that the next process recorded as received
-  (``message_comparison.py``).
+  (``run_replay.py``).
 
 No output depends on the exact value of ``now_ns``. So it is only checked that ``now_ns`` is not
 before the deadlines and does not decrease.

@@ -14,9 +14,9 @@ from noack.core.errors import CallerError, ExitStatus
 with lazy_modules():
     import cosim.analysis.adversary.worst_run as worst_run
     from cosim.analysis import adversary as adversary_search
-    from cosim.analysis import margin_search
+    from cosim.analysis import certificates, margin_search
     from cosim.live import progress
-    from cosim.output import certificate_report, certificates
+    from cosim.output import certificate_report
     from cosim.output.export import mat_export
     from noack.scenario import resolution
     from noack.theory.certificates import scenario_certificates

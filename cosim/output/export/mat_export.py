@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.output.certificates import certificates_of
+from cosim.analysis.certificates import certificates_of
 from cosim.output.export import ExportedRun
 from cosim.record.data_frames import events, samples
 from cosim.record.record_source import Rows

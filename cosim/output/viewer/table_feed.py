@@ -48,7 +48,7 @@ from noack.theory.certificates.certified_bounds import (
 )
 from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.paper.error_bounds import ErrorMonitor
+from noack.theory.paper import ErrorMonitor
 
 LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""

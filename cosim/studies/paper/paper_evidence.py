@@ -31,7 +31,7 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from noack.theory.paper.theorems import Interval, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import Interval, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
 Numbers = dict[str, Any]

@@ -1,1 +1,1 @@
-"""The systems behind the plants: integrated equations, an FMU; and their support code."""
+"""Support code of systems whose equations are compiled: the integrator, the cache."""

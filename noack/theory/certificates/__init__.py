@@ -8,12 +8,13 @@ loop"):
    The plant bounds ‖C x‖ by free + gain · sup‖p‖; between two tests β̃ grows from β; a held
    input is of age ≤ σ. All these inequalities are linear in non-negative numbers. If the loop gain
    is below 1, their solution bounds the run at all times, by induction over time: Δ (of the size of
-   eq:Normec, but without Proposition 1), X (eq:normXt) and β̃.
+   eq:Normec, but without Proposition 1), X (eq:normXt) and β̃. ``loss_accumulation.py`` bounds the
+   effect of all losses together, if windows limit them.
 2. ``solution.py``. The minimum inter-event time δ is the time that e_s needs from 0 to the
    threshold under these bounds (eq:miet_errdyn; the paper's is eq:tau). N and D_C depend on δ, so
-   the largest consistent δ is used. Under the paper's conditions the bounds are sharpened
-   by the flow between two deliveries, which ``delivery_flow.py`` computes: an ellipsoid that x
-   never leaves.
+   the largest consistent δ is used. Under the paper's conditions ``invariant_ellipsoids.py``
+   sharpens the bounds by an ellipsoid that x never leaves: the flow between two deliveries, which
+   ``delivery_flow.py`` computes, leads back into it.
 3. ``disturbed.py``. With persistent disturbances, noise, an observer or a constant threshold, each
    bound has a decaying part and a persistent part. All inequalities are linear in functions of
    time, so the bounds of the two parts are added.

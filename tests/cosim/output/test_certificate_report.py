@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.cli import app
-from cosim.output.certificates import (
+from cosim.analysis.certificates import (
     IDEAL,
     SCHEDULE,
     Certificates,
     certificates_of,
     with_weight,
 )
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
+from cosim.cli import app
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve

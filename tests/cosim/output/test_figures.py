@@ -35,10 +35,10 @@ from cosim.output.page_kit import PAGES
 from cosim.output.run_figures import (
     Trajectory,
     Transmissions,
-    later_than,
     run_figures,
     states_figure,
 )
+from cosim.output.timing_figures import later_than
 from noack.core.errors import CallerError
 from tests.cosim.output.conftest import CASES, HOSTILE
 from tests.cosim.output.test_palette import BACKGROUNDS, luminance

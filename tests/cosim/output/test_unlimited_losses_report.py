@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.output.certificates import Certificates
+from cosim.analysis.certificates import Certificates
 from noack.impairments.loss_guarantee import LossHistory
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario

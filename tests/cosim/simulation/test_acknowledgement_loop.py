@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.live.simulated_run import simulate_run
-from cosim.output.certificates import Certificates
 from cosim.record.run_record import RunRecord, load_record, write_run
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate

@@ -15,8 +15,7 @@ import pytest
 from noack.core.errors import CallerError
 from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
-from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
-from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError, linearise
 from noack.settings.user_files import located
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build

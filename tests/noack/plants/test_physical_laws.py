@@ -10,8 +10,7 @@ from scipy.integrate import solve_ivp
 
 from noack.plants.cart_pole import CartPoleSettings
 from noack.plants.dc_motor import DcMotor, DcMotorSettings
-from noack.plants.plant_settings import OdeSystem, PlantEquations
-from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.plant_settings import OdeSystem, PlantEquations, linearise
 from tests.noack.plants.motion import H_NS, motion
 
 INDUCTANCES = (2.75e-6, 1e-3, 0.5)

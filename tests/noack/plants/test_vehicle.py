@@ -12,8 +12,7 @@ from scipy.integrate import solve_ivp
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
 from noack.plants.four_tank import FourTankSettings
-from noack.plants.plant_settings import OdeSystem
-from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.plant_settings import OdeSystem, linearise
 from noack.plants.vehicle import (
     CompiledVehicle,
     VehicleSettings,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.paper.error_bounds import ErrorMonitor
+from noack.theory.paper import ErrorMonitor
 from noack.trigger.trigger_rule import TriggerRule
 from tests.oracles.lossy_loops import seeds
 from tests.trigger_rules import decaying_rule

@@ -16,7 +16,8 @@ from noack.core.linear_systems import Matrix
 from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
 from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
-from noack.theory.certificates.inequalities import LossAccumulation, solve_inequalities
+from noack.theory.certificates.inequalities import solve_inequalities
+from noack.theory.certificates.loss_accumulation import LossAccumulation
 from noack.theory.certificates.solution import solve
 from tests.oracles.lossy_loops import SEARCH, System, systems
 

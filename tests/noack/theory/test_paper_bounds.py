@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.terms import NetworkConditions
-from noack.theory.paper.theorems import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
+from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe
 from tests.oracles.lossy_loops import (
     ROUNDING,

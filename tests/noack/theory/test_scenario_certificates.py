@@ -30,7 +30,7 @@ from noack.theory.certificates.conditions import (
 )
 from noack.theory.certificates.scenario_certificates import box, certify, certify_box, own_plant
 from noack.theory.certificates.solution import completed
-from noack.theory.paper.theorems import theorem_2
+from noack.theory.paper import theorem_2
 from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,

@@ -11,7 +11,7 @@ from noack.core.linear_systems import Matrix
 from noack.theory.bounds.gains import Output
 from noack.theory.bounds.terms import Constants, NetworkConditions
 from noack.theory.certificates.delivery_flow import Reach, bend_of_error, errors_after_losses
-from noack.theory.certificates.solution import InvariantEllipsoids
+from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 from tests.noack.theory.exact_loops import observe
 from tests.oracles.lossy_loops import (
     ROUNDING,

@@ -17,9 +17,9 @@ from noack.core.linear_systems import Vector
 from noack.theory.bounds.enclosure import NotDecayingError
 from noack.theory.bounds.gains import PlantGains
 from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
-from noack.theory.certificates import delivery_flow, solution
+from noack.theory.certificates import delivery_flow, invariant_ellipsoids
 from noack.theory.certificates.delivery_flow import DeliveryFlow, Reach
-from noack.theory.certificates.solution import InvariantEllipsoids
+from noack.theory.certificates.invariant_ellipsoids import InvariantEllipsoids
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import bounds_of, search
 from tests.oracles.continuous_loops import ContinuousTrace, simulate_continuous_time
@@ -40,18 +40,18 @@ def only_the_start() -> AbstractContextManager[Any]:
 
 def no_lost_updates() -> AbstractContextManager[Any]:
     """At an event e_c is 0."""
-    return patch.object(solution, "errors_at_events", np.zeros_like)
+    return patch.object(invariant_ellipsoids, "errors_at_events", np.zeros_like)
 
 
 def no_event_at_the_end() -> AbstractContextManager[Any]:
     """A lost event adds nothing to e_c."""
-    exact = solution.errors_after_losses
+    exact = invariant_ellipsoids.errors_after_losses
 
     def shifted(*given: Any) -> Vector:
         found = exact(*given)
         return np.append(found[:1], found[:-1])
 
-    return patch.object(solution, "errors_after_losses", shifted)
+    return patch.object(invariant_ellipsoids, "errors_after_losses", shifted)
 
 
 def half_of_the_threshold() -> AbstractContextManager[Any]:
@@ -67,7 +67,7 @@ def half_of_the_threshold() -> AbstractContextManager[Any]:
 def no_drive_of_the_error() -> AbstractContextManager[Any]:
     """After an event e_s stays what H makes of it."""
     return patch.object(
-        solution, "error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
+        invariant_ellipsoids, "error_after", lambda flow, time_s: np.zeros((flow.n, 2 * flow.n))
     )
 
 

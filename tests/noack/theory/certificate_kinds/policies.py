@@ -19,12 +19,11 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
-from noack.theory.bounds.trigger_bounds import TriggerBounds
+from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
 from noack.theory.certificates import scenario_certificates, solution
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.inequalities import ErrorInequalities
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
-from noack.trigger.comparison_bound import ComparisonBound
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
 from tests.noack.theory.certificate_kinds.shares import Case, shares_of

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from noack.scenario.scenario_file import validate
-from noack.trigger.comparison_bound import comparison_bound
+from noack.theory.bounds.trigger_bounds import comparison_bound
 from noack.trigger.dynamic import DynamicSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices

@@ -1,0 +1,191 @@
+"""The figures of a loop's times: latencies, lateness of its processes, and their clocks."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.loop_statistics import latency_us, lateness_parts
+from cosim.analysis.value_reduction import QuantileSketch
+from cosim.output import palette
+from cosim.output.figure_description import (
+    DASHES,
+    TIME,
+    Axis,
+    Bars,
+    FigureDescription,
+    Item,
+    Line,
+    Marks,
+    Panel,
+    Rule,
+    finite,
+    histogram,
+    one_panel,
+    time_axis,
+)
+from cosim.output.palette import CONTROLLER, THRESHOLD
+from cosim.record.align import Reals
+from cosim.record.run_record import RunRecord
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import (
+    CLOCK_TABLES,
+    LOST_NS,
+    OWNER,
+)
+from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.scenario import Scenario
+
+Flags = NDArray[np.bool_]
+_RANKS = 120
+_SHORTEST_US = 0.1  # a logarithmic axis has no zero
+
+
+def times_figure(
+    name: str, title: str, dots: Marks, label: str, until_s: float, bounds: Sequence[Line] = ()
+) -> FigureDescription:
+    """Describe values over time, and their histogram on the same logarithmic axis."""
+    edges, counts = histogram(dots.y)
+    bars = Bars(edges=edges, heights=counts, colour=dots.colour, share=0.9, horizontal=True)
+    least = [
+        Rule(at=float(line.y.min()), colour=line.colour, dash=line.dash)
+        for line in bounds
+        if len(line.y)
+    ]
+    counted = Axis(label="count", whole=True)
+    panel = Panel(
+        title=title,
+        items=[*bounds, dots],
+        x=Axis(label=TIME, ends=(0.0, float(dots.x.max(initial=until_s)))),
+        y=Axis(label=label, logarithmic=True),
+        beside=Panel(items=[bars, *least], x=counted, y=Axis(logarithmic=True)),
+    )
+    return one_panel(name, panel, 2.1)
+
+
+def latency_figure(record: RunRecord) -> FigureDescription:
+    """Describe the wall time from each event to the update of the controller."""
+    event_ns, taken_us = latency_us(record)
+    dots = Marks(x=event_ns / NS_PER_S, y=taken_us, colour=CONTROLLER, framed=True)
+    title, horizon_s = "Sensor-to-controller latency", record.scenario.horizon_s
+    return times_figure("latency", title, dots, "latency [wall µs]", horizon_s).captioned(
+        "Sensor-to-controller latency: wall time from the event to the controller's update.",
+        f"Latencies of {len(taken_us)} updates, the longest {largest_text(taken_us)} µs.",
+    )
+
+
+def largest_text(values: Reals) -> str:
+    """Return the largest finite value as text."""
+    values = values[np.isfinite(values)]
+    return f"{values.max():.3g}" if len(values) else "unknown"
+
+
+def lateness_figure(record: RunRecord) -> FigureDescription:
+    """Describe the share of each process's steps with at least a given lateness."""
+    scenario, items, longest = record.scenario, list[Item](), list[str]()
+    for i, role in enumerate(LOOP_ROLES):
+        late_us = QuantileSketch.of(lateness_parts(record, role))
+        most = late_us.quantiles(1.0)[0]
+        longest.append(f"{role} {'unknown' if most is None else f'{most:.3g}'} µs")
+        x, y = later_than(late_us)
+        colour, dash = palette.PROCESSES[role], DASHES[i % len(DASHES)]
+        items.append(Line(x=x, y=y, label=role, colour=colour, steps="pre", width=1.8, dash=dash))
+    period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
+    period = Rule(at=period_us, colour=THRESHOLD, label="one period", vertical=True, width=1.2)
+    panel = Panel(
+        title="Lateness",
+        items=[*items, replace(period, dash=(4, 3))],
+        x=Axis(label="lateness [wall µs]", logarithmic=True),
+        y=Axis(label="share of steps at least as late", logarithmic=True),
+    )
+    return one_panel("lateness", panel, 2.5).captioned(
+        "Share of a process's steps with at least this lateness. Lateness is measured "
+        "from the deadline (plant, controller), the time of the measurement (sensor), or the "
+        "arrival of the datagram at the socket (network).",
+        "Complementary distribution of lateness on logarithmic axes; maximum: "
+        f"{', '.join(longest)}.",
+    )
+
+
+def later_than(values: QuantileSketch) -> tuple[Reals, Reals]:
+    """Return values in ascending order, and for each the share of values at least as large."""
+    k = values.count
+    if not k:
+        return np.zeros(0), np.zeros(0)
+    # k values are at least as large as the k-th largest. The same number of points in each decade
+    # of shares, and linearly spaced ones, which resolve the median.
+    rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
+    rank = np.unique(rank.round().astype(np.intp))[::-1]
+    return np.maximum(finite(values.largest(rank)), _SHORTEST_US), rank / k
+
+
+class ClockErrors(NamedTuple):
+    """Bounds of the error of a process's clock: k comparisons with the recorder's clock."""
+
+    t_s: Reals
+    """(k,)"""
+    error_us: Reals
+    """(k,) wall µs; NaN: the bound was lost."""
+
+    @property
+    def lost(self) -> Flags:
+        """(k,) whether the bound was lost."""
+        return np.isnan(self.error_us)
+
+    @property
+    def largest_us(self) -> float | None:
+        """The largest known bound; None without one."""
+        known = self.error_us[~self.lost]
+        return float(known.max()) if len(known) else None
+
+
+def clock_errors(record: RunRecord) -> dict[str, ClockErrors]:
+    """Return the bounds of the processes whose clock is not the recorder's, by process."""
+    errors = {}
+    for table in CLOCK_TABLES:
+        if table not in record.tables:
+            continue
+        rows = record.columns(table, "t_ns", "error_ns")
+        if (rows["error_ns"] != 0).any():
+            error_us = np.where(rows["error_ns"] == LOST_NS, np.nan, rows["error_ns"] * 1e-3)
+            errors[OWNER[table]] = ClockErrors(rows["t_ns"] / NS_PER_S, error_us)
+    return errors
+
+
+def clocks_figure(scenario: Scenario, errors: Mapping[str, ClockErrors]) -> FigureDescription:
+    """Describe the bound of each process's clock; it has a gap, and a cross, where it was lost."""
+    assert scenario.clocks is not None  # else the record has no tables of clocks
+    allowed_us, last_s = scenario.clocks.largest_error_us, scenario.horizon_s
+    lines, crosses, texts = list[Item](), list[Item](), list[str]()
+    for i, (process, one) in enumerate(errors.items()):
+        most, colour, order = one.largest_us, palette.PROCESSES[process], 2 + 0.1 * i
+        texts.append(f"{process} " + ("never known" if most is None else f"{most:.3g} µs"))
+        keep = one.t_s <= last_s
+        t_s, error_us, lost = one.t_s[keep], one.error_us[keep], one.lost[keep]
+        # The curves often coincide: the first ones are wider, and stay visible under the last.
+        width = 1.3 + 1.2 * (len(errors) - 1 - i)
+        curve = Line(x=t_s, y=error_us, label=process, colour=colour, width=width)
+        lines.append(replace(curve, order=order))
+        began_s = t_s[lost & ~np.append(False, lost[:-1])]
+        at = np.full(len(began_s), allowed_us)
+        cross = Marks(x=began_s, y=at, colour=colour, marker="x", size=9.0, stroke=2.0)
+        crosses.append(replace(cross, order=order))
+    limit = Rule(at=allowed_us, colour=THRESHOLD, label="allowed", width=1.2, dash=(4, 3))
+    unknown = all(one.largest_us is None for one in errors.values())
+    ends = (allowed_us / 10, allowed_us * 10) if unknown else (None, None)
+    panel = Panel(
+        title="Clocks",
+        items=[*lines, *crosses, limit],
+        x=time_axis(np.array([0.0, last_s])),
+        y=Axis(label="bound of error [wall µs]", logarithmic=True, ends=ends),
+    )
+    largest, gone = ", ".join(texts), [name for name, one in errors.items() if one.lost.any()]
+    return one_panel("clocks", panel, 1.9).captioned(
+        "Bound of the difference between a process's time and the recorder's, for the "
+        f"processes on hosts with other clocks. Largest: {largest}. Dashed: the largest bound with "
+        "which claims hold."
+        + (f" Cross: from here on, the bound was lost ({', '.join(gone)})." if gone else ""),
+        f"Bounds of the clocks' errors over time on a logarithmic axis; largest: {largest}.",
+    )
