@@ -9,7 +9,6 @@ Losses are compared with the network's guarantee from the recorded rows.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from noack.core.core_library import CData, core
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
-from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -306,7 +305,9 @@ def controllers_of(
 
     Of the plant's data they use at most x(0).
     """
-    parts, alike = alike_parts(loops, partial(_part, start), _redrawn)
+    alike, parts = alike_loops(loops), list[Controller]()
+    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
+        parts.append(_part(start, loop) if number == first else _redrawn(parts[first], loop))
     if not start.is_restart:
         return LoopMachines(parts, phases_ns, alike=alike)
     phases = tuple(phases_ns or (0,) * len(loops))  # they determine the first ticks

@@ -33,7 +33,7 @@ from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
-from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_parts, set_machine
+from noack.machines.loop_machines import NEVER_NS, LoopMachines, Role, alike_loops, set_machine
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import PlantStart, PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import BEGINNING, FAILED, Notice, Start
@@ -290,7 +290,9 @@ def plants_of(
 
     A plant cannot be restarted during the run: ``start`` has no effect.
     """
-    parts, alike = alike_parts(loops, _part, _redrawn)
+    alike, parts = alike_loops(loops), list[Plant]()
+    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
+        parts.append(_part(loop) if number == first else _redrawn(parts[first], loop))
     return LoopMachines(parts, phases_ns, alike=alike)
 
 

@@ -17,7 +17,6 @@ are unknown, and the first known input is used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from noack.core.core_library import CData, core, ffi
 from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
-from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
+from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Start
 from noack.protocol.record_tables import (
@@ -284,7 +283,9 @@ def sensors_of(
     Of the plant's data they use at most x(0). After a restart, a sensor transmits its first
     measurement.
     """
-    parts, alike = alike_parts(loops, partial(_part, start), partial(_redrawn, start))
+    alike, parts = alike_loops(loops), list[Sensor]()
+    for number, (loop, first) in enumerate(zip(loops, alike, strict=True)):
+        parts.append(_part(start, loop) if number == first else _redrawn(start, parts[first], loop))
     return LoopMachines(parts, phases_ns, alike=alike)
 
 

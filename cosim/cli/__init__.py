@@ -3,7 +3,7 @@
 import gc
 import os
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from typing import TYPE_CHECKING, Any
 
 from cosim.lazy_modules import lazy_modules
@@ -38,9 +38,10 @@ def main() -> None:
     gc.set_threshold(_NEW_OBJECTS)
     words = sys.argv[1:]
     as_json = "--json" in words
-    with stoppable_imports():
+    with stoppable_imports(), ExitStack() as stack:
         try:
-            server = _fork_server(words)
+            if (server := _fork_server(words)) is not None:
+                stack.enter_context(closing(server))
             command.register_commands(*(words or _completed_words())[:1])
             command.run_program(server)  # a command handles signals itself
         except NoackError as error:

@@ -84,7 +84,7 @@ class LiveOptions(OutputOptions):
 
 
 def run_processes(
-    load: "Callable[[], scenario.Scenario]",
+    loaded: "scenario.Scenario",
     options: LiveOptions,
     *,
     spawn: Sequence[str] | None = None,
@@ -95,7 +95,7 @@ def run_processes(
     """Run a scenario live; print its verdict and return the exit status.
 
     Args:
-        load: loads the scenario.
+        loaded: the scenario.
         options: of the command.
         spawn: roles of the processes to start, all by default; the others join by ``session``.
         session: name that the processes of the run share.
@@ -103,7 +103,7 @@ def run_processes(
         listening: how processes on other hosts join.
     """
     with fork_server.fork_server(server) as server:
-        loaded, ending = load(), None
+        ending = None
         link_load.require_capacity(loaded)
         warn_of_other_runs()
         # Those of the theory come at the start: nothing waits for the launcher then.

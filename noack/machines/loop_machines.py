@@ -13,7 +13,7 @@ what a loop's own row lacks is missing in them (:func:`row_layout`).
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,27 +94,10 @@ class MachinePart(Protocol):
         ...
 
 
-Part = TypeVar("Part", bound=MachinePart)
-
-
-def alike_parts(
-    loops: Sequence[Scenario],
-    make: Callable[[Scenario], Part],
-    redrawn: Callable[[Part, Scenario], Part],
-) -> tuple[list[Part], list[int]]:
-    """Return the part of each loop, and the number of the first loop that is alike.
-
-    Loops are alike if they differ in their draws only. ``make`` makes the part of the first of
-    them, ``redrawn`` one with the draws of another loop.
-    """
-    parts: list[Part] = []
-    alike: list[int] = []
+def alike_loops(loops: Sequence[Scenario]) -> list[int]:
+    """Return for each loop the number of the first one from which it differs in draws only."""
     firsts: dict[tuple[int, ...], int] = {}
-    for number, loop in enumerate(loops):
-        first = firsts.setdefault(settings_key(loop), number)
-        parts.append(make(loop) if first == number else redrawn(parts[first], loop))
-        alike.append(first)
-    return parts, alike
+    return [firsts.setdefault(settings_key(loop), number) for number, loop in enumerate(loops)]
 
 
 def set_machine(

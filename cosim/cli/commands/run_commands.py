@@ -53,7 +53,7 @@ def run(
         noack run lane_following --hosts hosts.toml   some processes on other hosts, over ssh
     """
     listening = None if hosts is None else remote_access.listening_for(hosts)
-    return run_processes(given.load, options, server=context.obj, listening=listening)
+    return run_processes(given.load(), options, server=context.obj, listening=listening)
 
 
 @cli.command(cli.RUNS, 10)
@@ -75,9 +75,7 @@ def demo(
         noack demo --set speed=4 --set horizon_s=8   takes 2 s of wall time
     """
     wanted = [*(['mode="zoh"'] if zoh else []), *(settings or ())]
-    return run_processes(
-        lambda: cli.load_scenario("lane_following", wanted), options, server=context.obj
-    )
+    return run_processes(cli.load_scenario("lane_following", wanted), options, server=context.obj)
 
 
 @cli.command(cli.RUNS, 30)

@@ -105,9 +105,8 @@ def margin(
         return ExitStatus.OK if found.stable_m else ExitStatus.FAILED
     if (pattern := found.destabilised) is None:
         raise CallerError(f"--play: no destabilising pattern was found for M up to {most}")
-    return run_processes(
-        lambda: given.load(*pattern.settings), LiveOptions(runs=runs), server=context.obj
-    )
+    played = given.load(*pattern.settings)
+    return run_processes(played, LiveOptions(runs=runs), server=context.obj)
 
 
 class AdversaryAim(StrEnum):

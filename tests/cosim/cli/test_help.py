@@ -12,7 +12,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.program import examples_of
+from cosim.cli.command import examples_of
 from netem import emulator_options as emulator
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
 from netem.tc_words import parse

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.program import pipe_safe_stream
+from cosim.cli.command import pipe_safe_stream
 
 NOACK = (sys.executable, "-m", "cosim.cli")
 ROOT = Path(__file__).parents[3]
