@@ -1,4 +1,4 @@
-"""The commands, one file each.
+"""The commands, those of one subject in a file.
 
 A file declares its commands with :func:`cosim.cli.command.command`: panel, and place in it. The
 help of the options and the examples are in the docstrings. Help, completion and the reference page

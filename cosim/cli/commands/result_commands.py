@@ -1,16 +1,19 @@
-"""``noack summary``, ``view``, ``report``, ``replay``, ``fidelity``, ``export``: an earlier run."""
+"""Commands about earlier runs: results, figures and pages, replay, export, archives, comparison."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 from cosim.cli import command as cli
+from cosim.cli import completion
 from cosim.lazy_modules import lazy_modules
 from cosim.output.export import FORMATS, export_run, export_suffix
 from cosim.record.run_directory import RECORDING_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import ExitStatus
+from noack.runtime.command_line import print_to_stderr
 
 with lazy_modules():
     import cosim.analysis.replay.replay_result as replay_result
@@ -19,9 +22,10 @@ with lazy_modules():
     from cosim.analysis import fidelity as fidelity_analysis
     from cosim.analysis import run_summary
     from cosim.live import finalize
-    from cosim.output import figure_files, run_figures, run_tables, run_verdict
+    from cosim.output import figure_files, result_tables, run_figures, run_tables, run_verdict
     from cosim.output.viewer import live_viewer
-    from cosim.record import run_directory, run_record
+    from cosim.record import collection, run_directory, run_record
+    from cosim.studies import run_archive, run_comparison
 
 
 @cli.command(cli.RUNS, 50)
@@ -193,3 +197,126 @@ def export(
     with cli.status("exporting"):
         written = export_run(chosen, path, file_format, loop=run.loop, certificates=certificates)
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
+
+
+@cli.command(cli.RUNS, 92)
+def archive(
+    run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False
+) -> None:
+    """Archive a run: one file with everything that its repetition needs.
+
+    `noack reproduce` repeats it.
+
+    Options:
+        out: File of the archive; NAME.noack.zip in this folder by default.
+
+    Examples:
+        noack archive   the last run, as NAME.noack.zip in this folder
+        noack archive runs/latest --out result.noack.zip --json   to another file
+    """
+    chosen = run.path
+    path = out or Path(f"{chosen.resolve().name}{run_archive.SUFFIX}")
+    with cli.status("archiving"):
+        manifest = run_archive.write_archive(chosen, path)
+    cli.print_lines(json, {"archive": str(path)} | manifest.model_dump(mode="json"), path)
+
+
+@cli.command(cli.RUNS, 94)
+def reproduce(
+    file: Annotated[Path, Argument(metavar="FILE")],
+    *,
+    run_code: Annotated[bool, Option("--run-code")] = False,
+    long: Annotated[bool, Option("--long")] = False,
+    into: Path | None = None,
+    json: cli.JsonOption = False,
+) -> int:
+    """Repeat an archived run: simulate it again, or replay its record, bit for bit.
+
+    Versions, machine and numbers that differ are listed. Exit status 1: a bit differs.
+
+    Options:
+        file: Archive of a run.
+        run_code: Run the code that the archive contains, if its plant, trigger or controller is a
+            Python class or an FMU.
+        long: Repeat a run of more than a million steps, too.
+        into: Keep the archived run and its repetition in this new folder.
+
+    Examples:
+        noack reproduce result.noack.zip   exit status 1 if a bit differs
+        noack reproduce result.noack.zip --into again --json   keep both runs; print JSON
+    """
+    with cli.status("repeating"):
+        found = run_archive.repeat_archive(file, run_code=run_code, long=long, into=into)
+    cli.show(json, found.to_json, run_archive.print_repetition, found)
+    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+
+
+@cli.command(cli.RUNS, 55)
+def collect(
+    run_dir: Annotated[Path, Argument()],
+    sources: Annotated[list[str], Argument()],
+    *,
+    json: cli.JsonOption = False,
+) -> None:
+    """Add what processes on other hosts kept of a run, and finalise it again.
+
+    A process that was invited keeps its rows on its host when the recorder is out of reach at the
+    end. It then prints their folder.
+
+    Options:
+        run_dir: Run directory.
+        sources: Folders named by the processes: FOLDER, or HOST:FOLDER for scp.
+
+    Examples:
+        noack collect runs/latest robot:noack/runs/RUN   by scp from the host robot
+        noack collect runs/latest copy   from a folder that was copied here
+    """
+    run_dir = chosen_run(run_dir, cli.DEFAULT_RUNS)
+    outcome = finalize.reopen(run_dir)  # refuses a run that is under way
+    for source in sources:
+        merged, roles = collection.collect(run_dir, source, finalize.reopen)
+        outcome = replace(merged, run_dir=run_dir)
+        print_to_stderr(f"noack: {source}: took what {', '.join(roles) or 'no process'} kept")
+    cli.show(json, outcome.summary.to_json, run_verdict.print_outcome, outcome)
+
+
+@cli.command(cli.RUNS, 80)
+def compare(
+    directories: Annotated[
+        list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)
+    ],
+    *,
+    out: Path = cli.DEFAULT_RUNS / "comparison.html",
+    width: cli.WidthOption = None,
+    json: cli.JsonOption = False,
+) -> None:
+    """Compare runs: key numbers, settings that differ, curves overlaid.
+
+    Options:
+        directories: Two to seven run directories, live or simulated; RUN:NAME is a loop.
+        out: File of the overlay: a page (.html), or a figure (.svg, .png, .pdf).
+
+    Examples:
+        noack compare runs/A runs/B   key numbers, and a page with the curves overlaid
+        noack compare runs/A runs/B runs/C --out overlay.png   the overlay as a picture
+        noack compare runs/A:left runs/A:right   two loops of a run
+        noack compare runs/A runs/B --json   as JSON
+    """
+    with cli.status("comparing"):
+        found = run_comparison.compare_runs(directories)
+        found.save(out, width)
+    if json:
+        cli.print_json(found.to_json() | {"overlay": str(out)})
+        return
+    console = cli.console()
+    for run in found.runs:
+        line = f"{run.label}  {run.title}  {run.directory}"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    labels = [run.label for run in found.runs]
+    tables = {"key numbers (in brackets: difference to A)": found.rows}
+    if found.settings:
+        tables["settings that differ"] = found.setting_rows
+    for title, rows in tables.items():
+        table = result_tables.ResultTable("", title, ("", *labels), rows)
+        console.print(result_tables.terminal_table(table))
+    console.print(f"overlay: {out}", markup=False, highlight=False, soft_wrap=True)
