@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load
 from cosim.lazy_modules import lazy_modules
-from cosim.record.run_directory import (
-    RECORD,
-    REPORT_FILE,
-    SCENARIO_FILE,
-    chosen_run,
-    file_of_loop,
-)
+from cosim.record.run_directory import RECORD, REPORT_FILE, SCENARIO_FILE, chosen_run, file_of_loop
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.number_format import as_html, as_text
 from noack.scenario import resolution

@@ -30,11 +30,7 @@ from cosim.output.palette import CONTROLLER, THRESHOLD
 from cosim.record.align import Reals
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
-from noack.protocol.record_tables import (
-    CLOCK_TABLES,
-    LOST_NS,
-    OWNER,
-)
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.scenario import Scenario
 

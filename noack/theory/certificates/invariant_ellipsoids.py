@@ -22,13 +22,7 @@ from noack.core.cached_method import cached_method
 from noack.core.linear_systems import Matrix, Vector, solve_lyapunov, spectral_abscissa
 from noack.theory.bounds.contraction import Stack
 from noack.theory.bounds.gains import Output, PlantGains
-from noack.theory.bounds.terms import (
-    MEASURED,
-    Constants,
-    NetworkConditions,
-    Part,
-    TriggerBound,
-)
+from noack.theory.bounds.terms import MEASURED, Constants, NetworkConditions, Part, TriggerBound
 from noack.theory.certificates.delivery_flow import (
     ROUNDING,
     DeliveryFlow,
