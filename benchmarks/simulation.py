@@ -38,8 +38,14 @@ from benchmarks.report import (
 from cosim.analysis.replay import replay
 from cosim.cli import find_scenario
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch import Population, Setting, run_batch, run_with_events, setting_of
 from cosim.simulation.continuous import continuous_loop_of, network_fates, simulate_continuous
+from cosim.simulation.exact_simulation import (
+    Population,
+    Setting,
+    run_batch,
+    run_with_events,
+    setting_of,
+)
 from cosim.simulation.sampled_loop import SampledLoop, Scales
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign import campaign_file

@@ -32,7 +32,6 @@ from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.continuous import (
-    MAX_EVENTS,
     ContinuousLoop,
     ContinuousRun,
     TooManyEventsError,
@@ -40,6 +39,7 @@ from cosim.simulation.continuous import (
     network_fates,
     simulate_continuous,
 )
+from cosim.simulation.exact_simulation import MAX_EVENTS
 from cosim.simulation.plant_grid_loop import NO_ACTUATION, PlantGridLoop, StepSchedule
 from noack.core.errors import CallerError, NoackError
 from noack.core.linear_systems import Matrix, Vector

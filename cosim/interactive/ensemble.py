@@ -9,14 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch import (
+from cosim.simulation.exact_simulation import (
+    DIVERGED,
+    OK,
     Events,
+    ExactSimulation,
     Population,
     Setting,
     run_with_events,
     setting_of,
 )
-from cosim.simulation.exact_simulation import DIVERGED, OK, ExactSimulation
 from cosim.studies.campaign.random_draws import box_of
 from noack.core.linear_systems import Vector
 from noack.scenario.resolution import resolve

@@ -15,7 +15,6 @@ In this order: the loop, a run of it for given packet fates, the fates that a sc
 decides, and the run of ``noack simulate --trigger continuous`` with its summary and JSON document.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,26 +26,24 @@ from numpy.typing import NDArray
 from cosim.record.run_events import Divergence, divergence
 from cosim.simulation.exact_simulation import (
     DIVERGED,
+    MAX_EVENTS,
     OK,
     TOO_MANY_EVENTS,
     EventLog,
     ExactSimulation,
+    timeless,
+    vanished,
+    vanishes_s,
 )
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState
 from noack.core.core_library import core
 from noack.core.errors import CallerError, ExitStatus
 from noack.core.linear_systems import Matrix, Vector
-from noack.impairments.kinds.corrupt import Corrupt
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import LoopMatrices, loop_of, rule_of
 from noack.scenario.scenario import Scenario
 from noack.trigger.trigger_rule import TriggerRule
-
-_SMALLEST_THRESHOLD = 1e-140
-"""Below it, the threshold's square or its significant bits would underflow."""
 
 
 class LoopState(NamedTuple):
@@ -147,21 +144,6 @@ def reset(state: LoopState, delivered: bool) -> LoopState:
     return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
 
 
-def vanishes_s(rule: TriggerRule) -> float:
-    """Return the time from which a threshold is too small to compute with; infinity for never."""
-    if rule.from_event or rule.rate_per_s == 0 or rule.floor >= _SMALLEST_THRESHOLD:
-        return math.inf
-    return math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
-
-
-def vanished(from_s: float) -> CallerError:
-    """Return the error of a threshold that decays too far."""
-    return CallerError(
-        f"trigger: from {from_s:g} s on the threshold is below {_SMALLEST_THRESHOLD:g}, where "
-        "errors are within rounding; give trigger.floor or a shorter horizon"
-    )
-
-
 def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     """Return the exact loop of a resolved scenario.
 
@@ -176,7 +158,6 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     return ContinuousLoop(loop_of(resolved), rule_of(resolved))
 
 
-MAX_EVENTS = 100_000
 _PLACES = 512
 """Room for events in the first attempt; each further one has four times as much."""
 
@@ -329,12 +310,6 @@ def _read_run(
     before = tuple(map(LoopState, times_s, *np.moveaxis(states, 1, 0)))
     after = tuple(map(reset, before, delivered.tolist()))
     return ContinuousRun(system, horizon_s, start, before, after, delivered, diverged_at_s)
-
-
-def timeless(settings: LinkSettings) -> LinkSettings:
-    """Return the settings of a link that apply in the paper's loop: losses and corruption."""
-    kept = tuple(one for one in settings.impairments if isinstance(one, LossOf | Corrupt))
-    return settings.model_copy(update={"impairments": kept})
 
 
 def network_fates(resolved: Scenario) -> Callable[[int], bool]:

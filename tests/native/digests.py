@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cosim.shipped_files import find_shipped, shipped_names
-from cosim.simulation.batch import run_with_events
+from cosim.simulation.exact_simulation import run_with_events
 from cosim.simulation.virtual_time import simulate
 from noack.core.core_library import core
 from noack.core.errors import CallerError

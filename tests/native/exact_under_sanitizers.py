@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.simulation.batch import run_with_events
-from cosim.simulation.exact_simulation import ExactSimulation
+from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
 from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import random_population, random_setting

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.adversary.objective import Flags, Pattern, PatternFlow, Segments
-from cosim.simulation.continuous import MAX_EVENTS, TooManyEventsError
+from cosim.simulation.continuous import TooManyEventsError
+from cosim.simulation.exact_simulation import MAX_EVENTS
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, cast
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
-from cosim.simulation.batch import ROW
+from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.scenario import toml_file
 from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed

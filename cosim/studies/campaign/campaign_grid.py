@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch import ROW, Setting, run_batch, setting_of
-from cosim.simulation.continuous import timeless
+from cosim.simulation.exact_simulation import ROW, Setting, run_batch, setting_of, timeless
 from cosim.studies.campaign.campaign_file import LOOPS, Campaign, Value, scales_loops
 from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error

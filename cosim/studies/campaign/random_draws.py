@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.simulation.batch import Population
+from cosim.simulation.exact_simulation import Population
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms, words
 from noack.scenario.resolution import loop_of, resolve

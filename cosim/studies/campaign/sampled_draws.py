@@ -24,8 +24,7 @@ from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.align import align_tables, in_common
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import Rows, RunRecord
-from cosim.simulation.batch import ROW
-from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.exact_simulation import DIVERGED, OK, ROW, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from cosim.studies.campaign.random_draws import drawn_scenario, seeds_of
 from noack.core.clock import NS_PER_S

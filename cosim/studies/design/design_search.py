@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from cosim.simulation.batch import Population, run_batch, setting_of
+from cosim.simulation.exact_simulation import Population, run_batch, setting_of
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.metrics import estimate, interval_ranks, quantile_interval
 from cosim.studies.campaign.random_draws import Box, box_of

@@ -17,7 +17,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from cosim.output.figure_description import FigureDescription
 from cosim.output.figure_files import save_figure
 from cosim.output.run_figures import Trajectory, Transmissions, states_figure
-from cosim.simulation.continuous import run_continuous, timeless
+from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import timeless
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_report import FinishedCampaign
 from cosim.studies.campaign.campaign_summary import CONFIRMED_FROM, PARTLY_FROM, runs_at, share_text

@@ -13,8 +13,8 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.record.align import align_tables, expected_rms, true_states
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of
+from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.design.design_search import DesignLimits, design
 from noack.core.errors import CallerError

@@ -9,9 +9,8 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_directory import write_scenario
 from cosim.record.run_record import RunRecord
-from cosim.simulation.batch import setting_of
 from cosim.simulation.continuous import continuous_loop_of
-from cosim.simulation.exact_simulation import OK
+from cosim.simulation.exact_simulation import OK, setting_of
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.core.errors import CallerError

@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from cosim.shipped_files import find_shipped
-from cosim.simulation.batch import Population, Setting, run_batch, run_events, setting_of
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
-from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.simulation.exact_simulation import (
+    DIVERGED,
+    OK,
+    TOO_MANY_EVENTS,
+    UNDECIDED,
+    Population,
+    Setting,
+    run_batch,
+    run_events,
+    setting_of,
+)
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.impairments.kinds.delay import Delay

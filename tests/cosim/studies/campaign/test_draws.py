@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch import run_batch
 from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import run_batch
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss

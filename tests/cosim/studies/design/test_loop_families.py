@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch import run_batch, setting_of
 from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import DesignLimits, certificate_of, design
 from cosim.studies.design.design_space import families_of, lqr_gain

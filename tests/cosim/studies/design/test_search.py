@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.batch import run_batch, setting_of
+from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import (
     DesignLimits,
