@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import CData, core
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes

@@ -28,8 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import CData, core
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CData, CoreMemory, core, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource

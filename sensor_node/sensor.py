@@ -21,8 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines, Role, alike_loops, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings

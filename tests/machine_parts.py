@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import Controller, controllers_of
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import reals_at
+from noack.core.core_library import core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines
 from noack.plants.linear import LinearSystem

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.continuous import ContinuousLoop
-from noack.core.core_library import core, ffi, pointer_to
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CoreMemory, core, ffi, pointer_to
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.trigger.trigger_rule import TriggerRule, fill_rule, rule_rows
 

@@ -16,10 +16,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData, core, ffi, pointer_to
+from noack.core.core_library import SCRATCH_MATRICES, CData, core, ffi, pointer_to
 
-SCRATCH_MATRICES = 10
-"""Matrices of its size that the core needs for scratch."""
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables

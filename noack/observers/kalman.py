@@ -11,8 +11,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from noack.core.core_library import CData, core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CData, CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.section import Deviations, Rows, require_length, require_shape

@@ -11,8 +11,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
-from noack.core.core_library import CData, core
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CData, CoreMemory, core
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import (

@@ -11,8 +11,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from noack.core.core_library import CData
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CData, CoreMemory
 from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import Row, ScenarioSection, Table, require_length
 

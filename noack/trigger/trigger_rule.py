@@ -21,8 +21,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CData
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CData, CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 

@@ -7,8 +7,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CoreMemory, core, ffi
 from noack.machines.loop_machines import LoopMachines
 from tests.noack.machines.any_machines import Sizes, controller, plant, sensor
 

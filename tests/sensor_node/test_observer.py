@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CoreMemory, core, ffi, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings

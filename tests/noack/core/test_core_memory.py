@@ -4,8 +4,7 @@ import gc
 
 import numpy as np
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
+from noack.core.core_library import CoreMemory, core, ffi, reals_at
 
 
 def test_arrays_are_copies_that_live_with_their_memory() -> None:

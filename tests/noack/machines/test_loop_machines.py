@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import noack.core.core_memory
+import noack.core.core_library
 import sensor_node.sensor
 from controller_node.controller import Controller
 from noack.controllers.linear_feedback import LinearFeedback
@@ -214,7 +214,7 @@ def test_matrices_that_are_computed_again_have_the_same_bits(
     gaps = np.tile(rng.permutation(np.arange(1, 301)), 3) * (MS + 1)
     found = []
     for most in (1024, places):
-        monkeypatch.setattr(noack.core.core_memory, "_MOST_PLACES", most)
+        monkeypatch.setattr(noack.core.core_library, "_MOST_PLACES", most)
         one = machine(Sensor(H, absolute_rule(1.0, n=3)))
         assert one.machines[0].model.transitions.places == most
         rows = [

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory
+from noack.core.core_library import CoreMemory, core, ffi
 from noack.core.linear_systems import Vector
 from noack.trigger.trigger_rule import TriggerDecision, TriggerRule, fill_rule, rule_rows
 
