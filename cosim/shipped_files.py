@@ -66,7 +66,9 @@ def all_shipped(folder: str) -> list[ShippedFile]:
     paths = (_path_of(name, folder) for name in shipped_names(folder))
     from noack.scenario import toml_file
 
-    return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
+    return [
+        ShippedFile(path.stem, str(toml_file.read(path)["description"]), path) for path in paths
+    ]
 
 
 def text_of(name: str) -> str:

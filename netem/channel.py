@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -89,7 +89,7 @@ class Channel:
         for number, link in enumerate(links):
             for loop in range(loops):
                 link.start_flow(loop, number * loops + loop)
-        self.core: Any = ffi.new("noack_channel *", {
+        self.core: CData = ffi.new("noack_channel *", {
             "loops": loops, "directions": len(links), "links": [link.core for link in links],
             "is_scripted": network is not None, "first_number": first_number,
             "inputs": first_number, "reached_ns": -1, "change_ns": NO_TIME_NS, "free_place": -1,
@@ -101,7 +101,7 @@ class Channel:
         self.core.packets = pointer_to(self._packets, "noack_packet_row *")
         self.core.releases = pointer_to(self._releases, "noack_release_row *")
         self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
-        self._delayed: Any = ffi.new("noack_delayed[]", 0)
+        self._delayed: CData = ffi.new("noack_delayed[]", 0)
         self._taken: list[tuple[str, Rows]] = []
         self._add_places(_PLACES)
         if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:

@@ -2,15 +2,20 @@
 
 import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperGroup, TyperOption
 
 from noack.core.errors import ExitStatus, printable, why
 from noack.runtime.command_line import failed
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+    from typer._click.core import Command, Context, Parameter
+    from typer._click.formatting import HelpFormatter
 
 NAME = "noack"
 _COMPLETION = ("install_completion", "show_completion")
@@ -21,7 +26,7 @@ class Program(TyperGroup):
 
     _words: Sequence[str] = ()
 
-    def get_params(self, ctx: Any) -> list[Any]:
+    def get_params(self, ctx: "Context") -> list["Parameter"]:
         """Return the options before the command; the help hides those of shell completion.
 
         If the command comes first, none is needed: for their values typer would import pydantic,
@@ -29,23 +34,26 @@ class Program(TyperGroup):
         """
         if self._words and not self._words[0].startswith("-"):
             return []
-        found: list[Any] = super().get_params(ctx)
+        found = super().get_params(ctx)
         for parameter in found:
-            parameter.hidden = parameter.hidden or parameter.name in _COMPLETION
+            if isinstance(parameter, TyperOption) and parameter.name in _COMPLETION:
+                parameter.hidden = True
         return found
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
+    def format_commands(self, ctx: "Context", formatter: "HelpFormatter") -> None:
         """Write the commands, a section for each panel."""
-        commands: Mapping[str, Any] = self.commands
-        for panel, some in groupby(commands.values(), lambda command: command.rich_help_panel):
+        by_panel = groupby(
+            self.commands.values(), lambda command: getattr(command, "rich_help_panel", "")
+        )
+        for panel, some in by_panel:
             with formatter.section(panel):
                 formatter.write_dl(
-                    [(command.name, command.get_short_help_str(200)) for command in some]
+                    [(command.name or "", command.get_short_help_str(200)) for command in some]
                 )
 
     def main(
         self,
-        args: Any = None,
+        args: Sequence[str] | None = None,
         prog_name: str | None = None,
         complete_var: str | None = None,
         standalone_mode: bool = True,
@@ -88,7 +96,7 @@ class Program(TyperGroup):
         return f"{where}{message}; see `{command} --help`"
 
 
-def examples_of(command: Any) -> list[str]:
+def examples_of(command: "Command") -> list[str]:
     """Return the commands of the examples at the end of a help page."""
     lines = (command.epilog or "").splitlines()
     commands = (line.strip().partition("   ")[0] for line in lines)
@@ -121,7 +129,7 @@ class _PipeSafeFile(io.FileIO):
 
     _full = False
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: "ReadableBuffer", /) -> int:
         try:
             return super().write(data)
         except OSError as error:

@@ -425,8 +425,10 @@ def filled(draft: Draft, field: Field, text: str) -> Draft:
     group = next(one for one in form_of(changed).all_groups() if one.key == field.selects)
     keys = (*(one.key for one in group.fields), *(one.key for one in group.groups))
     known = {key.rpartition(".")[2] for key in keys}
-    table = {key: value for key, value in changed.value(group.key).items() if key in known}
-    return changed.with_value(group.key, table)
+    table = changed.value(group.key)
+    assert isinstance(table, dict)
+    kept = {key: value for key, value in table.items() if key in known}
+    return changed.with_value(group.key, kept)
 
 
 def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:

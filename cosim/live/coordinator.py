@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 import zenoh
-from pydantic import JsonValue
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.core.clock import NS_PER_S, RunClock
@@ -44,6 +43,7 @@ from noack.scenario.parameter_changes import (
 )
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
+from noack.settings.section import Table
 
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
@@ -441,7 +441,7 @@ class ChangeRequests:
     def _schedules(self) -> tuple[ChangeSchedule, ...]:
         return (self._schedule, *self._entries.values())
 
-    def _parameters(self) -> dict[str, dict[str, JsonValue]]:
+    def _parameters(self) -> dict[str, Table]:
         return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
 
     def _add(

@@ -158,7 +158,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
         CallerError: one line; it is not a complete fate file, or has no such flow.
     """
     with opened_fates(path) as (file, _):
-        counts: Counter[tuple[Any, ...]] = Counter()
+        counts: Counter[tuple[object, ...]] = Counter()
         for batch in file.iter_batches(columns=list(_FLOW)):
             table = pa.Table.from_batches([batch]).group_by([*_FLOW]).aggregate([([], "count_all")])
             for row in table.to_pylist():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
@@ -93,7 +93,7 @@ class ExactSimulation:
                 f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs"
             )
         self.n, self.m, self._link, self._memory = n, m, link, CoreMemory()
-        self.core: Any = ffi.new("noack_exact *")
+        self.core: CData = ffi.new("noack_exact *")
         """The structure, as the core's functions take it."""
         fill_rule(self.core.rule, trigger, n, self._memory)
         self._memory.fill(self.core, {

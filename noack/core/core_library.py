@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
 CData = Any
 """A structure or pointer of the core: mypy does not know its fields."""
-Array = NDArray[Any]
+Array = NDArray[np.generic]
 """Numbers, or rows of a structure of the core."""
+Rows = NDArray[np.void]
+"""Rows of a structure of the core."""
 _REMEDY = "run `make setup` in the repository, or install noack again"
 
 try:
@@ -69,7 +71,7 @@ def dtype_of(name: str) -> np.dtype[np.void]:
     )
 
 
-def _format_of(kind: CData) -> Any:
+def _format_of(kind: CData) -> DTypeLike:
     if kind.kind == "array":
         return _format_of(kind.item), (kind.length,)
     return _FORMATS[kind.cname]

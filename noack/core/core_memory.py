@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from itertools import accumulate
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from noack.core.core_library import Array, CData, core, ffi, pointer_to
 from noack.core.linear_systems import SCRATCH_MATRICES, Matrix, Vector
 
+T = TypeVar("T")
 _MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
 
 
@@ -25,11 +26,11 @@ class CoreMemory:
     """
 
     def __init__(self) -> None:
-        self._kept: list[Any] = []
+        self._kept: list[object] = []
         self._transitions: dict[bytes, CData] = {}
         self._shared: list[Array] = []
 
-    def keep(self, owner: Any) -> Any:
+    def keep(self, owner: T) -> T:
         """Keep an object alive as long as this memory; return it."""
         self._kept.append(owner)
         return owner
@@ -76,7 +77,7 @@ class CoreMemory:
         model.has_point = self.integers([point is not None for point in known])
         model.points = self.reals([np.zeros(n) if point is None else point for point in known])
 
-    def fill(self, structure: CData, numbers: Mapping[str, Any]) -> None:
+    def fill(self, structure: CData, numbers: Mapping[str, object]) -> None:
         """Set fields of a structure; an array becomes a pointer to a copy of it."""
         for name, number in numbers.items():
             value = self.reals(number) if isinstance(number, np.ndarray) else number

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Protocol, Self, TypeVar
 
 import zenoh
 from zenoh import CongestionControl, Priority
@@ -29,6 +29,8 @@ from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
 from noack.scenario.scenario_tables import MOST_CHANGES
+
+Item = TypeVar("Item", covariant=True)
 
 LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
@@ -95,7 +97,7 @@ def session_config(path: str, *, listen: bool) -> zenoh.Config:
     """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
-    settings: dict[str, Any] = {
+    settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         f"{side}/endpoints": [f"unixsock-stream/{path}"],
         f"{other}/endpoints": [],
@@ -133,8 +135,19 @@ def answer_to(
     return None if reply is None or reply.ok is None else reply.ok.payload.to_string()
 
 
+class _Receiver(Protocol[Item]):
+    """A queue of received messages."""
+
+    def try_recv(self) -> Item | None:
+        """Return the next message; None without one."""
+
+
 def first_reply(
-    replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
+    replies: _Receiver[zenoh.Reply],
+    until_s: float,
+    *,
+    poll_s: float,
+    give_up: Callable[[], bool] = lambda: False,
 ) -> zenoh.Reply | None:
     """Return the first reply before a reading of the monotonic clock; None without one.
 
@@ -143,7 +156,7 @@ def first_reply(
     began_s = time.monotonic()
     while (now_s := time.monotonic()) < until_s and not give_up():
         try:
-            reply: zenoh.Reply | None = replies.try_recv()
+            reply = replies.try_recv()
         except zenoh.ZError:  # the query ended without an answer
             return None
         if reply is not None:
@@ -168,12 +181,11 @@ def header_of(sample: zenoh.Sample) -> bytes | None:
     return header if key == str(sample.key_expr).encode() else None
 
 
-def next_payload(subscriber: Any) -> bytes | None:
+def next_payload(subscriber: _Receiver[zenoh.Sample]) -> bytes | None:
     """Return the payload of a subscriber's next message with its key; None without one."""
     while (sample := subscriber.try_recv()) is not None:
         if header_of(sample) is not None:
-            payload: bytes = sample.payload.to_bytes()
-            return payload
+            return sample.payload.to_bytes()
     return None
 
 
@@ -257,10 +269,20 @@ class ControlPlane:
         since_s = self._coordinator_gone_s
         return since_s is not None and time.monotonic() - since_s >= for_s
 
-    def publish(self, *parts: str, content: str | bytes, header: bytes = b"", **how: Any) -> None:
-        """Send a message to the subscribers of a key; ``how`` has options of zenoh."""
+    def publish(
+        self,
+        *parts: str,
+        content: str | bytes,
+        header: bytes = b"",
+        priority: Priority | None = None,
+        congestion_control: CongestionControl | None = None,
+    ) -> None:
+        """Send a message to the subscribers of a key."""
         key = self.key(*parts)
-        self.session.put(key, content, attachment=label(key, header), **how)
+        self.session.put(
+            key, content, attachment=label(key, header),
+            priority=priority, congestion_control=congestion_control,
+        )  # fmt: skip
 
     def request_stop(self, reason: str) -> None:
         """Ask all processes of the run to stop."""
@@ -300,13 +322,17 @@ class ControlPlane:
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        how = {"congestion_control": CongestionControl.DROP, "priority": Priority.BACKGROUND}
-        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
+        self.publish(
+            "telemetry", self.role, table, content=payload, header=header,
+            priority=Priority.BACKGROUND, congestion_control=CongestionControl.DROP,
+        )  # fmt: skip
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        how = {"congestion_control": CongestionControl.BLOCK}
-        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
+        block = CongestionControl.BLOCK
+        self.publish(
+            "telemetry", self.role, table, content=payload, header=header, congestion_control=block
+        )
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:

@@ -145,7 +145,7 @@ class Replay(SummaryPart):
             first_difference=self.first_difference,
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """The complete result for JSON."""
         verdict = self.verdict().model_dump(exclude={"error"})
         return verdict | {"gaps": self.gaps} | self.model_dump()

@@ -33,7 +33,7 @@ class ExportedRun:
     directory: Path
     record: "RunRecord"
     """Of the only loop, or of the network that the loops share."""
-    summary: dict[str, Any]
+    summary: dict[str, object]
     """The content of ``summary.json``, or its part about the loop."""
     inner: "Sequence[ExportedRun]" = ()
     """The loops that share the network."""
@@ -43,7 +43,7 @@ class ExportedRun:
     """Time of the run at which the loop's own time begins."""
 
     @property
-    def environment(self) -> dict[str, Any]:
+    def environment(self) -> dict[str, object]:
         """The content of ``environment.json``."""
         kind = {"kind": self.record.kind}
         return read_object(self.directory / ENVIRONMENT_FILE) | kind

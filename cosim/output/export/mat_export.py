@@ -30,7 +30,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
     return save_mat(_content(run, certificates=certificates), path)
 
 
-def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
+def save_mat(content: Mapping[str, object], path: Path) -> list[Path]:
     """Write a document of JSON, or arrays, as variables; return the path.
 
     Raises:
@@ -48,9 +48,9 @@ def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
     return [write_whole(path, header + buffer.getvalue()[len(header) :])]
 
 
-def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
+def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
     record = run.record
-    found: dict[str, Any] = {table: _columns(record[table]) for table in record.tables}
+    found: dict[str, object] = {table: _columns(record[table]) for table in record.tables}
     found["summary"] = run.summary
     found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
     found["environment"] = run.environment
@@ -71,7 +71,7 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
     return found
 
 
-def _certificates(scenario: Scenario) -> dict[str, Any]:
+def _certificates(scenario: Scenario) -> dict[str, object]:
     """Return the certificates of a scenario, or the reason why there are none."""
     try:
         return certificates_of(scenario).to_json()
@@ -79,9 +79,9 @@ def _certificates(scenario: Scenario) -> dict[str, Any]:
         return {"none": str(error)}
 
 
-def _columns(rows: Rows) -> dict[str, Any]:
+def _columns(rows: Rows) -> dict[str, object]:
     """Return the columns of a table: (k, 1), vectors (k, n), bytes (k, width)."""
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for name in rows.dtype.names or ():
         column = rows[name]
         if column.dtype.kind == "V":
@@ -97,7 +97,7 @@ def _array(values: Any) -> Any:
 def _structure(value: Any) -> Any:
     """Return a value as :func:`scipy.io.savemat` takes it; None is an empty array."""
     if isinstance(value, Mapping):
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for key, entry in value.items():
             found[_free_name(_name(key), found)] = _structure(entry)
         return found
@@ -129,7 +129,7 @@ def _name(key: str) -> str:
     return (name if name[:1].isalpha() else f"f_{name}")[:_LONGEST_NAME]
 
 
-def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+def _free_name(name: str, taken: Mapping[str, object]) -> str:
     number, free = 1, name
     while free in taken:
         number += 1
