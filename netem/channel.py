@@ -7,7 +7,7 @@ independent: each has its own settings, random streams and guarantee. Payloads a
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +81,7 @@ class Channel:
         *,
         loops: int = 1,
         first_number: int = 0,
-        schedule: ChangeSchedule | None = None,
+        schedule: ChangeSchedule[LinkSettings] | None = None,
         network: Network | None = None,
     ) -> None:
         self._links, self._loops = tuple(links), loops
@@ -226,10 +226,11 @@ def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSetti
 
 
 def due_settings(
-    schedule: ChangeSchedule, present: LinkSettings, now_ns: int
+    schedule: ChangeSchedule[LinkSettings], present: LinkSettings, now_ns: int
 ) -> Iterator[LinkSettings]:
     """Yield the settings that replace the present ones before a datagram that arrives now."""
     while (change := schedule.take(now_ns)) is not None:
+        assert change.prepared is not None
         first = present.first_delivered  # a restarted emulator has its own value
         settings = change.prepared.model_copy(update={"first_delivered": first})
         if settings != present:
@@ -237,7 +238,7 @@ def due_settings(
             yield settings
 
 
-def encoded(message: Any) -> bytes:
+def encoded(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(

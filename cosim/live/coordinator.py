@@ -388,9 +388,9 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        self._schedule = ChangeSchedule(ticket.scenario)
+        self._schedule = ChangeSchedule[None](ticket.scenario)
         self._entries = {
-            section.name: ChangeSchedule(loop_scenario(ticket.scenario, section))
+            section.name: ChangeSchedule[None](loop_scenario(ticket.scenario, section))
             for section in loop_sections(ticket.scenario)
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
@@ -438,7 +438,7 @@ class ChangeRequests:
         )
 
     @property
-    def _schedules(self) -> tuple[ChangeSchedule, ...]:
+    def _schedules(self) -> tuple[ChangeSchedule[None], ...]:
         return (self._schedule, *self._entries.values())
 
     def _parameters(self) -> dict[str, Table]:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, SupportsFloat
+from typing import NamedTuple, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,11 +85,18 @@ class ContinuousLoop:
         self.trigger = trigger
         self._between = self.simulation(0.0, known_start=True)
 
-    def simulation(self, horizon_s: float, *, known_start: bool, **more: Any) -> ExactSimulation:
-        """Return the core's simulation of the loop; further arguments are those of its class."""
+    def simulation(
+        self,
+        horizon_s: float,
+        *,
+        known_start: bool,
+        delivered: NDArray[np.bool_] | None = None,
+        **numbers: object,
+    ) -> ExactSimulation:
+        """Return the core's simulation of the loop; the arguments are those of its class."""
         return ExactSimulation(
             self.loop.H, self.loop.K, self.trigger,
-            horizon_s=horizon_s, known_start=known_start, **more,
+            horizon_s=horizon_s, known_start=known_start, link=None, delivered=delivered, **numbers,
         )  # fmt: skip
 
     @property

@@ -4,7 +4,7 @@ Everything is in SI units and in the paper's notation; n states, m inputs. A sta
 the loop is (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, of shape (3, n).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +85,7 @@ class ExactSimulation:
         known_start: bool,
         link: LinkState | None = None,
         delivered: NDArray[np.bool_] | None = None,
-        **numbers: Any,
+        **numbers: object,
     ) -> None:
         m, n = K.shape
         if max(n, m) > _MOST_ENTRIES:

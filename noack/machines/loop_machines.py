@@ -13,7 +13,7 @@ what a loop's own row lacks is missing in them (:func:`row_layout`).
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,12 @@ from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow
-from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_key
+from noack.scenario.parameter_changes import (
+    AppliedParameters,
+    ChangeSchedule,
+    ParameterChange,
+    settings_key,
+)
 from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]
@@ -59,7 +64,7 @@ class MachinePart(Protocol):
     role: Role
 
     @property
-    def schedule(self) -> ChangeSchedule | None:
+    def schedule(self) -> ChangeSchedule[object] | None:
         """The announced changes of its settings; None if they cannot change."""
         ...
 
@@ -95,6 +100,7 @@ class MachinePart(Protocol):
 
 
 Part = TypeVar("Part", bound=MachinePart)
+Prepared = TypeVar("Prepared")
 
 
 def alike_parts(
@@ -141,16 +147,18 @@ def set_machine(
         reception.newest, reception.not_after_ns = -1, horizon_ns
 
 
-def take_changes(schedule: ChangeSchedule | None, machine: CData) -> Sequence[Any]:
+def take_changes(
+    schedule: ChangeSchedule[Prepared] | None, machine: CData
+) -> Sequence[AppliedParameters[Prepared]]:
     """Return the changes that are due at the time at which a step asked, in order."""
-    found: list[Any] = []
+    found: list[AppliedParameters[Prepared]] = []
     while schedule is not None and (due := schedule.take(machine.change_ns)) is not None:
         found.append(due)
     machine.change_ns = next_change_ns(schedule)
     return found
 
 
-def next_change_ns(schedule: ChangeSchedule | None) -> int:
+def next_change_ns(schedule: ChangeSchedule[object] | None) -> int:
     """Return the time of the next change."""
     if schedule is None or schedule.next_ns is None:
         return NEVER_NS
@@ -237,11 +245,11 @@ class LoopMachines:
             if len(set(shapes)) > 1:
                 table.layouts = self._layouts(name, types[name], shapes)
 
-    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> Any:
+    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> CData:
         """Return the layout of each loop's rows in a table; loops of a shape share it."""
 
         @cache
-        def layout(shape: RecordShape) -> Any:
+        def layout(shape: RecordShape) -> CData:
             own = tables(**asdict(shape)).get(name)
             return ffi.NULL if own is None else self._memory.integers(row_layout(own, whole))
 

@@ -7,7 +7,6 @@ difference, and answers what the core asks: for users' code, and for changes of 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,12 +183,14 @@ class InputReplay:
             number = place_of.number(table, row)
             self.difference = rows_differ(table, number, rows[row], replayed[0])
 
-    def _note(self, place_of: "_Places", at: int, what: str, *values: Any) -> None:
+    def _note(
+        self, place_of: "_Places", at: int, what: str, column: str = "", *values: int | None
+    ) -> None:
         """Keep a difference at an input, if it is the first one."""
         table, row, rows = place_of(at)
         number, now_ns = place_of.number(table, row), int(rows["now_ns"][row])
         if self.difference is None:
-            self.difference = difference(table, number, now_ns, what, *values)
+            self.difference = difference(table, number, now_ns, what, column, *values)
 
 
 class _Places:

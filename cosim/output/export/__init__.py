@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
 from noack.core.errors import CallerError
@@ -88,7 +89,7 @@ def export_suffix(kind: str) -> str:
     return str(_module(kind).SUFFIX)
 
 
-def _module(kind: str) -> Any:
+def _module(kind: str) -> ModuleType:
     return import_module(f"{__name__}.{kind}{_ENDING}")
 
 

@@ -2,11 +2,12 @@
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.output.certificates import certificates_of
 from cosim.output.export import ExportedRun
@@ -41,7 +42,7 @@ def save_mat(content: Mapping[str, object], path: Path) -> list[Path]:
     buffer = io.BytesIO()
     try:
         file: Any = buffer  # SciPy's types know names of files only
-        savemat(file, _structure(content), oned_as="column")
+        savemat(file, _fields(content), oned_as="column")
     except (ValueError, OverflowError, TypeError) as error:
         raise MachineError(f"{path}: not possible as a .mat file of version 5: {error}") from None
     header = b"MATLAB 5.0 MAT-file, written by noack".ljust(116)  # without a date
@@ -90,17 +91,21 @@ def _columns(rows: Rows) -> dict[str, object]:
     return found
 
 
-def _array(values: Any) -> Any:
+def _array(values: NDArray[np.generic]) -> NDArray[np.generic]:
     return values.astype(object) if values.dtype.kind in "OU" else values
 
 
-def _structure(value: Any) -> Any:
+def _fields(content: Mapping[str, object]) -> dict[str, object]:
+    found: dict[str, object] = {}
+    for key, entry in content.items():
+        found[_free_name(_name(key), found)] = _structure(entry)
+    return found
+
+
+def _structure(value: object) -> object:
     """Return a value as :func:`scipy.io.savemat` takes it; None is an empty array."""
     if isinstance(value, Mapping):
-        found: dict[str, object] = {}
-        for key, entry in value.items():
-            found[_free_name(_name(key), found)] = _structure(entry)
-        return found
+        return _fields(value)
     if value is None:
         return np.zeros((0, 0))
     if isinstance(value, list | tuple):
@@ -108,13 +113,13 @@ def _structure(value: Any) -> Any:
     return value
 
 
-def _array_or_cells(values: list[Any] | tuple[Any, ...]) -> Any:
+def _array_or_cells(values: Sequence[object]) -> NDArray[np.generic]:
     """Return numbers as an array; anything else as a cell array."""
     numeric = [isinstance(one, int | float) and not isinstance(one, bool) for one in values]
     if values and all(numeric):
         return np.array(values, dtype=np.float64)
     if values and all(isinstance(one, list | tuple) and one for one in values):
-        rows = [_array_or_cells(one) for one in values]
+        rows = [_array_or_cells(one) for one in values if isinstance(one, list | tuple)]
         if all(row.dtype == np.float64 and row.shape == rows[0].shape for row in rows):
             return np.array(rows)
     cells = np.empty((len(values), 1), dtype=object)
