@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Protocol, Self, TypeVar
+from typing import Self
 
 import zenoh
 from zenoh import CongestionControl, Priority
-from zenoh.handlers import FifoChannel, RingChannel
+from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
@@ -29,8 +29,6 @@ from noack.runtime.join_ticket import RemoteAccess, Ticket
 from noack.runtime.private_folder import open_private
 from noack.runtime.spool import writer_of
 from noack.scenario.scenario_tables import MOST_CHANGES
-
-Item = TypeVar("Item", covariant=True)
 
 LEASE_MS = 6000
 """A connection whose other end is silent for longer breaks. On a busy machine a process may not run
@@ -135,15 +133,8 @@ def answer_to(
     return None if reply is None or reply.ok is None else reply.ok.payload.to_string()
 
 
-class _Receiver(Protocol[Item]):
-    """A queue of received messages."""
-
-    def try_recv(self) -> Item | None:
-        """Return the next message; None without one."""
-
-
 def first_reply(
-    replies: _Receiver[zenoh.Reply],
+    replies: Handler[zenoh.Reply],
     until_s: float,
     *,
     poll_s: float,
@@ -181,7 +172,7 @@ def header_of(sample: zenoh.Sample) -> bytes | None:
     return header if key == str(sample.key_expr).encode() else None
 
 
-def next_payload(subscriber: _Receiver[zenoh.Sample]) -> bytes | None:
+def next_payload(subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> bytes | None:
     """Return the payload of a subscriber's next message with its key; None without one."""
     while (sample := subscriber.try_recv()) is not None:
         if header_of(sample) is not None:
