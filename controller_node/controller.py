@@ -53,7 +53,11 @@ class LossCheck:
     """
 
     def __init__(
-        self, guarantee: LossGuarantee, schedule: ChangeSchedule | None, *, known_start: bool
+        self,
+        guarantee: LossGuarantee,
+        schedule: ChangeSchedule[object] | None,
+        *,
+        known_start: bool,
     ) -> None:
         self._schedule = schedule
         self._known_start = known_start
@@ -176,7 +180,7 @@ class Controller:
     predictive: bool = False
     predictions: int = 1
     setpoint: Setpoint | None = None
-    schedule: ChangeSchedule | None = None
+    schedule: ChangeSchedule[Setpoint | None] | None = None
 
     role = CONTROLLER
 

@@ -68,7 +68,9 @@ def shipped_names(folder: str) -> list[str]:
 def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
-    return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
+    return [
+        ShippedFile(path.stem, str(toml_file.read(path)["description"]), path) for path in paths
+    ]
 
 
 def text_of(name: str) -> str:

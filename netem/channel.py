@@ -7,13 +7,13 @@ independent: each has its own settings, random streams and guarantee. Payloads a
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from netem.link_state import LinkState
-from noack.core.core_library import core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -81,7 +81,7 @@ class Channel:
         *,
         loops: int = 1,
         first_number: int = 0,
-        schedule: ChangeSchedule | None = None,
+        schedule: ChangeSchedule[LinkSettings] | None = None,
         network: Network | None = None,
     ) -> None:
         self._links, self._loops = tuple(links), loops
@@ -89,7 +89,7 @@ class Channel:
         for number, link in enumerate(links):
             for loop in range(loops):
                 link.start_flow(loop, number * loops + loop)
-        self.core: Any = ffi.new("noack_channel *", {
+        self.core: CData = ffi.new("noack_channel *", {
             "loops": loops, "directions": len(links), "links": [link.core for link in links],
             "is_scripted": network is not None, "first_number": first_number,
             "inputs": first_number, "reached_ns": -1, "change_ns": NO_TIME_NS, "free_place": -1,
@@ -101,7 +101,7 @@ class Channel:
         self.core.packets = pointer_to(self._packets, "noack_packet_row *")
         self.core.releases = pointer_to(self._releases, "noack_release_row *")
         self._heap: Rows = np.zeros(0, dtype_of("noack_heap_entry"))
-        self._delayed: Any = ffi.new("noack_delayed[]", 0)
+        self._delayed: CData = ffi.new("noack_delayed[]", 0)
         self._taken: list[tuple[str, Rows]] = []
         self._add_places(_PLACES)
         if (wrong := core.noack_channel_check(self.core)) != ffi.NULL:
@@ -226,10 +226,11 @@ def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSetti
 
 
 def due_settings(
-    schedule: ChangeSchedule, present: LinkSettings, now_ns: int
+    schedule: ChangeSchedule[LinkSettings], present: LinkSettings, now_ns: int
 ) -> Iterator[LinkSettings]:
     """Yield the settings that replace the present ones before a datagram that arrives now."""
     while (change := schedule.take(now_ns)) is not None:
+        assert change.prepared is not None
         first = present.first_delivered  # a restarted emulator has its own value
         settings = change.prepared.model_copy(update={"first_delivered": first})
         if settings != present:
@@ -237,7 +238,7 @@ def due_settings(
             yield settings
 
 
-def encoded(message: Any) -> bytes:
+def encoded(message: CData) -> bytes:
     """Return the datagram of a simulated run with a ``noack_message``."""
     vector = np.array(ffi.unpack(message.vector, message.entries))
     return Encoder(RUN_ID, bytes(KEY_BYTES)).encode(

@@ -9,7 +9,6 @@ import json
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 from pydantic import BaseModel
@@ -272,7 +271,7 @@ def explain(
             console.print(Text(shortened(toml, _MAX_TOML)), soft_wrap=True)  # for copying
 
 
-def _document(settings: LinkSettings) -> dict[str, Any]:
+def _document(settings: LinkSettings) -> dict[str, object]:
     prediction, tc = expected_loss(settings), tc_command(settings)
     return {
         "words": text_of(settings),
@@ -383,9 +382,9 @@ def _uncapped(settings: LinkSettings) -> LinkSettings:
     return with_kept_loss(settings).model_copy(update={"mansd": None, "constraints": ()})
 
 
-def _link_table(spec: LinkSpec) -> dict[str, Any]:
+def _link_table(spec: LinkSpec) -> dict[str, object]:
     """Return a link's table in a file of links, without default values."""
-    table: dict[str, Any] = {
+    table: dict[str, object] = {
         "name": spec.name,
         "listen": address_text(spec.listen),
         "to": address_text(spec.to),
@@ -397,7 +396,7 @@ def _link_table(spec: LinkSpec) -> dict[str, Any]:
     return table | {name: side for name, side in sides.items() if side}
 
 
-def _given(section: BaseModel) -> dict[str, Any]:
+def _given(section: BaseModel) -> dict[str, object]:
     """Return the keys of a section that differ from their defaults, and its kind."""
     return {
         key: _plain(getattr(section, key))
@@ -406,7 +405,7 @@ def _given(section: BaseModel) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, BaseModel):
         return _given(value)
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value

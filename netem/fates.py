@@ -32,10 +32,11 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Direction, LinkSpec, say
-from noack.core.core_library import Array, dtype_of
+from noack.core.core_library import Rows, dtype_of
 from noack.core.errors import CallerError, one_line
 from noack.core.file_access import open_growing, open_regular
 from noack.impairments.constraints import require_consistent
@@ -70,7 +71,7 @@ SCHEMA = pa.schema(
 
 def description(specs: Sequence[LinkSpec], missing: int) -> dict[str, str]:
     """Return the metadata of a trace."""
-    document: Mapping[str, Any] = {
+    document: Mapping[str, object] = {
         "format": FORMAT,
         "version": version("noack"),
         "missing_events": missing,
@@ -124,7 +125,7 @@ class FateRecorder:
         }
         self._gathered = 0
         self._max_waiting = max_waiting
-        self._queue: SimpleQueue[Array | str | None] = SimpleQueue()
+        self._queue: SimpleQueue[Rows | str | None] = SimpleQueue()
         self._taken = 0
         self._done = 0
         self._missed = 0
@@ -165,7 +166,7 @@ class FateRecorder:
         """Number of events that are not in the trace."""
         return self._missed + self._unwritten
 
-    def take(self, events: Array, data: Bytes) -> None:
+    def take(self, events: Rows, data: Bytes) -> None:
         """Queue the arrivals; called in the relay's thread."""
         try:
             rows = events.view(_RAW)[events["departure"] == 0]
@@ -194,7 +195,7 @@ class FateRecorder:
             self._write()
         self._end()
 
-    def _gather(self, rows: Array) -> None:
+    def _gather(self, rows: Rows) -> None:
         """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
             part, rows = np.split(rows, [_GROUP_ROWS - self._gathered])
@@ -252,7 +253,7 @@ class Fates(NamedTuple):
     """The content of a trace, for each direction of each link."""
 
     decisions: Mapping[tuple[str, Direction], Decisions]
-    guarantees: Mapping[tuple[str, Direction], Mapping[str, Any]]
+    guarantees: Mapping[tuple[str, Direction], Mapping[str, object]]
     """The keys ``mansd`` and ``constraints`` of its settings; none if the recorded fates break the
     guarantee, because it changed during the recording."""
 
@@ -279,7 +280,7 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             raise CallerError(f"{path}: has no link {link!r}; its links: {known}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
     found: dict[tuple[str, Direction], Decisions] = {}
-    guarantees: dict[tuple[str, Direction], Mapping[str, Any]] = {}
+    guarantees: dict[tuple[str, Direction], Mapping[str, object]] = {}
     for link in links_recorded if links is None else links:
         for direction in DIRECTIONS:
             here = (columns["link"] == link) & (columns["direction"] == direction)
@@ -290,7 +291,7 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     return Fates(found, guarantees)
 
 
-def _is_kept(settings: "_Direction", rows: Mapping[str, Array]) -> bool:
+def _is_kept(settings: "_Direction", rows: Mapping[str, NDArray[np.int64]]) -> bool:
     """Whether the losses of each flow are allowed, not counting those out of order."""
     losses = rows["consecutive_losses"]
     if settings.mansd is not None and losses.max(initial=0) > settings.mansd:
@@ -383,7 +384,7 @@ def _document(path: Path, text: bytes | None) -> _Document:
         raise CallerError(f"{path}: not a fate trace of this program") from None
 
 
-def _flows(rows: Mapping[str, Array], most_flows: int, place: str) -> Decisions:
+def _flows(rows: Mapping[str, NDArray[np.int64]], most_flows: int, place: str) -> Decisions:
     """Return the decisions of each flow, from the rows of a direction."""
     _check(rows, most_flows, place)
     order = np.lexsort((rows["packet"], rows["flow"]))
@@ -407,7 +408,7 @@ def _flows(rows: Mapping[str, Array], most_flows: int, place: str) -> Decisions:
     return found
 
 
-def _check(rows: Mapping[str, Array], most_flows: int, place: str) -> None:
+def _check(rows: Mapping[str, NDArray[np.int64]], most_flows: int, place: str) -> None:
     """Check that an emulator could have made these decisions."""
     delay, copy = rows["delay_ns"], rows["copy_delay_ns"]
     lost = np.isin(rows["fate"], _LOST)

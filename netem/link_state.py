@@ -210,7 +210,7 @@ class LinkState:
         for name in ("flows", "memory", "recent_ns", "losses"):
             old = self._memory[name]
             self._memory[name] = np.concatenate((old, np.zeros_like(old)))
-        self.flows = self._memory["flows"]
+        self.flows = self._memory["flows"].view(self.flows.dtype)
         self.core.rows = len(self.flows)
         self._point(self.core)
 

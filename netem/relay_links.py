@@ -202,7 +202,9 @@ def socket_name(address: Address, what: str) -> SocketName:
         raise CallerError(
             f"{what}: {address[0]}: not an address of IPv4 or IPv6 ({error.strerror})"
         ) from None
-    return results[0][4]
+    name = results[0][4]
+    assert isinstance(name[0], str)
+    return name
 
 
 def _udp_socket(name: SocketName) -> Endpoint:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from netem.link_state import Integers, LinkState
-from netem.relay_links import EVENT
-from noack.core.core_library import Array, CData, core, dtype_of, ffi, pointer_to
+from netem.relay_links import EVENT, Bytes
+from noack.core.core_library import CData, Rows, core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import Decisions, LinkSettings
 from noack.runtime.address import NAME_BYTES, SocketName, packed_name
 
@@ -38,13 +38,13 @@ class RelayMemory:
         self, links: int, segment: bool = False, taps: int = 0, row_count: int = 0
     ) -> None:
         self.first_path = 2 * links
-        self._chunks: list[Array] = []
+        self._chunks: list[Bytes] = []
         self._epoll = select.epoll()
         self.directions: CData = ffi.new("noack_direction[]", 2 * links)
-        self.events: Array = np.zeros(_EVENTS if taps else 0, EVENT)
-        self.data: Array = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
-        self.packets: Array = np.zeros(row_count, PACKET_ROW)
-        self.releases: Array = np.zeros(row_count, RELEASE_ROW)
+        self.events: Rows = np.zeros(_EVENTS if taps else 0, EVENT)
+        self.data: Bytes = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
+        self.packets: Rows = np.zeros(row_count, PACKET_ROW)
+        self.releases: Rows = np.zeros(row_count, RELEASE_ROW)
         self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
@@ -118,13 +118,13 @@ class RelayMemory:
         for row in np.flatnonzero(clients["number"] >= 0).tolist():
             core.noack_client_insert(self.core, row)
 
-    def take_events(self) -> tuple[Array, Array]:
+    def take_events(self) -> tuple[Rows, Bytes]:
         """Return the collected events and their payloads, which the next ones overwrite."""
         events, data = self.core.event_length, self.core.data_length
         self.core.event_length = self.core.data_length = 0
         return self.events[:events], self.data[:data]
 
-    def take_rows(self) -> tuple[Array, Array]:
+    def take_rows(self) -> tuple[Rows, Rows]:
         """Return the collected rows of the two tables, which the next ones overwrite."""
         packets, releases = self.core.packet_rows, self.core.release_rows
         self.core.packet_rows = self.core.release_rows = 0
@@ -140,7 +140,7 @@ class RelayMemory:
         """Stop waiting for datagrams."""
         self._epoll.close()
 
-    def _set_clients(self, clients: Array, sockets: Array) -> None:
+    def _set_clients(self, clients: Rows, sockets: Rows) -> None:
         self.clients, self.sockets = clients, sockets
         self._table = np.full(_TABLE_SHARE * len(clients), -1, np.int32)
         self.core.client_rows, self.core.table_places = len(clients), len(self._table)
@@ -148,7 +148,7 @@ class RelayMemory:
         self.core.sockets = pointer_to(sockets, "noack_socket *")
         self.core.table = pointer_to(self._table, "int32_t *")
 
-    def _set_slots(self, heap: Array, slots: Array, begin: int) -> None:
+    def _set_slots(self, heap: Rows, slots: Rows, begin: int) -> None:
         """Use these arrays; the slots from ``begin`` on are free."""
         relay, count = self.core, len(slots)
         slots["next"][begin:] = np.arange(begin + 1, count + 1)
@@ -226,11 +226,11 @@ def has_headroom(wanted_bytes: int = 0) -> bool:
     return True
 
 
-def doubled(array: Array) -> Array:
+def doubled(array: Rows) -> Rows:
     """Return an array of twice the length; the new elements are 0."""
     return np.concatenate((array, np.zeros_like(array)))
 
 
-def name_array(packed: bytes) -> Array:
+def name_array(packed: bytes) -> Bytes:
     """Return a packed socket address as an array, (NAME_BYTES,) of bytes."""
     return np.frombuffer(packed.ljust(NAME_BYTES, b"\0"), np.uint8)

@@ -13,7 +13,7 @@ from netem.channel import Datagram, at_start, due_settings, link_name
 from netem.relay_links import let_wait, stamp_arrivals
 from netem.relay_memory import PACKET_ROW, RelayDirection, RelayMemory, name_array
 from noack.core.clock import RunClock
-from noack.core.core_library import Array, core
+from noack.core.core_library import Rows, core
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -151,7 +151,7 @@ class RunNetwork:
         self._relay.read_ns = now_ns
         rows = _RowList()
         self.drive(_AT_ONCE_NS, rows)
-        return sorted(rows, key=lambda record: int(record.row[0]))
+        return sorted(rows, key=_first_entry)
 
     @property
     def received(self) -> Sequence[int]:
@@ -206,10 +206,16 @@ class RunNetwork:
             sink.extend_table(NETEM_RELEASE, releases)
 
 
+def _first_entry(record: Record) -> int:
+    number = record.row[0]
+    assert isinstance(number, int)
+    return number
+
+
 class _RowList(list[Record]):
     """A sink that keeps the rows."""
 
-    def extend_table(self, table: str, rows: Array) -> None:
+    def extend_table(self, table: str, rows: Rows) -> None:
         """Add rows of a table."""
         self.extend(Record(table, row) for row in rows.tolist())
 

@@ -9,7 +9,7 @@ The order of the words is the order of the impairments; the position of ``mansd`
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self, TypeVar
 
 from pydantic import (
     BeforeValidator,
@@ -22,7 +22,6 @@ from pydantic import (
 
 from netem.relay_links import LinkSpec
 from noack.core.errors import CallerError, shortened
-from noack.impairments.clauses import Table
 from noack.impairments.constraints import CONSTRAINTS, AnyConstraint
 from noack.impairments.feature import Constraint, Feature, Impairment
 from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
@@ -32,8 +31,9 @@ from noack.impairments.loss_prediction import read_files
 from noack.impairments.words import COUNT, WordReader, percent_text
 from noack.runtime.address import parse_address, parse_destination
 from noack.scenario import toml_file
-from noack.settings.section import ScenarioSection, Seed
+from noack.settings.section import ScenarioSection, Seed, Table
 
+T = TypeVar("T")
 _REFUSED = {
     "slot": "this emulator does not gather packets into slots; it has rate and blackout",
     "ecn": "this emulator cannot mark packets: it sees payloads, not IP headers",
@@ -70,8 +70,7 @@ GRAMMAR = [
     if word.grammar
 ]
 """The words of each impairment, for ``--help``."""
-_IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
-_CONSTRAINT: TypeAdapter[Any] = TypeAdapter(AnyConstraint)
+_IMPAIRMENT, _CONSTRAINT = TypeAdapter(AnyImpairment), TypeAdapter(AnyConstraint)
 _LINK, _SEED = TypeAdapter(LinkSettings), TypeAdapter[int](Seed)
 _LIMIT = LinkSettings.model_fields["limit"].default
 
@@ -92,7 +91,7 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     reader = WordReader(words)
     impairments: list[Impairment] = []
     constraints: list[Constraint] = []
-    settings: Table = {}
+    settings: dict[str, int] = {}
     while (word := reader.begin()) is not None:
         if word in _REFUSED:
             reader.wrong(_REFUSED[word])
@@ -106,7 +105,7 @@ def parse(words: str | Sequence[str]) -> LinkWords:
             if issubclass(kind, Constraint):
                 constraints.append(_validated(_CONSTRAINT, table, reader))
                 continue
-            impairment: Impairment = _validated(_IMPAIRMENT, table, reader)
+            impairment = _validated(_IMPAIRMENT, table, reader)
             _check_place(reader, impairment, impairments, bare_gap=word == "gap")
             impairments.append(impairment)
             continue
@@ -121,7 +120,7 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     given: Table = {_SETTINGS[word]: value for word, value in settings.items()}
     given |= {"impairments": tuple(impairments), "constraints": tuple(constraints)}
     try:
-        return LinkWords(LinkSettings(**given), seed)
+        return LinkWords(LinkSettings.model_validate(given), seed)
     except ValidationError as error:
         # Each setting is valid by itself; the error is a combination of settings.
         key, _, message = _message(error).partition(": ")
@@ -166,7 +165,7 @@ def require_no_dashes(arguments: Sequence[str]) -> None:
             raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
 
 
-def _validated(kind: TypeAdapter[Any], given: object, reader: WordReader) -> Any:
+def _validated(kind: TypeAdapter[T], given: object, reader: WordReader) -> T:
     try:
         return kind.validate_json(json.dumps(given))  # strict mode: lists for tuples only in JSON
     except ValidationError as error:
@@ -245,7 +244,7 @@ def tc_command(settings: LinkSettings, named: LinkSettings | None = None) -> TcC
     return TcCommand(text, tuple(lacks), tuple(dict.fromkeys(notes)))
 
 
-def _settings(value: Any) -> Any:
+def _settings(value: object) -> LinkSettings:
     if isinstance(value, LinkSettings):
         return value
     if not isinstance(value, str):
@@ -350,6 +349,6 @@ def load_links(path: Path, *, read: bool = True) -> tuple[LinkSpec, ...]:
     return specs
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> Table:
     """Return the JSON Schema of links files, for editors."""
     return toml_file.json_schema(LinksFile)

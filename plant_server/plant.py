@@ -22,7 +22,6 @@ applied. The policy then determines the input:
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,8 +125,10 @@ class Watchdog:
             memory.set_model(plant.fallback, memory.transitions(self.H, (period_ns,)))
 
 
-def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
-    """Whether an actuation of time ``newest_ns`` is too old at ``t_ns``; also of arrays."""
+def too_old(
+    t_ns: NDArray[np.int64], newest_ns: NDArray[np.int64], timeout_ns: int
+) -> NDArray[np.bool_]:
+    """Whether actuations of the times ``newest_ns`` are too old at ``t_ns``."""
     return t_ns - newest_ns > timeout_ns
 
 

@@ -117,7 +117,7 @@ class Sensor:
     period_ns: int | None = None
     first_number: int = 0
     setpoint: Vector | None = None
-    schedule: ChangeSchedule | None = None
+    schedule: ChangeSchedule[tuple[Vector | None, Policy]] | None = None
     timeout_ns: int | None = None
     observer: Observer | None = None
     horizon_ns: int = _ANY_TIME_NS
@@ -184,6 +184,7 @@ class Sensor:
         """Apply changes, let the user's trigger decide, or make room for sent updates."""
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, sensor.machine):
+                assert due.prepared is not None
                 setpoint, policy = due.prepared
                 self._set_point(sensor, due.since_ns, setpoint)
                 self._set_policy(sensor, policy)

@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import Any
 
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
@@ -147,7 +146,7 @@ class Certificates:
             return LossMargin(self.scenario).first_bounds()
         return None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
             "scenario": self.scenario.name,

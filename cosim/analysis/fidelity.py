@@ -22,7 +22,7 @@ effect.
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -283,7 +283,7 @@ class Fidelity:
             f"{100 * self.explained_relative:.2g} %" + ("" if self.explained else ", too large")
         )
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """All figures, for ``noack fidelity --json``."""
         figures = {k: v for k, v in asdict(self).items() if k not in ("t_s", "stage_norms")}
         return {**figures, "explained": self.explained, "verdict": self.verdict}

@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,18 +150,17 @@ _SENT_RECEIVED = {
 """The tables with one row for each message sent, and for each message received."""
 
 
-def from_controller(record: RunRecord) -> dict[str, FlowPart]:
-    """The outcome of what the controller sends through the network, by its name."""
-    found = {}
-    for flow in record.scenario.network.flows[1:]:
-        outcomes, (sent, received) = packet_outcomes(record, flow), _SENT_RECEIVED[flow]
-        found[f"{flow.name.lower()}s"] = FlowPart(
-            sent=record.count(sent),
-            lost=int(outcomes.lost.sum()),
-            longest_loss_burst=outcomes.longest_loss_burst(),
-            received=record.count(received),
-        )
-    return found
+def from_controller(record: RunRecord, flow: Flow) -> FlowPart | None:
+    """The outcome of a flow from the controller; None if it does not cross the network."""
+    if flow not in record.scenario.network.flows:
+        return None
+    outcomes, (sent, received) = packet_outcomes(record, flow), _SENT_RECEIVED[flow]
+    return FlowPart(
+        sent=record.count(sent),
+        lost=int(outcomes.lost.sum()),
+        longest_loss_burst=outcomes.longest_loss_burst(),
+        received=record.count(received),
+    )
 
 
 def unintended_losses(record: RunRecord) -> dict[str, int]:
@@ -362,6 +361,18 @@ def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     return np.asarray(finite & in_common(scenario, joined))
 
 
+class Signals(TypedDict):
+    """The fields of a loop's summary about its signals."""
+
+    initial_state_norm: float | None
+    final_state_norm: float | None
+    sup_e_s_norm: float | None
+    sup_e_c_norm: float | None
+    sup_e_c_at_s: float | None
+    identity_residual_max: float | None
+    identity_residual_relative: float | None
+
+
 class SignalStatistics:
     """Reads the signals of a run once, aligned."""
 
@@ -408,7 +419,7 @@ class SignalStatistics:
         self._errors.add(errors)
         self._late_errors.add(errors[max(self._half - self._read, 0) :])
 
-    def for_summary(self) -> dict[str, Any]:
+    def for_summary(self) -> Signals:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last = None, None
         for steps in self._record.source.batches(PLANT_STEP, ("x",)):

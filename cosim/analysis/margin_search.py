@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -147,7 +147,7 @@ class MarginResult:
         found = self.without_guarantee
         return f"without the guarantee: {found if isinstance(found, str) else found.text}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all fields and the verdicts for JSON."""
         period = None
         if self.period is not None:
@@ -163,7 +163,7 @@ class MarginResult:
         }
 
 
-def _document(found: Stability) -> dict[str, Any]:
+def _document(found: Stability) -> dict[str, object]:
     return found._asdict() | {"pattern": found.text, "verdict": found.verdict}
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,7 @@ from noack.protocol.record_tables import (
     effective,
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
@@ -107,6 +108,9 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
         mode=scenario.mode,
         reached_s=_seconds(record.last_ns(PLANT_STEP)) or 0.0,
         **_transmissions(record),
+        link_share=None,  # of the network's bytes, which the record of the loop does not have
+        acknowledgements=from_controller(record, Flow.ACKNOWLEDGEMENT),
+        actuations=from_controller(record, Flow.ACTUATION),
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
         assumptions=[AssumptionPart(**one._asdict()) for one in assumptions(scenario)],
@@ -134,13 +138,31 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
     )
 
 
-def _transmissions(record: RunRecord) -> dict[str, Any]:
+class _Transmissions(TypedDict):
+    """The fields of a loop's summary about its updates."""
+
+    events: int
+    deliveries: int
+    drops: int
+    loss_expected: float | None
+    drops_by_cause: dict[str, int]
+    forced_deliveries: int
+    longest_loss_burst: int
+    delay_mean_s: float | None
+    delay_max_s: float | None
+    loss_bursts: dict[str, int]
+    inter_event_min_s: float | None
+    inter_event_median_s: float | None
+    inter_delivery_median_s: float | None
+
+
+def _transmissions(record: RunRecord) -> _Transmissions:
     """Counts and intervals of transmissions."""
     scenario, events, outcomes = record.scenario, record.events(), packet_outcomes(record)
     deliveries = record.columns(CONTROLLER_DELIVERY, "t_ns", "dropouts")
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     longest = int(deliveries["dropouts"].max(initial=0))
-    bursts = outcomes.loss_bursts().tolist()
+    bursts, delays_s = outcomes.loss_bursts().tolist(), _delays_s(record)
     return {
         "events": len(events),
         "deliveries": len(deliveries),
@@ -149,27 +171,22 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.fate == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
-        **_delays(record),
+        "delay_mean_s": _or_none(np.mean, delays_s),
+        "delay_max_s": _or_none(np.max, delays_s),
         "loss_bursts": {str(n): count for n, count in sorted(Counter(bursts).items())},
-        **from_controller(record),
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),
     }
 
 
-def _delays(record: RunRecord) -> dict[str, Any]:
+def _delays_s(record: RunRecord) -> Vector:
     """The times of the effectively delivered updates in the network."""
     packets = record.columns(
         NETEM_PACKET, "now_ns", "release_ns", "flow", "fate",
         where=lambda rows: (rows["flow"] == UPDATES) & effective(rows["fate"]),
     )  # fmt: skip
-    delays_s = (packets["release_ns"] - packets["now_ns"]) / NS_PER_S
-    return {
-        "link_share": None,  # of the network's bytes, which the record of the loop does not have
-        "delay_mean_s": _or_none(np.mean, delays_s),
-        "delay_max_s": _or_none(np.max, delays_s),
-    }
+    return np.asarray((packets["release_ns"] - packets["now_ns"]) / NS_PER_S)
 
 
 def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
@@ -260,7 +277,9 @@ def _seconds(t_ns: int | None) -> float | None:
     return None if t_ns is None else float(t_ns) * 1e-9
 
 
-def _or_none(statistic: Callable[..., Any], values: NDArray[np.float64]) -> float | None:
+def _or_none(
+    statistic: Callable[[NDArray[np.float64]], SupportsFloat], values: NDArray[np.float64]
+) -> float | None:
     return float(statistic(values)) if len(values) else None
 
 

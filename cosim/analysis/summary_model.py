@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -18,7 +18,7 @@ from pydantic import (
 from noack.core.errors import ExitStatus
 
 
-def _or_none(value: Any) -> Any:
+def _or_none(value: object) -> object:
     """Return None for infinity and NaN, which JSON does not have."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -263,7 +263,7 @@ class ChangePart(SummaryPart):
 
     number: Count
     t_s: float
-    settings: dict[str, Any]
+    settings: dict[str, object]
     what: str
     in_force_from_s: dict[Text, float]
 
@@ -351,7 +351,7 @@ class LoopSummary(SummaryPart):
             raise ValueError("a live run has a latency")
         return self
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """The summary as JSON."""
         return self.model_dump(mode="json")
 
@@ -440,12 +440,12 @@ class RunSummary(SummaryPart):
                 )
         raise KeyError(name)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """The content of ``summary.json``."""
         return self.model_dump(mode="json")
 
 
-def read_summary(content: Mapping[str, Any]) -> RunSummary | None:
+def read_summary(content: Mapping[str, object]) -> RunSummary | None:
     """Return a summary from its JSON; None if it is not complete, or of another version."""
     try:
         return RunSummary.model_validate(content)

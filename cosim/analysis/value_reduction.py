@@ -6,7 +6,7 @@ largest value stay exact. :func:`decimate` omits points of a curve without chang
 """
 
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class QuantileSketch:
         ranks = self.count - np.array(shares) * (self.count - 1)
         return list(self.largest(ranks).tolist())
 
-    def largest(self, ranks: NDArray[Any]) -> NDArray[np.float64]:
+    def largest(self, ranks: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the values of some ranks, (k,); that of rank 1 is the largest one."""
         if self._values is not None:
             values = np.sort(np.concatenate([np.zeros(0), *self._values]))

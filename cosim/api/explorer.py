@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cosim.api.scenarios import Source, load, plain
 from cosim.lazy_modules import lazy_modules
@@ -85,7 +85,7 @@ class Explorer:
         _ = self.certificate
         return self._results.warning
 
-    def set(self, settings: Mapping[str, Any]) -> None:
+    def set(self, settings: Mapping[str, object]) -> None:
         """Change settings; if one is wrong, all stay as they are.
 
         Args:
@@ -165,7 +165,7 @@ class Explorer:
             print(f"{self!r}\n{error}")
 
 
-def explore(source: Source, settings: Mapping[str, Any] | None = None) -> Explorer:
+def explore(source: Source, settings: Mapping[str, object] | None = None) -> Explorer:
     """Explore a loop: change settings and see what follows, as on the page of ``noack lab``.
 
     At the end of a notebook's cell the explorer shows sliders beside the figure, which follows

@@ -7,8 +7,7 @@ changed for a moment. The margin takes seconds in the kernel's own thread, so a 
 import asyncio
 import html
 import io
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import ipywidgets as widgets
 
@@ -41,7 +40,7 @@ class ExplorerWidget:
         self._results = results
         self._quiet = False
         self._shape: tuple[object, ...] = ()
-        self._inputs: dict[str, Any] = {}
+        self._inputs: dict[str, widgets.Widget] = {}
         self._known: dict[str, Slider] = {}
         self._later: asyncio.Handle | None = None
         names = results.run.state_names
@@ -140,7 +139,7 @@ class ExplorerWidget:
         )
         return widgets.VBox([widgets.Label(choice.label), made], layout=_WIDE)
 
-    def _slider(self, slider: Slider) -> Any:
+    def _slider(self, slider: Slider) -> widgets.Widget:
         low, high = slider.ends
         if slider.logarithmic:
             made = widgets.FloatLogSlider(
@@ -155,7 +154,7 @@ class ExplorerWidget:
         made.layout = _WIDE
         key = slider.key
 
-        def moved(change: dict[str, Any]) -> None:
+        def moved(change: Mapping[str, float]) -> None:
             now = self._known[key]
             value = now.value_at(now.place(change["new"]))
             if value != now.value:

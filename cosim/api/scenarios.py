@@ -4,20 +4,21 @@ import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.scenario import toml_file
 from noack.scenario.matrix_files import matrices_of, model_of
-from noack.scenario.runtime_parameters import full_key
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed, put
+from noack.scenario.scenario_file import completed, put, remove
+from noack.settings.section import ReadTable, Table
 
-Source = Scenario | str | PathLike[str] | Mapping[str, Any]
+Source = Scenario | str | PathLike[str] | ReadTable
 """A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""
 
 _BETA_SHARE = 0.1
@@ -27,7 +28,7 @@ _MANSD = 4
 _LOSS_PROBABILITY = 0.5
 
 
-def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
+def load(source: Source, settings: ReadTable | None = None) -> Scenario:
     """Load a scenario.
 
     >>> import noack
@@ -47,12 +48,12 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
     if isinstance(source, Scenario):
         return with_settings(source, settings) if settings else source
     if isinstance(source, Mapping):
-        return _completed(plain(source), settings, Path("scenario"))
+        return _completed(plain_table(source), settings, Path("scenario"))
     path = find_shipped(str(source), "scenarios")
     return _completed(toml_file.read(path, Scenario), settings, path)
 
 
-def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
+def with_settings(scenario: Scenario, settings: ReadTable) -> Scenario:
     """Return the scenario with other settings; the given scenario is not changed.
 
     >>> import noack
@@ -75,12 +76,12 @@ def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
 
 
 def from_system(
-    system: Any,
-    gain: Any,
+    system: object,
+    gain: ArrayLike,
     initial_state: Sequence[float],
     *,
-    plant: Any = None,
-    settings: Mapping[str, Any] | None = None,
+    plant: object = None,
+    settings: ReadTable | None = None,
     name: str = "own_system",
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
@@ -112,14 +113,17 @@ def from_system(
     decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
     alpha_per_s = _rounded(_ALPHA_SHARE * decay_per_s)
     start = plain(initial_state)
-    norm = (
-        float(np.linalg.norm(start)) if _is_vector(start) else 0.0
-    )  # the validation reports the mistake
-    content: dict[str, Any] = {
+    # If it is no vector, the validation reports the mistake.
+    norm = float(np.linalg.norm(start)) if _is_vector(start) else 0.0
+    true_plant: Table = {"initial_state": start}
+    if plant is not None:
+        true = matrices_of(plant)
+        true_plant |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
+    content: Table = {
         "name": name,
         "horizon_s": _rounded(math.log(1 / _SETTLED) / alpha_per_s),
         "model": model.model_dump(mode="json", exclude_none=True),
-        "plant": {"initial_state": start},
+        "plant": true_plant,
         "trigger": {
             "policy": "decaying",
             "beta": _rounded(_BETA_SHARE * norm or _BETA_SHARE),
@@ -130,13 +134,10 @@ def from_system(
             "loss": {"model": "bernoulli", "probability": _LOSS_PROBABILITY},
         },
     }
-    if plant is not None:
-        true = matrices_of(plant)
-        content["plant"] |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
     return _completed(content, settings, Path("from_system"))
 
 
-def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path: Path) -> Scenario:
+def _completed(content: Table, settings: ReadTable | None, path: Path) -> Scenario:
     """Apply settings, validate, and read the named files, relative to ``path``."""
     if not isinstance(settings, Mapping | None):
         raise CallerError(
@@ -149,28 +150,21 @@ def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path
                 f'settings: {key!r} is not a key; a key is a text such as "trigger.beta"'
             )
         if value is None:
-            _take_away(content, key)
+            remove(content, key)
         else:
             put(content, key, plain(value), f"settings: {key}")
     return completed(content, path)
 
 
-def _take_away(content: dict[str, Any], key: str) -> None:
-    table: Any = content
-    *path, last = full_key(key).split(".")
-    for part in path:
-        if isinstance(table, list) and part.isdecimal():
-            table = table[int(part)] if int(part) < len(table) else None
-        else:
-            table = table.get(part) if isinstance(table, dict) else None
-    if isinstance(table, dict):
-        table.pop(last, None)
+def plain_table(table: ReadTable) -> Table:
+    """Return a table as from a TOML parser: NumPy arrays and numbers become lists and numbers."""
+    return {str(key): plain(entry) for key, entry in table.items()}
 
 
-def plain(value: Any) -> Any:
-    """Return a value as from a TOML parser: NumPy arrays and numbers become lists and numbers."""
+def plain(value: object) -> object:
+    """Return a value as from a TOML parser, as :func:`plain_table` does."""
     if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
+        return plain_table(value)
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     if isinstance(value, np.ndarray | np.generic):
@@ -178,7 +172,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _is_vector(value: Any) -> bool:
+def _is_vector(value: object) -> TypeGuard[list[float]]:
     return isinstance(value, list) and all(isinstance(entry, int | float) for entry in value)
 
 

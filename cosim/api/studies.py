@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from cosim.analysis.certificates import Certificates, certificates_of
 from cosim.analysis.margin_search import MOST_M, MarginResult, find_margin
@@ -166,7 +166,7 @@ class CampaignResult:
         return self._finished.store.folder
 
     @property
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """The results: ``summary.json``; ``docs/campaigns.md`` documents its keys."""
         return self._finished.summary.document()
 
@@ -262,7 +262,7 @@ class CampaignResult:
 
 
 def campaign(
-    source: str | PathLike[str] | Mapping[str, Any],
+    source: str | PathLike[str] | Mapping[str, object],
     *,
     draws: int | None = None,
     folder: str | PathLike[str] | None = None,
@@ -325,7 +325,7 @@ def _runs_bar() -> "AbstractContextManager[Callable[[int, int], None]]":
     return progress_display.runs_bar(progress_display.PipeSafeConsole(file=sys.stderr))
 
 
-def _table(rows: list[dict[str, Any]]) -> "pa.Table":
+def _table(rows: list[dict[str, object]]) -> "pa.Table":
     # importing pyarrow takes 0.1 s
     import pyarrow as pa
 

@@ -6,7 +6,7 @@ import math
 import pkgutil
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
@@ -29,7 +29,7 @@ from typing import (
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperGroup
+from typer.core import TyperGroup, TyperOption
 
 from cosim.cli import commands, completion
 from cosim.lazy_modules import lazy_modules
@@ -50,8 +50,11 @@ with lazy_modules():
     from noack.scenario import scenario_file
 
 if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
     from rich.console import Console
     from rich.status import Status
+    from typer._click.core import Command, Context, Parameter
+    from typer._click.formatting import HelpFormatter
 
     from noack.scenario.scenario import Scenario
 
@@ -64,7 +67,7 @@ class Program(TyperGroup):
 
     _words: Sequence[str] = ()
 
-    def get_params(self, ctx: Any) -> list[Any]:
+    def get_params(self, ctx: "Context") -> list["Parameter"]:
         """Return the options before the command; the help hides those of shell completion.
 
         If the command comes first, none is needed: for their values typer would import pydantic,
@@ -72,23 +75,26 @@ class Program(TyperGroup):
         """
         if self._words and not self._words[0].startswith("-"):
             return []
-        found: list[Any] = super().get_params(ctx)
+        found = super().get_params(ctx)
         for parameter in found:
-            parameter.hidden = parameter.hidden or parameter.name in _COMPLETION
+            if isinstance(parameter, TyperOption) and parameter.name in _COMPLETION:
+                parameter.hidden = True
         return found
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
+    def format_commands(self, ctx: "Context", formatter: "HelpFormatter") -> None:
         """Write the commands, a section for each panel."""
-        commands: Mapping[str, Any] = self.commands
-        for panel, some in groupby(commands.values(), lambda command: command.rich_help_panel):
+        by_panel = groupby(
+            self.commands.values(), lambda command: getattr(command, "rich_help_panel", "")
+        )
+        for panel, some in by_panel:
             with formatter.section(panel):
                 formatter.write_dl(
-                    [(command.name, command.get_short_help_str(200)) for command in some]
+                    [(command.name or "", command.get_short_help_str(200)) for command in some]
                 )
 
     def main(
         self,
-        args: Any = None,
+        args: Sequence[str] | None = None,
         prog_name: str | None = None,
         complete_var: str | None = None,
         standalone_mode: bool = True,
@@ -131,7 +137,7 @@ class Program(TyperGroup):
         return f"{where}{message}; see `{command} --help`"
 
 
-def examples_of(command: Any) -> list[str]:
+def examples_of(command: "Command") -> list[str]:
     """Return the commands of the examples at the end of a help page."""
     lines = (command.epilog or "").splitlines()
     commands = (line.strip().partition("   ")[0] for line in lines)
@@ -164,7 +170,7 @@ class _PipeSafeFile(io.FileIO):
 
     _full = False
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: "ReadableBuffer", /) -> int:
         try:
             return super().write(data)
         except OSError as error:

@@ -5,9 +5,9 @@ All processes of a run wait for the slowest one: what the start does not need is
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Option
@@ -187,8 +187,12 @@ def finalize_run(ending: "run_directory.RunEnding", options: OutputOptions) -> i
     return outcome.status
 
 
-def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[Any], Any]:
-    """Return a function that starts the workers; its argument is a function that prints a line."""
+StartWorkers = Callable[[Callable[[str], None]], AbstractContextManager["campaign_workers.Runner"]]
+"""Starts workers, given a function that prints a line."""
+
+
+def worker_pool(workers: int | None, scheduler: str | None = None) -> StartWorkers:
+    """Return a function that starts the workers."""
     if scheduler is not None:
         if workers is not None:
             raise CallerError("--workers: with --scheduler the cluster's workers are used")
@@ -200,7 +204,7 @@ def worker_pool(workers: int | None, scheduler: str | None = None) -> Callable[[
 
 
 def execute_campaign(
-    plan: "campaign_file.Campaign", path: Path, start: Callable[[Any], Any], *,
+    plan: "campaign_file.Campaign", path: Path, start: StartWorkers, *,
     folder: Path, draws: int | None = None, figure_files: "FigureFiles | None" = None,
 ) -> "campaign_report.FinishedCampaign":  # fmt: skip
     """Run or continue a campaign; write its page.

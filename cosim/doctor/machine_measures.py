@@ -17,7 +17,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypedDict, TypeVar
 
 import numpy as np
 import zenoh
@@ -224,6 +224,14 @@ def _probe(*arguments: object) -> list[str]:
     return python_command("-m", "cosim.doctor.probe", *arguments)
 
 
+class _WakeUps(TypedDict):
+    """What the probe prints: lateness in ns, and whether each setting was applied."""
+
+    plain: list[int]
+    realtime: list[int]
+    granted: dict[str, str]
+
+
 def _wake_ups(
     wanted: RunRequirements, duration_s: float
 ) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
@@ -236,8 +244,10 @@ def _wake_ups(
     except (OSError, subprocess.SubprocessError) as error:
         reason = one_line(error)
         return reason, reason, {}
-    found: dict[str, Any] = json.loads(done.stdout)
-    plain, realtime = (lateness(found[name], wanted.allowance_ns) for name in ("plain", "realtime"))
+    found: _WakeUps = json.loads(done.stdout)
+    plain, realtime = (
+        lateness(late_ns, wanted.allowance_ns) for late_ns in (found["plain"], found["realtime"])
+    )
     return plain, realtime, found["granted"]
 
 

@@ -27,6 +27,7 @@ from noack.scenario.runtime_parameters import trigger_parameters
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import value_of
 from noack.scenario.sections import POLICIES
+from noack.settings.section import Table
 
 _STEPS = 200
 _DECADE = 10.0
@@ -197,7 +198,7 @@ def _base_of(draft: Draft) -> Draft:
     return Draft(draft.base, draft.folder, draft.base_text, draft.base_text)
 
 
-def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
+def example_of(draft: Draft, key: str, kind: str) -> Table | None:
     """Return an example of a table of a kind; None if there is none.
 
     Raises:
@@ -206,8 +207,8 @@ def example_of(draft: Draft, key: str, kind: str) -> dict[str, Any] | None:
     if key == "network.loss" and kind in _LOSSES:
         return {"model": kind, **_LOSSES[kind]}
     if key == "trigger" and kind in POLICIES:
-        example: Any = POLICIES[kind].example(draft.scenario.model.dimensions[0])
-        return None if example is None else dict(example.model_dump(mode="json", exclude_none=True))
+        example = POLICIES[kind].example(draft.scenario.model.dimensions[0])
+        return None if example is None else example.content()
     return None
 
 
@@ -364,7 +365,7 @@ class Field:
             return ""
         return value if isinstance(value, str) else value_text(value)
 
-    def value(self, text: str) -> Any:
+    def value(self, text: str) -> object:
         """Return the value of a text; what is no TOML stays text, so that validation names it."""
         if self.kind is FieldKind.TEXT:
             return text
@@ -425,8 +426,10 @@ def filled(draft: Draft, field: Field, text: str) -> Draft:
     group = next(one for one in form_of(changed).all_groups() if one.key == field.selects)
     keys = (*(one.key for one in group.fields), *(one.key for one in group.groups))
     known = {key.rpartition(".")[2] for key in keys}
-    table = {key: value for key, value in changed.value(group.key).items() if key in known}
-    return changed.with_value(group.key, table)
+    table = changed.value(group.key)
+    assert isinstance(table, dict)
+    kept = {key: value for key, value in table.items() if key in known}
+    return changed.with_value(group.key, kept)
 
 
 def by_field(form: Group, mistakes: list[Mistake]) -> dict[str, str]:
@@ -467,8 +470,7 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
     content = content if isinstance(content, Mapping) else {}
     default = default if isinstance(default, Mapping) else {}
     fields, groups = [], []
-    kinds = {} if "oneOf" not in schema else _kinds(schema)
-    name = kinds.pop("", "")
+    name, kinds = _kinds(schema)
     if kinds:
         optional = [kind for kind, one in kinds.items() if name not in one.get("required", ())]
         usual = default.get(name, optional[0] if len(optional) == 1 else None)
@@ -489,16 +491,17 @@ def _group(key: str, schema: Schema, help_: str, content: object, default: objec
     return Group(key, help_, tuple(fields), tuple(groups))
 
 
-def _kinds(schema: Schema) -> dict[str, Any]:
-    """Return the schema of each kind; the empty name has the key that chooses the kind."""
-    found: dict[str, Any] = {}
-    for reference in schema["oneOf"]:
+def _kinds(schema: Schema) -> tuple[str, dict[str, Schema]]:
+    """Return the key that chooses the kind, and the schema of each kind; none: there are none."""
+    found: dict[str, Schema] = {}
+    name = ""
+    for reference in schema.get("oneOf", ()):
         one = _resolved(reference)
         name, described = next(
             (name, part) for name, part in one["properties"].items() if "const" in part
         )
-        found |= {"": name, described["const"]: one}
-    return found
+        found[described["const"]] = one
+    return name, found
 
 
 def _field(key: str, label: str, schema: Schema, help_: str, default: object) -> Field:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
 import tomlkit
@@ -22,7 +22,8 @@ from noack.core.errors import CallerError, NoackError
 from noack.core.file_access import read_regular
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import completed, put, toml_text, value_of
+from noack.scenario.scenario_file import completed, put, remove, toml_text, value_of
+from noack.settings.section import ReadTable, Table
 from noack.settings.user_files import PLACES
 
 _SOURCE = "scenario"
@@ -65,7 +66,7 @@ class Draft:
     text: str
 
     @cached_property
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Table:
         """The parsed text; raise DraftError if it is not TOML."""
         try:
             return toml_file.parsed(self.text, _SOURCE)
@@ -82,7 +83,7 @@ class Draft:
         except NoackError as error:
             raise DraftError(str(error)) from None
 
-    def value(self, key: str) -> Any:
+    def value(self, key: str) -> object:
         """Return the value of a key in the text; None if it is not given."""
         found = leaf(self.content, key)
         return None if found is _ABSENT else found
@@ -95,10 +96,9 @@ class Draft:
         """Return the draft without a key, which then has its default."""
         if leaf(self.content, key) is _ABSENT:
             return self
-        path, _, last = key.rpartition(".")
-        return self._changed(lambda content: leaf(content, path).pop(last))
+        return self._changed(lambda content: remove(content, key))
 
-    def _changed(self, change: Callable[[dict[str, Any]], object]) -> "Draft":
+    def _changed(self, change: Callable[[Table], object]) -> "Draft":
         content = copy.deepcopy(self.content)
         change(content)
         made = replace(self, text=changed_text(self.text, content, change))
@@ -119,9 +119,9 @@ class Draft:
         return urlencode([(_BASE, self.base), *differences(base, self.content)])
 
 
-def leaf(content: Mapping[str, Any], key: str) -> Any:
+def leaf(content: ReadTable, key: str) -> object:
     """Return the value of a key, or a mark for its absence; an empty key is the whole content."""
-    table: Any = content
+    table: object = content
     for part in key.split(".") if key else ():
         if not isinstance(table, Mapping) or part not in table:
             return _ABSENT
@@ -195,7 +195,7 @@ def draft_of_query(query: str, default: str, known: Mapping[str, str]) -> Draft:
     return draft
 
 
-def _code(content: Mapping[str, Any]) -> list[Any]:
+def _code(content: ReadTable) -> list[object]:
     """Return the tables that name code."""
     tables = [leaf(content, place) for place in PLACES]
     return [
@@ -219,9 +219,7 @@ def known_scenarios(folder: Path, given: str) -> dict[str, str]:
     return known | {given: given}
 
 
-def changed_text(
-    text: str, wanted: Mapping[str, Any], change: Callable[[dict[str, Any]], object]
-) -> str:
+def changed_text(text: str, wanted: ReadTable, change: Callable[[Table], object]) -> str:
     """Return a changed TOML text with its comments; without them if they cannot be kept.
 
     Args:

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import LoopSummary
 from cosim.analysis.value_reduction import decimate_all
 from cosim.record.align import align_tables
 from cosim.simulation.continuous import (
     ContinuousRun,
+    ContinuousSummary,
     LoopState,
     TooManyEventsError,
     run_continuous,
@@ -151,7 +153,7 @@ def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     facts = summary(run, resolved)
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, facts["diverged_at_s"],
+        threshold_at(resolved, t_s), run.event_s, run.delivered, facts.diverged_at_s,
         key_numbers(facts, cut), cut,
     )  # fmt: skip
 
@@ -170,33 +172,25 @@ def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
     return np.maximum(decaying, trigger.floor)
 
 
-def key_numbers(facts: dict[str, object], cut: str = "") -> Numbers:
-    """Return the key numbers of a summary, which has the keys of a loop in ``summary.json``.
+def key_numbers(facts: ContinuousSummary | LoopSummary, cut: str = "") -> Numbers:
+    """Return the key numbers of a summary; for ``cut`` see :class:`Exploration`."""
 
-    Args:
-        facts: the summary.
-        cut: see :class:`Exploration`.
-    """
+    def text(value: float | None, unit: str = "") -> str:
+        return "–" if value is None else number(float(value), 4) + unit
 
-    def text(key: str, unit: str = "") -> str:
-        value = facts.get(key)
-        return "–" if value is None else number(float(str(value)), 4) + unit
-
-    events, lost = int(str(facts["events"])), int(str(facts["drops"]))
-    share = f" ({100 * lost / events:.0f} %)" if events else ""
-    diverged = facts.get("diverged_at_s")
+    share = f" ({100 * facts.drops / facts.events:.0f} %)" if facts.events else ""
     ended = cut or "reached the horizon"
-    if diverged is not None:
-        ended = f"diverged at {text('diverged_at_s')} s"
+    if facts.diverged_at_s is not None:
+        ended = f"diverged at {text(facts.diverged_at_s)} s"
     return (
         ("run", ended),
-        ("transmissions", text("events")),
-        ("delivered", text("deliveries")),
-        ("lost", text("drops") + share),
-        ("longest loss burst", text("longest_loss_burst")),
-        ("shortest inter-event time", text("inter_event_min_s", " s")),
-        ("‖x‖ at the start", text("initial_state_norm")),
-        ("‖x‖ at the end", text("final_state_norm")),
+        ("transmissions", text(facts.events)),
+        ("delivered", text(facts.deliveries)),
+        ("lost", text(facts.drops) + share),
+        ("longest loss burst", text(facts.longest_loss_burst)),
+        ("shortest inter-event time", text(facts.inter_event_min_s, " s")),
+        ("‖x‖ at the start", text(facts.initial_state_norm)),
+        ("‖x‖ at the end", text(facts.final_state_norm)),
     )
 
 
@@ -235,5 +229,5 @@ def simulate_sampled(scenario: Scenario) -> Exploration:
         resolved, SAMPLED, t_s[kept], x, x_s, x_c, e_s_norm, e_c_norm,
         threshold_at(resolved, t_s[kept]), np.asarray(sent["t_ns"] / NS_PER_S),
         np.isin(sent["event"], record[CONTROLLER_DELIVERY]["sequence"]), loop.diverged_at_s,
-        key_numbers(loop.to_json()),
+        key_numbers(loop),
     )  # fmt: skip

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -302,7 +302,7 @@ class Step(NamedTuple):
     title: str
     text: str
     scenario: str
-    settings: dict[str, Any]
+    settings: dict[str, object]
     drag: str
 
 

@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar, TypeVarTuple
 
 from cosim.interactive.draft import Draft, DraftError, Mistake, known_scenarios
 from cosim.interactive.ensemble import explore_ensemble
@@ -34,6 +34,7 @@ from noack.core.errors import NoackError
 from noack.scenario.scenario import Scenario
 
 T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 
 ANSWER_S = 60.0
 """So long a browser may take to answer: without a graphics card it may draw for seconds."""
@@ -66,7 +67,7 @@ class LabServices:
         """Scenarios that the page offers, and what opens them."""
         return known_scenarios(self.folder, self.scenario)
 
-    async def compute(self, function: Callable[..., T], *arguments: Any) -> T:
+    async def compute(self, function: Callable[[*Ts], T], *arguments: *Ts) -> T:
         """Call a function in the worker process, after the calls that were made before.
 
         A cancelled call is not begun, or given up after a moment.
@@ -79,7 +80,7 @@ class LabServices:
             self._replace_worker()
             return await self._call(function, *arguments)
 
-    async def _call(self, function: Callable[..., T], *arguments: Any) -> T:
+    async def _call(self, function: Callable[[*Ts], T], *arguments: *Ts) -> T:
         loop = asyncio.get_running_loop()
         await self._turn.acquire()
         call: asyncio.Future[T] = loop.run_in_executor(self._pool, function, *arguments)
@@ -91,12 +92,12 @@ class LabServices:
             loop.call_later(_GIVE_UP_S, self._give_up, call)
             raise
 
-    def _end_turn(self, call: asyncio.Future[Any]) -> None:
+    def _end_turn(self, call: asyncio.Future[T]) -> None:
         self._turn.release()
         if not call.cancelled():
             call.exception()  # perhaps nobody waits for it any more
 
-    def _give_up(self, call: asyncio.Future[Any]) -> None:
+    def _give_up(self, call: asyncio.Future[T]) -> None:
         if not call.done():
             self._replace_worker()
 
@@ -131,9 +132,9 @@ class PageCalls:
 
     def __init__(self, services: LabServices) -> None:
         self._services = services
-        self._calls: set[asyncio.Task[Any]] = set()
+        self._calls: set[asyncio.Task[object]] = set()
 
-    async def compute(self, function: Callable[..., T], *arguments: Any) -> T:
+    async def compute(self, function: Callable[[*Ts], T], *arguments: *Ts) -> T:
         """Call a function in the worker process.
 
         Raises: what the function raises; CancelledError if the page is closed.

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
 
 from nicegui import ui
 
@@ -152,7 +151,8 @@ class LivePanel:
             self._log.push(line)
         self._lines = live.first_line + len(live.lines)
         self._text.set_text(_words(live))
-        self._bar.set_value(min(live.progress.get("t_s", 0.0) / live.horizon_s, 1.0))
+        reached_s = live.progress.t_s if live.progress else 0.0
+        self._bar.set_value(min(reached_s / live.horizon_s, 1.0))
         for button, enabled in (
             (self._start, live.is_over),
             (self._stop, not live.is_over),
@@ -204,14 +204,13 @@ class LivePanel:
 
 
 def _words(live: LiveRun) -> str:
-    progress: dict[str, Any] = live.progress
-    if not progress:
+    if (progress := live.progress) is None:
         return live.state
     found = (
-        f"{live.state}: {progress['t_s']:.1f} of {live.horizon_s:g} s, "
-        f"{progress['events']} transmissions, {progress['deliveries']} received, longest loss "
-        f"burst {progress['longest_loss_burst']}"
+        f"{live.state}: {progress.t_s:.1f} of {live.horizon_s:g} s, "
+        f"{progress.events} transmissions, {progress.deliveries} received, longest loss "
+        f"burst {progress.longest_loss_burst}"
     )
-    if progress.get("x_norm") is not None:
-        found += f", ‖x‖ {progress['x_norm']:.3g}"
+    if progress.x_norm is not None:
+        found += f", ‖x‖ {progress.x_norm:.3g}"
     return found

@@ -14,7 +14,6 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from cosim.interactive.draft import Draft
 from cosim.live.launcher import launch
@@ -22,6 +21,7 @@ from cosim.live.run_watcher import Watcher
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.control_messages import RunProgress, parse_message
 
 _ADDRESS = re.compile(r"http://\S+")
 MOST_LINES = 200
@@ -41,7 +41,7 @@ class LiveRun:
     run_dir: Path | None = None
     viewer: str | None = None
     """Address of the rerun viewer."""
-    progress: dict[str, Any] = field(default_factory=dict)
+    progress: RunProgress | None = None
     lines: list[str] = field(default_factory=list)
     """What happened, the newest line last."""
     first_line: int = 0
@@ -129,7 +129,7 @@ class LiveRun:
                 self.state, self.run_dir = "running", Path(said["run_dir"])
                 self._add("all processes run")
             case "progress":
-                self._progress(said)
+                self._progress(parse_message(RunProgress, line))
             case "failed":
                 self._add(f"{said['why']} at {said['t_s']:.1f} s; it is restarted")
             case "restarted":
@@ -146,12 +146,13 @@ class LiveRun:
                 self.state, self.ok = "failed", False
                 self._add(said.get("text", line))
 
-    def _progress(self, report: dict[str, Any]) -> None:
-        for name, words in (("warnings", "{}"), ("changes", "changed: {}")):
-            known = len(self.progress.get(name, []))
-            for text in report.get(name, [])[known:]:
-                self._add(words.format(text))
-        if self.viewer is None and (found := _ADDRESS.search(report.get("live") or "")):
+    def _progress(self, report: RunProgress) -> None:
+        before = self.progress
+        for text in report.warnings[len(before.warnings) if before else 0 :]:
+            self._add(text)
+        for text in report.changes[len(before.changes) if before else 0 :]:
+            self._add(f"changed: {text}")
+        if self.viewer is None and (found := _ADDRESS.search(report.live or "")):
             self.viewer = found[0]
         self.progress = report
 
@@ -212,7 +213,7 @@ def main() -> int:
     return outcome.status
 
 
-def _say(what: str, **fields: Any) -> None:
+def _say(what: str, **fields: object) -> None:
     with suppress(BrokenPipeError):  # the page has ended; the run is recorded all the same
         print(json.dumps({"what": what, **fields}), flush=True)
 

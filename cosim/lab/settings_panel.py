@@ -4,7 +4,6 @@ Groups of the form are built when they are opened; mistakes are shown at their f
 """
 
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 from nicegui import ui
 from nicegui.elements.mixins.value_element import ValueElement
@@ -36,7 +35,9 @@ class FastSlider(ValueElement[float]):
 
     LOOPBACK = False  # a late answer of the server would move it back
 
-    def __init__(self, slider: Slider, on_change: Callable[[Any], Any]) -> None:
+    def __init__(
+        self, slider: Slider, on_change: Callable[[ValueChangeEventArguments[float]], object]
+    ) -> None:
         low, high = slider.ends
         super().__init__(
             tag="q-slider", value=slider.position, on_value_change=on_change, throttle=1 / 60

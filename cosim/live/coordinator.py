@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 import zenoh
-from pydantic import JsonValue
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.core.clock import NS_PER_S, RunClock
@@ -44,6 +43,7 @@ from noack.scenario.parameter_changes import (
 )
 from noack.scenario.scenario import loop_scenario, loop_sections
 from noack.scenario.scenario_tables import MOST_CHANGES
+from noack.settings.section import Table
 
 _RESTART_DELAY_S = 0.3
 """Wall time from the admission of a restarted process to its first deadline."""
@@ -388,9 +388,9 @@ class ChangeRequests:
     def __init__(self, ticket: Ticket, plane: ControlPlane) -> None:
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
         self._plane = plane
-        self._schedule = ChangeSchedule(ticket.scenario)
+        self._schedule = ChangeSchedule[None](ticket.scenario)
         self._entries = {
-            section.name: ChangeSchedule(loop_scenario(ticket.scenario, section))
+            section.name: ChangeSchedule[None](loop_scenario(ticket.scenario, section))
             for section in loop_sections(ticket.scenario)
         }
         """The changes of the loops of each entry of [[loops]], by its name."""
@@ -438,10 +438,10 @@ class ChangeRequests:
         )
 
     @property
-    def _schedules(self) -> tuple[ChangeSchedule, ...]:
+    def _schedules(self) -> tuple[ChangeSchedule[None], ...]:
         return (self._schedule, *self._entries.values())
 
-    def _parameters(self) -> dict[str, dict[str, JsonValue]]:
+    def _parameters(self) -> dict[str, Table]:
         return {name: current_parameters(schedule.last) for name, schedule in self._entries.items()}
 
     def _add(

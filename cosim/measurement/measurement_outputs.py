@@ -7,7 +7,7 @@ delays, correlation and (m, K)) and the page with both are at the end.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -72,7 +72,9 @@ class OutputRequest:
             require_suffix(self.network, "--write", ".toml")
 
 
-def report(found: Measurement, request: OutputRequest, console: Console | None) -> dict[str, Any]:
+def report(
+    found: Measurement, request: OutputRequest, console: Console | None
+) -> dict[str, object]:
     """Write what is requested, print the tables, and return the document of ``--json``.
 
     Raises:
@@ -116,6 +118,7 @@ def write_network(found: Measurement, path: Path, form: Form) -> list[Path]:
     text = _comment(found, form) + toml_text({"network": {**cap, **section}})
     source = f"--write {path}"
     content = toml_file.parsed(text, source)["network"]
+    assert isinstance(content, dict)
     loaded = toml_file.validated(NetworkSection, content, source)
     read_files(loaded.link, path.parent, source)
     write_whole(path, text)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from functools import reduce
 from operator import and_
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -43,6 +43,9 @@ from noack.traces.packet_trace import (
     packet_trace,
 )
 from noack.traces.trace_formats import read_trace
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 _HEAD_BYTES = 64
 _OTHERS = ("fate files", "run directories", "delivery opportunities")
@@ -72,7 +75,9 @@ FILE_OPTIONS = {
 """Options of the command line, by field of :class:`SourceOptions`."""
 
 
-def refuse_unused(options: Any, names: Mapping[str, str], what: str, *used: str) -> None:
+def refuse_unused(
+    options: "DataclassInstance", names: Mapping[str, str], what: str, *used: str
+) -> None:
     """Raise CallerError for an option that differs from its default, but has no effect.
 
     Args:
@@ -158,7 +163,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
         CallerError: one line; it is not a complete fate file, or has no such flow.
     """
     with opened_fates(path) as (file, _):
-        counts: Counter[tuple[Any, ...]] = Counter()
+        counts: Counter[tuple[object, ...]] = Counter()
         for batch in file.iter_batches(columns=list(_FLOW)):
             table = pa.Table.from_batches([batch]).group_by([*_FLOW]).aggregate([([], "count_all")])
             for row in table.to_pylist():
@@ -185,7 +190,7 @@ def read_fate_file(path: Path, number: int) -> PacketTrace:
 
 
 def _received(
-    path: Path, rows: dict[str, NDArray[Any]]
+    path: Path, rows: dict[str, NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the times of the first intact delivery, and which packets have none."""
     times = (rows[name] for name in ("delay_ns", "copy_delay_ns", "arrival_ns"))

@@ -168,7 +168,7 @@ def _head(axes: Axes, figure: Figure, box: Box, title: str, shown: Sequence[Show
 
 
 @singledispatch
-def _draw(item: Any, axes: Axes, norm: Normalize | None) -> Artist | None:
+def _draw(item: object, axes: Axes, norm: Normalize | None) -> Artist | None:
     """Draw an item; return what represents it in the legend, None if there is nothing."""
     raise TypeError(type(item))
 
@@ -202,7 +202,7 @@ def _(item: Band, axes: Axes, norm: Normalize | None) -> Artist | None:
     low, high = (finite(one, positive=axes.get_yscale() == "log") for one in (item.low, item.high))
     if not (np.isfinite(low) & np.isfinite(high)).any():
         return None
-    steps: Any = item.steps or None
+    steps = item.steps or None
     return axes.fill_between(
         item.x, low, high, step=steps, color=rgb(item.colour), alpha=item.opacity, linewidth=0
     )
@@ -320,7 +320,7 @@ def _colour_bar(
     box = Box(begin_in, top_in, BAR_IN, height_in)
     bar = _axes(figure, Place(panel, box, has_x=False, has_y=True))
     mappable = ScalarMappable(norm, "viridis")
-    extend: Any = "max" if scale.exceeded else "neither"
+    extend: Literal["max", "neither"] = "max" if scale.exceeded else "neither"
     figure.colorbar(mappable, cax=bar, label=scale.label, extend=extend)
     bar.grid(visible=False)
 

@@ -7,7 +7,6 @@ escaped; figures are drawn where they are used.
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -40,7 +39,7 @@ def templates(folder: Path = PAGES) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters: dict[str, Any] = {
+    filters: dict[str, object] = {
         "tone": lambda word: _TONES.get(word, ""),
         "inline": _markup,
         "interval": interval_text,

@@ -173,8 +173,8 @@ def lost_row(lost: int, delivered: int) -> tuple[str, str]:
 
 def largest_cap(summary: RunSummary) -> int:
     """Return the largest M − 1 of a run, which may have changed it."""
-    changed = (int(change.settings.get(MANSD, 0)) for change in summary.changes)
-    return max([summary.mansd, *changed])
+    changed = (change.settings.get(MANSD) for change in summary.changes)
+    return max([summary.mansd, *(cap for cap in changed if isinstance(cap, int))])
 
 
 def longest_burst(cap: int, constraints: Sequence[str], longest: int) -> tuple[str, str]:

@@ -160,12 +160,12 @@ def valid_reports(
         with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
-            report = report_of(role, json.dumps(entry), tables).fields()
+            report = report_of(role, json.dumps(entry), tables)
             owned = [table for table in tables if OWNER[table] == role]
-            if report.get("generation", 0) < generations(source, owned)[-1] or role in reports:
-                earlier.append(report | {"process": role})
+            if report.generation < generations(source, owned)[-1] or role in reports:
+                earlier.append(report.fields() | {"process": role})
             else:
-                reports[role] = report
+                reports[role] = report.fields()
     return reports, earlier
 
 

@@ -92,7 +92,7 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
     made: list[RecordedChange] = []
     scenario = record.scenario
-    schedule = ChangeSchedule(scenario)
+    schedule = ChangeSchedule[None](scenario)
     for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
         if _add(schedule, change, change.t_ns):
             taken = schedule.take(change.t_ns)
@@ -103,7 +103,7 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
 
 def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
     """The flow of the controller's model in a run, with its set-points."""
-    loop, schedule = loop_of(scenario), ChangeSchedule(scenario)
+    loop, schedule = loop_of(scenario), ChangeSchedule[None](scenario)
     flow, known = ModelFlow(loop.H, loop.setpoint), set()
     for change, since_ns in _changes_in(received):
         if change.number not in known:  # a restarted controller receives it again
@@ -143,7 +143,7 @@ def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
     return found
 
 
-def _add(schedule: ChangeSchedule, change: ParameterChange, since_ns: int) -> bool:
+def _add(schedule: ChangeSchedule[None], change: ParameterChange, since_ns: int) -> bool:
     try:
         schedule.announce("", change, 0, 0, since_ns - 1)
     except CallerError:

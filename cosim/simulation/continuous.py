@@ -18,7 +18,7 @@ decides, and the run of ``noack simulate --trigger continuous`` with its summary
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,11 +82,18 @@ class ContinuousLoop:
         self.trigger = trigger
         self._between = self.simulation(0.0, known_start=True)
 
-    def simulation(self, horizon_s: float, *, known_start: bool, **more: Any) -> ExactSimulation:
-        """Return the core's simulation of the loop; further arguments are those of its class."""
+    def simulation(
+        self,
+        horizon_s: float,
+        *,
+        known_start: bool,
+        delivered: NDArray[np.bool_] | None = None,
+        **numbers: object,
+    ) -> ExactSimulation:
+        """Return the core's simulation of the loop; the arguments are those of its class."""
         return ExactSimulation(
             self.loop.H, self.loop.K, self.trigger,
-            horizon_s=horizon_s, known_start=known_start, **more,
+            horizon_s=horizon_s, known_start=known_start, link=None, delivered=delivered, **numbers,
         )  # fmt: skip
 
     @property
@@ -357,7 +364,7 @@ def document(run: ContinuousRun, resolved: Scenario) -> dict[str, object]:
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     states = ("x", "e_s", "e_c")
     return {
-        "summary": summary(run, resolved),
+        "summary": summary(run, resolved).to_json(),
         "events": [
             {"t_s": state.t_s, "delivered": bool(delivered)}
             | {name: getattr(state, name).tolist() for name in states}
@@ -379,34 +386,59 @@ def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
     return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
 
 
-def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
-    """Return the run's numbers, with the keys of ``summary.json``."""
+class ContinuousSummary(NamedTuple):
+    """The run's numbers, with the names of a loop's in ``summary.json``."""
+
+    scenario: str
+    mode: str
+    mansd: int
+    horizon_s: float
+    reached_s: float
+    events: int
+    deliveries: int
+    drops: int
+    longest_loss_burst: int
+    inter_event_min_s: float | None
+    inter_event_median_s: float | None
+    inter_delivery_median_s: float | None
+    initial_state_norm: float
+    final_state_norm: float
+    diverged_at_s: float | None
+    exit_status: ExitStatus
+    reason: str
+
+    def to_json(self) -> dict[str, object]:
+        """The summary as JSON."""
+        *numbers, _, _ = self._asdict().items()
+        exit_part = {"status": int(self.exit_status), "reason": self.reason}
+        return {"kind": "continuous", **dict(numbers), "exit": exit_part}
+
+
+def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
+    """Return the run's numbers."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     diverged = _divergence(run, samples, resolved)
     arrived = np.flatnonzero(run.delivered)
     drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
-    return {
-        "kind": "continuous",
-        "scenario": resolved.name,
-        "mode": resolved.mode,
-        "mansd": resolved.network.mansd,
-        "horizon_s": resolved.horizon_s,
-        "reached_s": run.reached_s,
-        "events": len(run.delivered),
-        "deliveries": int(run.delivered.sum()),
-        "drops": int((~run.delivered).sum()),
-        "longest_loss_burst": int(drop_runs.max()),
-        "inter_event_min_s": _or_none(np.min, np.diff(run.event_s)),
-        "inter_event_median_s": _or_none(np.median, np.diff(run.event_s)),
-        "inter_delivery_median_s": _or_none(np.median, np.diff(run.event_s[run.delivered])),
-        "initial_state_norm": float(np.linalg.norm(samples.x[0])),
-        "final_state_norm": float(np.linalg.norm(samples.x[-1])),
-        "diverged_at_s": None if diverged is None else diverged.at_s,
-        "exit": {
-            "status": int(ExitStatus.OK if diverged is None else ExitStatus.FAILED),
-            "reason": "horizon" if diverged is None else diverged.text,
-        },
-    }
+    return ContinuousSummary(
+        scenario=resolved.name,
+        mode=resolved.mode,
+        mansd=resolved.network.mansd,
+        horizon_s=resolved.horizon_s,
+        reached_s=run.reached_s,
+        events=len(run.delivered),
+        deliveries=int(run.delivered.sum()),
+        drops=int((~run.delivered).sum()),
+        longest_loss_burst=int(drop_runs.max()),
+        inter_event_min_s=_or_none(np.min, np.diff(run.event_s)),
+        inter_event_median_s=_or_none(np.median, np.diff(run.event_s)),
+        inter_delivery_median_s=_or_none(np.median, np.diff(run.event_s[run.delivered])),
+        initial_state_norm=float(np.linalg.norm(samples.x[0])),
+        final_state_norm=float(np.linalg.norm(samples.x[-1])),
+        diverged_at_s=None if diverged is None else diverged.at_s,
+        exit_status=ExitStatus.OK if diverged is None else ExitStatus.FAILED,
+        reason="horizon" if diverged is None else diverged.text,
+    )
 
 
 def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
@@ -415,5 +447,5 @@ def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Div
     return divergence([(samples.t_s, samples.x)], len(samples.t_s), [resolved])
 
 
-def _or_none(statistic: Any, values: Vector) -> float | None:
+def _or_none(statistic: Callable[[Vector], SupportsFloat], values: Vector) -> float | None:
     return float(statistic(values)) if len(values) else None

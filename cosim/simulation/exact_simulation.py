@@ -9,14 +9,14 @@ the loop is (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, of shape (3,
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from netem.channel import UPDATE_LINK
 from netem.link_state import LinkState, stream_names
-from noack.core.core_library import CoreMemory, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
@@ -100,7 +100,7 @@ class ExactSimulation:
         known_start: bool,
         link: LinkState | None = None,
         delivered: NDArray[np.bool_] | None = None,
-        **numbers: Any,
+        **numbers: object,
     ) -> None:
         m, n = K.shape
         if max(n, m) > _MOST_ENTRIES:
@@ -108,7 +108,7 @@ class ExactSimulation:
                 f"plant: exact simulation has at most {_MOST_ENTRIES} states and inputs"
             )
         self.n, self.m, self._link, self._memory = n, m, link, CoreMemory()
-        self.core: Any = ffi.new("noack_exact *")
+        self.core: CData = ffi.new("noack_exact *")
         """The structure, as the core's functions take it."""
         fill_rule(self.core.rule, trigger, n, self._memory)
         self._memory.fill(self.core, {

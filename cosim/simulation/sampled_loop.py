@@ -9,7 +9,7 @@ is late.
 
 from copy import copy
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,7 +193,7 @@ class SampledLoop:
             np.zeros(count), np.zeros(count, np.int64), np.zeros(count, np.int64),
         )  # fmt: skip
 
-    def update(self, runs: Runs, delivered: Any) -> None:
+    def update(self, runs: Runs, delivered: NDArray[np.bool_]) -> None:
         """Make the events of runs: x_s = y, and send the update of the delivered ones, (N,)."""
         runs.x_s[:] = runs.y
         rows = np.flatnonzero(delivered)

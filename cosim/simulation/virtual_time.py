@@ -7,7 +7,6 @@ of the network couple the loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from cosim.record.record_source import (
 )
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, Rows, RunRecord, loop_roles
 from netem.channel import RUN_ID, Network, channel_of
-from noack.core.core_library import core, ffi
+from noack.core.core_library import CData, core, ffi
 from noack.machines.loop_machines import NEVER_NS, LoopMachines, row_types
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, OWNER
@@ -39,6 +38,7 @@ from noack.scenario.resolution import (
     tables_of,
 )
 from noack.scenario.scenario import Scenario, phases_ns
+from noack.settings.section import ReadTable
 from plant_server.plant import plants_of
 from sensor_node.sensor import sensors_of
 
@@ -86,7 +86,7 @@ class RecordCollector:
     def __init__(self, types: Mapping[str, np.dtype[np.void]], loops: int) -> None:
         self._types, self._loops = types, loops
         self._batches: dict[str, list[Rows]] = {}
-        self._settings: dict[str, list[tuple[Any, ...]]] = {}
+        self._settings: dict[str, list[tuple[object, ...]]] = {}
         self._by_loop: dict[str, list[Rows]] = {}
         self._notices: list[tuple[Notice, str]] = []
 
@@ -121,14 +121,13 @@ class RecordCollector:
             self._by_loop[table] = _split(self.whole(table), self._loops)
         return self._by_loop[table][number]
 
-    def notices(self, loop: int | None = None) -> list[dict[str, Any]]:
+    def notices(self, loop: int | None = None) -> list[dict[str, object]]:
         """Return the notices of a loop or, of None, those about the whole run, by their times."""
-        lines = [
+        return [
             notice._replace(loop=None).line() | {"process": role}
-            for notice, role in self._notices
+            for notice, role in sorted(self._notices, key=lambda one: one[0].t_ns)
             if notice.loop in (None, loop)
         ]
-        return sorted(lines, key=lambda line: int(line["t_ns"]))
 
 
 class VirtualRun:
@@ -161,7 +160,7 @@ class VirtualRun:
         """The row types of the tables of each kind of loops (:func:`settings_key`)."""
         run_types = {**row_types(map(shape_of, kinds.values())), **network_tables()}
         self.record = RecordCollector(run_types, len(loops))
-        self.core: Any = self._new_core(len(loops))
+        self.core: CData = self._new_core(len(loops))
         wrong = core.noack_simulation_check(self.core)
         if wrong != ffi.NULL:
             raise ValueError(f"simulation: {ffi.string(wrong).decode()}")
@@ -202,7 +201,7 @@ class VirtualRun:
         for change in changes:
             self.record.take(RECORDER, change_notice(change))
 
-    def reception(self, role: str, loop: int, *, acknowledges: bool = False) -> dict[str, Any]:
+    def reception(self, role: str, loop: int, *, acknowledges: bool = False) -> dict[str, object]:
         """Return the numbers of datagrams that a loop's machine has accepted and rejected."""
         machine = self.machines[role].machines[loop].machine
         counts = machine.acknowledgements if acknowledges else machine.received
@@ -212,7 +211,7 @@ class VirtualRun:
             "rejected": {reason: count for reason, count in rejected if count},
         }
 
-    def _new_core(self, loops: int) -> Any:
+    def _new_core(self, loops: int) -> CData:
         """Return the ``noack_simulation``."""
         key, flows = ffi.from_buffer("uint8_t[]", bytes(KEY_BYTES)), self._scenario.network.flows
         simulation = ffi.new("noack_simulation *", {
@@ -305,7 +304,7 @@ def _simulated(
         roles = loop_roles(len(loops))
         records.append(RunRecord(loop, rows, notices, reports, "simulated", (), number, roles))
     of_all = {table: len(rows) for table, rows in of_network.items()}
-    reports = {"netem": _report(of_all, "netem")}
+    reports = {"netem": _report(of_all, "netem", {"rejected": {}})}
     common = RunRecord(
         scenario, of_network, run.record.notices(), reports, "simulated", roles=NETWORK_ROLES
     )
@@ -355,17 +354,17 @@ def _split(rows: Rows, loops: int) -> list[Rows]:
 
 def _reports(
     run: VirtualRun, counts: Mapping[str, int], scenario: Scenario, loop: int
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, dict[str, object]]:
     """Return the final report of each role, as of a loop with these numbers of rows."""
-    reports = {role: _report(counts, role) for role in LOOP_ROLES}
-    for role in _ROLES:
-        reports[role]["channel"] = run.reception(role, loop)
+    channels = {role: run.reception(role, loop) for role in _ROLES}
     if scenario.protocol.acknowledges:
         received = run.reception("sensor", loop, acknowledges=True)
-        reports["sensor"]["channel"]["acknowledgements"] = received
-    return reports
+        channels["sensor"]["acknowledgements"] = received
+    return {
+        role: _report(counts, role, channels.get(role, {"rejected": {}})) for role in LOOP_ROLES
+    }
 
 
-def _report(counts: Mapping[str, int], role: str) -> dict[str, Any]:
+def _report(counts: Mapping[str, int], role: str, channel: ReadTable) -> dict[str, object]:
     owned = {table: count for table, count in counts.items() if OWNER[table] == role}
-    return {"ended": HORIZON, "channel": {"rejected": {}}, "rows": owned}
+    return {"ended": HORIZON, "channel": channel, "rows": owned}

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -190,7 +190,7 @@ class ControlServer:
             priority=Priority.BACKGROUND,
         )
 
-    def _reply(self, query: zenoh.Query, answer: Callable[[dict[str, Any]], object]) -> None:
+    def _reply(self, query: zenoh.Query, answer: Callable[[dict[str, object]], object]) -> None:
         try:
             content = json.dumps(answer(_content(query)))
             query.reply(query.key_expr, content)
@@ -202,7 +202,7 @@ class ControlServer:
         finally:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _settings(self, _: Mapping[str, Any]) -> object:
+    def _settings(self, _: Mapping[str, object]) -> object:
         links = [
             {"name": link.name}
             | {name: _settings(getattr(link, name).settings) for name in DIRECTIONS}
@@ -210,7 +210,7 @@ class ControlServer:
         ]
         return {"links": links}
 
-    def _change(self, content: Mapping[str, Any]) -> object:
+    def _change(self, content: Mapping[str, object]) -> object:
         try:
             change = SettingsChange.model_validate_json(json.dumps(content))
         except ValidationError as error:
@@ -251,7 +251,7 @@ def _require_read(settings: LinkSettings) -> None:
             raise CallerError(f"{file}: read the file first, and send its content as settings")
 
 
-def _content(query: zenoh.Query) -> dict[str, Any]:
+def _content(query: zenoh.Query) -> dict[str, object]:
     """Return the content of a query; raise CallerError unless it is a JSON object."""
     try:
         content = json.loads(query.payload.to_string() if query.payload else "{}")

@@ -53,7 +53,7 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def ask(self, what: str, **content: Any) -> Any:
+    def ask(self, what: str, **content: object) -> Any:
         """Send the query ``report``, ``settings`` or ``change``, and return the answer.
 
         Raises:

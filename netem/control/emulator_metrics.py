@@ -120,9 +120,8 @@ def _gauge(name: str, text: str, labels: Sequence[str], rows: _Rows) -> Metric:
     return _filled(GaugeMetricFamily(f"{_PREFIX}_{name}", text, labels=labels), rows)
 
 
-def _filled(metric: Any, rows: _Rows) -> Metric:
+def _filled(metric: CounterMetricFamily | GaugeMetricFamily, rows: _Rows) -> Metric:
     for values, value in rows:
         if value is not None:
             metric.add_metric(values, value)
-    assert isinstance(metric, Metric)
     return metric

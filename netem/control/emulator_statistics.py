@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from functools import cached_property
 from queue import SimpleQueue
 from threading import Lock
-from typing import Any, NamedTuple, Self, TypedDict, TypeVar
+from typing import NamedTuple, Self, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,8 @@ class CommandQueue:
     def __init__(self, relay: Relay) -> None:
         self._relay = relay
         self._began_ns = time.monotonic_ns()
-        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
+        self._waiting: SimpleQueue[tuple[Callable[[], None], Callable[[], bool]]] = SimpleQueue()
+        """What runs a command, and what cancels it."""
         self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
             (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
             for spec in relay.specs
@@ -95,20 +96,16 @@ class CommandQueue:
     def run_pending(self) -> None:
         """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
         for _ in range(self._waiting.qsize()):
-            future, command = self._waiting.get_nowait()
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                future.set_result(command())
-            except Exception as error:
-                future.set_exception(error)
+            run, _ = self._waiting.get_nowait()
+            run()
 
     def close(self) -> None:
         """Refuse further commands; called in the relay's thread when the relay ends."""
         with self._lock:
             self._closed = True
         while not self._waiting.empty():
-            self._waiting.get_nowait()[0].cancel()
+            _, cancel = self._waiting.get_nowait()
+            cancel()
 
     def submit(self, command: Callable[[], T]) -> T:
         """Run a command in the relay's thread, from another thread, and return its result.
@@ -117,10 +114,18 @@ class CommandQueue:
             PeerError: the relay has ended, or does not answer.
         """
         future: Future[T] = Future()
+
+        def run() -> None:
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(command())
+                except Exception as error:
+                    future.set_exception(error)
+
         with self._lock:
             if self._closed:
                 raise PeerError("the emulator has ended")
-            self._waiting.put((future, command))
+            self._waiting.put((run, future.cancel))
         try:
             return future.result(_PATIENCE_S)
         except CancelledError:

@@ -27,7 +27,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from noack.core.core_library import CData  # loads the core
 
 RELATIVE_RATE_PPB = 1_201_000
 """Default of ρ: two crystals of ±100 ppm, and both clocks slewed by at most 500 ppm, as ntpd and
@@ -265,7 +268,7 @@ class RunClock:
         wall_ns = self._monotonic_ns() - self.epoch_ns
         return wall_ns if self.speed == 1.0 else int(wall_ns * self.speed)
 
-    def set_core(self, clock: Any) -> None:
+    def set_core(self, clock: "CData") -> None:
         """Let a ``noack_clock`` of the core read as this clock does, if it reads this host's."""
         clock.epoch_ns, clock.speed, clock.slew_ppb = self.epoch_ns, self.speed, 0
 
@@ -290,7 +293,7 @@ class SlewedRunClock(RunClock):
         super().__init__(epoch_ns, speed, lambda: slewed.now_ns(own_ns()))
         self._slewed = slewed
 
-    def set_core(self, clock: Any) -> None:
+    def set_core(self, clock: "CData") -> None:
         """Let a ``noack_clock`` of the core read as this clock does, until the next estimate."""
         super().set_core(clock)
         slew = self._slewed.slew

@@ -8,18 +8,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from noack.core.errors import CallerError
 
 LIBRARY = Path(__file__).with_name("libnoack.so")
+T = TypeVar("T")
 CData = Any
 """A structure or pointer of the core: mypy does not know its fields."""
-Array = NDArray[Any]
+Array = NDArray[np.generic]
 """Numbers, or rows of a structure of the core."""
+Rows = NDArray[np.void]
+"""Rows of a structure of the core."""
 Reals = NDArray[np.float64]
 SCRATCH_MATRICES = 10
 """Matrices of a matrix's size that the core needs for scratch, for its exponential."""
@@ -77,7 +80,7 @@ def dtype_of(name: str) -> np.dtype[np.void]:
     )
 
 
-def _format_of(kind: CData) -> Any:
+def _format_of(kind: CData) -> DTypeLike:
     if kind.kind == "array":
         return _format_of(kind.item), (kind.length,)
     return _FORMATS[kind.cname]
@@ -108,11 +111,11 @@ class CoreMemory:
     """
 
     def __init__(self) -> None:
-        self._kept: list[Any] = []
+        self._kept: list[object] = []
         self._transitions: dict[bytes, CData] = {}
         self._shared: list[Array] = []
 
-    def keep(self, owner: Any) -> Any:
+    def keep(self, owner: T) -> T:
         """Keep an object alive as long as this memory; return it."""
         self._kept.append(owner)
         return owner
@@ -159,7 +162,7 @@ class CoreMemory:
         model.has_point = self.integers([point is not None for point in known])
         model.points = self.reals([np.zeros(n) if point is None else point for point in known])
 
-    def fill(self, structure: CData, numbers: Mapping[str, Any]) -> None:
+    def fill(self, structure: CData, numbers: Mapping[str, object]) -> None:
         """Set fields of a structure; an array becomes a pointer to a copy of it."""
         for name, number in numbers.items():
             value = self.reals(number) if isinstance(number, np.ndarray) else number

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from noack.core.errors import CallerError, MachineError, printable, why
 
@@ -205,7 +205,7 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     return content
 
 
-def lock(file: int | IO[Any], *, shared: bool = False, wait: bool = False) -> bool:
+def lock(file: int | IO[bytes], *, shared: bool = False, wait: bool = False) -> bool:
     """Lock an open file or folder until it is closed; return False if another process has the lock.
 
     ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.

@@ -5,15 +5,15 @@ written as words, its lines of ``--help``, and which words go after which.
 """
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from noack.impairments.words import Quantity, WordReader
+from pydantic import BaseModel
 
-Table = dict[str, Any]
-"""A table of settings, before it is validated."""
+from noack.impairments.words import Quantity, WordReader
+from noack.settings.section import ReadTable, Table
 
 
 class Word(NamedTuple):
@@ -45,7 +45,7 @@ class Part:
     word: str = ""
     example: str = ""
     """Words in which the word occurs."""
-    implied: Mapping[str, Any] = field(default_factory=dict)
+    implied: ReadTable = field(default_factory=dict)
     """Settings that the word implies."""
 
     @property
@@ -65,12 +65,12 @@ class Part:
             value = reader.value(self.quantity)
             table |= zip(self.keys, (value,) if len(self.keys) == 1 else value, strict=True)
 
-    def is_default(self, settings: Any) -> bool:
+    def is_default(self, settings: BaseModel) -> bool:
         """Whether settings have the default value, so that the words may be left out."""
         fields = type(settings).model_fields
         return all(getattr(settings, key) == fields[key].default for key in self.keys)
 
-    def text(self, settings: Any) -> str:
+    def text(self, settings: BaseModel) -> str:
         """Return words that are read as these settings."""
         if self.quantity is None:
             return self.word
@@ -89,6 +89,9 @@ def flag(word: str, example: str, key: str, value: bool) -> Part:
     return Part(key, word=word, example=example, implied={key: value})
 
 
+_FILE = "file"
+
+
 @dataclass(frozen=True)
 class FileOr(Part):
     """The name of a file; or a word, and the value that a file may have."""
@@ -104,10 +107,10 @@ class FileOr(Part):
         if self.word and name == self.word:
             super().read(reader, table)
         else:
-            table["file"] = name
+            table[_FILE] = name
 
-    def text(self, settings: Any) -> str:
-        name: str | None = settings.file
+    def text(self, settings: BaseModel) -> str:
+        name: str | None = getattr(settings, _FILE)
         if name is None:
             return super().text(settings)
         return shlex.quote(f"./{name}" if name == self.word else name)
@@ -120,7 +123,7 @@ class FileOr(Part):
 
 def file_name(expected: str) -> FileOr:
     """Return the name of a file, which is described by ``expected``."""
-    return FileOr("file", expected=expected)
+    return FileOr(_FILE, expected=expected)
 
 
 class Clause:
@@ -144,7 +147,7 @@ class Clause:
         *parts: Part,
         synonyms: tuple[str, ...] = (),
         least: int = 1,
-        implied: Mapping[str, Any] = MappingProxyType({}),
+        implied: ReadTable = MappingProxyType({}),
         complement: bool = False,
         is_bare: bool = False,
     ) -> None:
@@ -177,7 +180,9 @@ class Clause:
                 break
             part.read(reader, table)
             if self.complement and number == 0:
-                table[self._values[1].keys[0]] = 1 - table[part.keys[0]]
+                share = table[part.keys[0]]
+                assert isinstance(share, float)
+                table[self._values[1].keys[0]] = 1 - share
         options = {part.word: part for part in self._options}
         while (word := reader.accept(*options)) is not None:
             if not table.keys().isdisjoint({*options[word].keys, *options[word].implied}):
@@ -185,12 +190,12 @@ class Clause:
             options[word].read(reader, table)
         return table
 
-    def writes(self, settings: Any) -> bool:
+    def writes(self, settings: BaseModel) -> bool:
         """Whether the clause has the words for settings, if there are several clauses."""
         keys = [part.keys for part in self._values[: self.least]]
         return all(getattr(settings, key) is not None for part in keys for key in part)
 
-    def text(self, settings: Any) -> str:
+    def text(self, settings: BaseModel) -> str:
         """Return words that are read as these settings."""
         values = self._values
         while len(values) > self.least and values[-1].is_default(settings):

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -332,28 +332,36 @@ def expected_loss(settings: LinkSettings) -> LossPrediction:
     return predict(with_kept_loss(settings))
 
 
+class _Kept(NamedTuple):
+    """A loss whose rate is kept."""
+
+    number: int
+    impairment: LossOf
+    loss: BernoulliLoss
+
+
 def with_kept_loss(settings: LinkSettings) -> LinkSettings:
     """Return settings with the probability that gives the asked loss rate.
 
     Raises:
         ValueError: there is none; one line.
     """
-    places = [
-        number
+    found = [
+        _Kept(number, impairment, impairment.loss)
         for number, impairment in enumerate(settings.impairments)
         if isinstance(impairment, LossOf)
         and isinstance(impairment.loss, BernoulliLoss)
         and impairment.loss.keep
     ]
-    if not places:
+    if not found:
         return settings
-    if len(places) > 1:
-        kept = settings.impairments[places[0]].text()
-        raise ValueError(f"{kept}: only one loss of a direction can be kept")
+    kept = found[0]
+    if len(found) > 1:
+        raise ValueError(f"{kept.impairment.text()}: only one loss of a direction can be kept")
     key = _key(settings)
     if key not in _found:
-        remember({key: _probability(settings, places[0])})
-    return _with_probability(settings, places[0], _found[key])
+        remember({key: _probability(settings, kept)})
+    return _with_probability(settings, kept, _found[key])
 
 
 def found_probabilities(*links: LinkSettings) -> dict[str, float]:
@@ -385,22 +393,20 @@ def _matters(impairment: Impairment) -> bool:
         return True
 
 
-def _with_probability(settings: LinkSettings, number: int, probability: float) -> LinkSettings:
-    kept: Any = settings.impairments[number]
+def _with_probability(settings: LinkSettings, kept: _Kept, probability: float) -> LinkSettings:
     loss = kept.loss.model_copy(update={"probability": probability, "keep": False})
-    impairments = list(settings.impairments)
-    impairments[number] = kept.model_copy(update={"loss": loss})
+    impairments: list[Impairment] = list(settings.impairments)
+    impairments[kept.number] = kept.impairment.model_copy(update={"loss": loss})
     return settings.model_copy(update={"impairments": tuple(impairments)})
 
 
-def _probability(settings: LinkSettings, number: int) -> float:
+def _probability(settings: LinkSettings, kept: _Kept) -> float:
     from scipy.optimize import brentq  # slow to import
 
-    kept: Any = settings.impairments[number]
-    text, target = kept.text(), kept.loss.probability
+    text, target = kept.impairment.text(), kept.loss.probability
 
     def rate_at(probability: float, of: LinkSettings = settings) -> float:
-        rate, note = predict(_with_probability(of, number, float(probability)))
+        rate, note = predict(_with_probability(of, kept, float(probability)))
         if rate is None:
             raise ValueError(f"{text}: the loss rate cannot be predicted: {note}")
         return rate

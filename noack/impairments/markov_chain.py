@@ -10,13 +10,16 @@ the impairments after their step.
 import math
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.core_library import core
 from noack.impairments.loss_guarantee import LossAutomaton, LossGuarantee
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array  # slow to import
 
 Array = NDArray[np.float64]
 MOST_STATES = 256
@@ -183,7 +186,7 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
     count = len(after_loss)
     allowed = after_loss >= 0
 
-    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> Any:
+    def to(targets: NDArray[np.int64], which: NDArray[np.bool_]) -> "csr_array[np.float64]":
         places = np.flatnonzero(which)
         shape = (count, count)
         return sparse.csr_array((np.ones(len(places)), (places, targets[places])), shape)
@@ -199,7 +202,7 @@ def constrained_rate(start: Array, moves: Array, lost: Array, guarantee: LossGua
     return float((distribution[allowed] @ moves @ lost).sum())
 
 
-def _stationary(joint: Any, start: Array) -> Array:
+def _stationary(joint: "csr_array[np.float64]", start: Array) -> Array:
     """Return the stationary distribution of the states that remain possible."""
     from scipy.sparse import csgraph  # slow to import
 
@@ -218,7 +221,7 @@ def _stationary(joint: Any, start: Array) -> Array:
     return distribution
 
 
-def _balance(moves: Any) -> Array:
+def _balance(moves: "csr_array[np.float64]") -> Array:
     """Return the stationary distribution π = πP of an irreducible chain.
 
     With π = 1 for a likely state, the other equations are a regular, well-conditioned system. It is

@@ -13,17 +13,22 @@ what a loop's own row lacks is missing in them (:func:`row_layout`).
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import CoreMemory, core, dtype_of, ffi, pointer_to
+from noack.core.core_library import CData, CoreMemory, core, dtype_of, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import LOOP, RecordShape, largest, tables
 from noack.protocol.wire_format import Flow
-from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange, settings_key
+from noack.scenario.parameter_changes import (
+    AppliedParameters,
+    ChangeSchedule,
+    ParameterChange,
+    settings_key,
+)
 from noack.scenario.scenario import Scenario
 
 Rows = NDArray[np.void]
@@ -58,7 +63,7 @@ class MachinePart(Protocol):
     role: Role
 
     @property
-    def schedule(self) -> ChangeSchedule | None:
+    def schedule(self) -> ChangeSchedule[object] | None:
         """The announced changes of its settings; None if they cannot change."""
         ...
 
@@ -72,15 +77,15 @@ class MachinePart(Protocol):
         """The sizes of the rows that it writes."""
         ...
 
-    def fill(self, structure: Any, memory: CoreMemory) -> None:
+    def fill(self, structure: CData, memory: CoreMemory) -> None:
         """Fill the core's structure, at the start of the machine's work."""
         ...
 
-    def redraw(self, structure: Any, memory: CoreMemory) -> None:
+    def redraw(self, structure: CData, memory: CoreMemory) -> None:
         """Set what the draws determine, in a copy of a structure that an alike part has filled."""
         ...
 
-    def answer(self, question: int, structure: Any) -> Sequence[Notice]:
+    def answer(self, question: int, structure: CData) -> Sequence[Notice]:
         """Do what a step needs before it goes on; return lines for the log."""
         ...
 
@@ -88,9 +93,12 @@ class MachinePart(Protocol):
         """Return lines for the log about new rows of received messages."""
         ...
 
-    def note(self, structure: Any, note: Any) -> Notice:
+    def note(self, structure: CData, note: CData) -> Notice:
         """Return the line for the log that a step has asked for by a ``noack_note``."""
         ...
+
+
+Prepared = TypeVar("Prepared")
 
 
 def alike_loops(loops: Sequence[Scenario]) -> list[int]:
@@ -100,7 +108,7 @@ def alike_loops(loops: Sequence[Scenario]) -> list[int]:
 
 
 def set_machine(
-    machine: Any,
+    machine: CData,
     *,
     n: int,
     m: int,
@@ -123,16 +131,18 @@ def set_machine(
         reception.newest, reception.not_after_ns = -1, horizon_ns
 
 
-def take_changes(schedule: ChangeSchedule | None, machine: Any) -> Sequence[Any]:
+def take_changes(
+    schedule: ChangeSchedule[Prepared] | None, machine: CData
+) -> Sequence[AppliedParameters[Prepared]]:
     """Return the changes that are due at the time at which a step asked, in order."""
-    found: list[Any] = []
+    found: list[AppliedParameters[Prepared]] = []
     while schedule is not None and (due := schedule.take(machine.change_ns)) is not None:
         found.append(due)
     machine.change_ns = next_change_ns(schedule)
     return found
 
 
-def next_change_ns(schedule: ChangeSchedule | None) -> int:
+def next_change_ns(schedule: ChangeSchedule[object] | None) -> int:
     """Return the time of the next change."""
     if schedule is None or schedule.next_ns is None:
         return NEVER_NS
@@ -166,7 +176,7 @@ class LoopMachines:
         self.phases_ns = tuple(phases_ns or (0,) * len(self.parts))
         self._memory = CoreMemory()
         self._notices: list[Notice] = []
-        self.core: Any = self._memory.keep(ffi.new("noack_process *"))
+        self.core: CData = self._memory.keep(ffi.new("noack_process *"))
         """The ``noack_process``; its address does not change."""
         self._fill_machines(alike or range(len(self.parts)))
         self._counting = {k for k, part in enumerate(self.parts) if part.counts_every_message}
@@ -189,7 +199,7 @@ class LoopMachines:
         setattr(process, f"{self.role.name}s", machines)
         process.due_ns = keep(ffi.new("int64_t[]", count))
         process.heap = keep(ffi.new("int64_t[]", count))
-        self.machines: Any = machines
+        self.machines: CData = machines
         """(loops,) The structures of the machines."""
         copies: dict[int, list[int]] = {}
         for number, first in enumerate(alike):
@@ -219,11 +229,11 @@ class LoopMachines:
             if len(set(shapes)) > 1:
                 table.layouts = self._layouts(name, types[name], shapes)
 
-    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> Any:
+    def _layouts(self, name: str, whole: np.dtype[np.void], shapes: Sequence[RecordShape]) -> CData:
         """Return the layout of each loop's rows in a table; loops of a shape share it."""
 
         @cache
-        def layout(shape: RecordShape) -> Any:
+        def layout(shape: RecordShape) -> CData:
             own = tables(**asdict(shape)).get(name)
             return ffi.NULL if own is None else self._memory.integers(row_layout(own, whole))
 
@@ -364,12 +374,11 @@ def row_layout(own: np.dtype[np.void], whole: np.dtype[np.void]) -> NDArray[np.i
         own: the row type of the loop, without its number.
         whole: the row type of the table, with the number of the loop.
     """
-    own_fields: Mapping[str, Any] = own.fields or {}
-    fields: Mapping[str, Any] = whole.fields or {}
     layout = np.full((whole.itemsize - core.NOACK_LOOP_BYTES) // 8, core.NOACK_MISSING_ZERO)
     for name in own.names or ():
-        kind, begin = own_fields[name][:2]
-        room, at = fields[name][:2]
+        assert own.fields is not None
+        assert whole.fields is not None
+        (kind, begin), (room, at) = own.fields[name][:2], whole.fields[name][:2]
         first, words = (at - core.NOACK_LOOP_BYTES) // 8, kind.itemsize // 8
         layout[first : first + room.itemsize // 8] = core.NOACK_MISSING_NAN
         layout[first : first + words] = begin // 8 + np.arange(words)

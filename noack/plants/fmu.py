@@ -17,8 +17,10 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NoReturn
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -36,6 +38,10 @@ from noack.plants.plant_settings import (
 from noack.settings.section import Row, require_length
 from noack.settings.user_files import FileSettings, unchanged
 
+if TYPE_CHECKING:  # an extra of noack, and slow to import
+    from fmpy.fmi1 import _FMU
+    from fmpy.model_description import ModelDescription, ScalarVariable
+
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
 """Status codes of FMI."""
 _REAL = {"Real", "Float64", "Float32"}
@@ -52,11 +58,7 @@ _LONGEST = 300
 _PREFIX = "noack-native-"
 _STREAMS = (1, 2)
 _LIBC = ctypes.CDLL(None)
-Library = Any  # FMPy
-Fmu = Any  # its instance of an FMU
-Description = Any  # what the FMU says of itself
-Variable = Any  # one of its variables
-Refusal = Callable[[Variable], str | None]
+Refusal = Callable[["ScalarVariable"], str | None]
 """Returns why a variable is unsuitable; None if it is suitable."""
 
 
@@ -158,7 +160,7 @@ class FmuSystem:
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
 
-    def _described(self, path: Path) -> Description:
+    def _described(self, path: Path) -> "ModelDescription":
         fmpy = _fmpy()
         try:
             with path.open("rb") as file:  # FMPy does not close a file that it cannot read
@@ -172,7 +174,7 @@ class FmuSystem:
         return description
 
     def _loaded(
-        self, path: Path, end: contextlib.ExitStack, description: Description
+        self, path: Path, end: contextlib.ExitStack, description: "ModelDescription"
     ) -> "_Instance":
         fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
         fmpy.extract(str(path), str(folder))
@@ -189,7 +191,7 @@ class FmuSystem:
         end.callback(instance.release)
         return instance
 
-    def _require_binary(self, folder: Path, description: Description) -> None:
+    def _require_binary(self, folder: Path, description: "ModelDescription") -> None:
         fmpy = _fmpy()
         modern = description.fmiVersion.startswith("3.")
         platform = fmpy.platform_tuple if modern else fmpy.platform
@@ -202,7 +204,7 @@ class FmuSystem:
         hint = "; it has sources, which `fmpy compile` can compile" if sources else ""
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
-    def _start(self, settings: FmuSettings, x0: Vector, description: Description) -> None:
+    def _start(self, settings: FmuSettings, x0: Vector, description: "ModelDescription") -> None:
         fmu, variables = self._instance.fmu, _Variables(description)
 
         def port(key: str, names: Sequence[str], refusal: Refusal = lambda variable: None) -> _Port:
@@ -239,7 +241,7 @@ class FmuSystem:
 class _Instance:
     """An instance of an FMU, and its state by the standard."""
 
-    def __init__(self, fmu: Fmu) -> None:
+    def __init__(self, fmu: "_FMU") -> None:
         self.fmu = fmu
         self.started = False
         self.status = 0
@@ -262,10 +264,11 @@ class _Log:
     def __init__(self) -> None:
         self._last = ""
 
-    def take(self, *arguments: Any) -> None:
+    def take(self, *arguments: object) -> None:
         """Keep a message; FMI 2: (environment, name, status, category, message), FMI 3: no name."""
-        status, message = arguments[-3], arguments[-1]
-        if status > _WARNING and message:
+        *_, status, _, message = arguments
+        assert isinstance(status, int)
+        if status > _WARNING and isinstance(message, bytes):
             self._last = _short(message.decode(errors="replace"))
 
     def why(self, error: Exception) -> str:
@@ -279,12 +282,12 @@ class _Variables:
     If a variable is missing or unsuitable, every method raises a CallerError of one line.
     """
 
-    def __init__(self, description: Description) -> None:
-        self._known: Mapping[str, Variable] = {
+    def __init__(self, description: "ModelDescription") -> None:
+        self._known: Mapping[str, ScalarVariable] = {
             variable.name: variable for variable in description.modelVariables
         }
 
-    def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list[Variable]:
+    def real(self, key: str, names: Sequence[str], refusal: Refusal) -> list["ScalarVariable"]:
         """Return real scalars that are not refused."""
         variables = [self._named(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
@@ -295,7 +298,7 @@ class _Variables:
                 _refuse(key, variable, why)
         return variables
 
-    def parameter(self, name: str, value: object) -> tuple[Variable, object]:
+    def parameter(self, name: str, value: object) -> tuple["ScalarVariable", object]:
         """Return a variable and its start value."""
         variable = self._named("parameters", name)
         kinds, needed = _VALUES.get(variable.type, ((int,), "a whole number"))
@@ -309,7 +312,7 @@ class _Variables:
             _refuse("parameters", variable, why)
         return variable, value
 
-    def _named(self, key: str, name: str) -> Variable:
+    def _named(self, key: str, name: str) -> "ScalarVariable":
         if name in self._known:
             return self._known[name]
         close = difflib.get_close_matches(name, self._known, n=1)
@@ -318,14 +321,14 @@ class _Variables:
         raise CallerError(f'plant.system.{key}: the FMU has no variable "{name}"; {hint}')
 
 
-def _refuse(key: str, variable: Variable, why: str) -> NoReturn:
+def _refuse(key: str, variable: "ScalarVariable", why: str) -> NoReturn:
     raise CallerError(f'plant.system.{key}: the FMU\'s "{variable.name}" {why}')
 
 
 class _Port:
     """Real variables of an instance, read or set together."""
 
-    def __init__(self, fmu: Fmu, variables: Sequence[Variable]) -> None:
+    def __init__(self, fmu: "_FMU", variables: Sequence["ScalarVariable"]) -> None:
         self._fmu, self._size = fmu, len(variables)
         places: dict[str, tuple[list[int], list[int]]] = {}
         for index, variable in enumerate(variables):
@@ -347,28 +350,28 @@ class _Port:
             _set(self._fmu, kind, references, values[at].tolist())
 
 
-def _set(fmu: Fmu, kind: str, references: Sequence[int], values: Sequence[object]) -> None:
+def _set(fmu: "_FMU", kind: str, references: Sequence[int], values: Sequence[object]) -> None:
     if kind == "Enumeration":
         kind = "Int64" if hasattr(fmu, "setInt64") else "Integer"
     getattr(fmu, f"set{kind}")(references, values)
 
 
-def _not_a_real_scalar(variable: Variable) -> str | None:
+def _not_a_real_scalar(variable: "ScalarVariable") -> str | None:
     if variable.type not in _REAL:
         return f"is of type {variable.type}; real numbers are needed"
     return "is an array; name scalar variables" if variable.dimensions else None
 
 
-def _not_readable(variable: Variable) -> str | None:
+def _not_readable(variable: "ScalarVariable") -> str | None:
     readable = variable.causality in ("output", "local")
     return None if readable else f"is neither output nor local, but {variable.causality}"
 
 
-def _not_an_input(variable: Variable) -> str | None:
+def _not_an_input(variable: "ScalarVariable") -> str | None:
     return None if variable.causality == "input" else f"is no input, but {variable.causality}"
 
 
-def _not_settable(variable: Variable) -> str | None:
+def _not_settable(variable: "ScalarVariable") -> str | None:
     """Refuse a variable that cannot be set before the initialisation."""
     from fmpy.simulation import settable_in_instantiated  # an extra of noack
 
@@ -377,22 +380,21 @@ def _not_settable(variable: Variable) -> str | None:
     return "cannot be set at the start"
 
 
-def _not_initial(variable: Variable) -> str | None:
+def _not_initial(variable: "ScalarVariable") -> str | None:
     """Refuse a variable to which x(0) cannot be written."""
     why = _not_settable(variable)
     return why and f"{why}; name variables whose initial is exact or approx, or none: []"
 
 
-def _about(description: Description) -> str:
+def _about(description: "ModelDescription") -> str:
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"
 
 
-def _fmpy() -> Library:
+def _fmpy() -> ModuleType:
     with contextlib.redirect_stdout(io.StringIO()):  # the import prints warnings about the platform
-        import fmpy
-    return fmpy
+        return import_module("fmpy")
 
 
 def _short(what: object) -> str:

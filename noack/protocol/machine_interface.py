@@ -1,6 +1,6 @@
 """What machines emit beside messages, and where in a run they begin."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from noack.protocol.wire_format import Message
 
@@ -33,7 +33,7 @@ class Record(NamedTuple):
     """A row for the numeric record; ``noack.protocol.record_tables`` documents the tables."""
 
     table: str
-    row: tuple[Any, ...]
+    row: tuple[object, ...]
 
 
 RESTART = "restart"  # level of the notice of a restarted process
@@ -49,7 +49,7 @@ class Notice(NamedTuple):
     loop: int | None = None
     """The number of the loop that it is about, in a run of several loops."""
 
-    def line(self) -> dict[str, Any]:
+    def line(self) -> dict[str, object]:
         """Return the fields; without the loop, if there is none."""
         line = self._asdict()
         return line if self.loop is not None else {k: line[k] for k in line if k != "loop"}

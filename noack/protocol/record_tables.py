@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import astuple, dataclass
 from enum import IntEnum
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,8 +284,8 @@ def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
     }
 
 
-def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[Any, ...]]:
-    found: list[tuple[Any, ...]] = []
+def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[object, ...]]:
+    found: list[tuple[object, ...]] = []
     for column in columns:
         if not column.exists(shape):
             continue

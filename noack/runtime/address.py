@@ -3,12 +3,11 @@
 import re
 import socket
 import struct
-from typing import Any
 
 from noack.core.errors import CallerError
 
 Address = tuple[str, int]  # numeric host and port
-SocketName = tuple[Any, ...]
+SocketName = tuple[str, int] | tuple[str, int, int, int]
 """An address in the form that sockets use: host and port; IPv6: also flow label and scope."""
 NAME_BYTES = 32  # room for a packed name; those of IPv6 have 28 bytes
 

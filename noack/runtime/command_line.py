@@ -23,7 +23,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import StrEnum
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 from noack.core.errors import CallerError, ExitStatus, printable
 
@@ -81,7 +81,7 @@ class JsonLog(io.TextIOBase):
         """Return whether the stream can be written."""
         return True
 
-    def log(self, level: str, source: str, message: str, **fields: Any) -> None:
+    def log(self, level: str, source: str, message: str, **fields: object) -> None:
         """Write an object; a number that is not finite becomes null."""
         from pydantic_core import to_json  # only for logs as JSON Lines
 
@@ -114,7 +114,7 @@ def log_format(wanted: LogFormat) -> Iterator[None]:
         sys.stderr = before
 
 
-def log_event(level: str, source: str, message: str, **fields: Any) -> bool:
+def log_event(level: str, source: str, message: str, **fields: object) -> bool:
     """Write an event if standard error is JSON Lines; return whether it is.
 
     A full disk or a closed pipe is ignored.

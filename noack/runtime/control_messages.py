@@ -5,7 +5,7 @@ Any other input, such as a damaged file, is refused and must not end a process.
 
 import re
 from ipaddress import ip_address
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -21,6 +21,7 @@ from pydantic_core import to_json
 from noack.core.errors import PeerError
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.toml_file import brief
+from noack.settings.section import Table
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -33,7 +34,7 @@ class ControlMessage(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="allow", defer_build=True)
 
-    def fields(self) -> dict[str, Any]:
+    def fields(self) -> Table:
         """Return the fields that were given, also further ones, for JSON."""
         return self.model_dump(exclude_unset=True)
 
@@ -79,7 +80,7 @@ class ChangeAnnouncement(ControlMessage):
 
     number: Count  # numbers the changes of the run from 0
     t_ns: Count  # simulated time from which it applies
-    settings: dict[str, JsonValue]  # values by scenario key
+    settings: Table  # values by scenario key
     requested_ns: Nanoseconds  # simulated time of the request
     requested_at: str  # date and time of the request; or that the scenario contains the change
     kept_losses: dict[str, FiniteFloat] = {}
@@ -105,9 +106,9 @@ class ChangeReply(ControlMessage):
     t_s: FiniteFloat
     from_s: FiniteFloat | None
     """Simulated time from which the change applies; None if none was requested."""
-    runtime_parameters: dict[str, JsonValue]
+    runtime_parameters: Table
     """Values by scenario key, all announced changes included."""
-    loops: dict[str, dict[str, JsonValue]]
+    loops: dict[str, Table]
     """The same for the loops of each entry of [[loops]], by its name."""
     changed_loops: tuple[str, ...]
     """The entries with another value than before the request."""

@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import zenoh
 from zenoh import CongestionControl, Priority
-from zenoh.handlers import FifoChannel, RingChannel
+from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from noack.core.errors import CallerError, NoAnswerError, PeerError
 from noack.impairments.loss_prediction import remember
@@ -95,7 +95,7 @@ def session_config(path: str, *, listen: bool) -> zenoh.Config:
     """Return the zenoh configuration of a session that listens on a socket, or connects to it."""
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
-    settings: dict[str, Any] = {
+    settings: dict[str, object] = {
         "mode": "router" if listen else "client",
         f"{side}/endpoints": [f"unixsock-stream/{path}"],
         f"{other}/endpoints": [],
@@ -134,7 +134,11 @@ def answer_to(
 
 
 def first_reply(
-    replies: Any, until_s: float, *, poll_s: float, give_up: Callable[[], bool] = lambda: False
+    replies: Handler[zenoh.Reply],
+    until_s: float,
+    *,
+    poll_s: float,
+    give_up: Callable[[], bool] = lambda: False,
 ) -> zenoh.Reply | None:
     """Return the first reply before a reading of the monotonic clock; None without one.
 
@@ -143,7 +147,7 @@ def first_reply(
     began_s = time.monotonic()
     while (now_s := time.monotonic()) < until_s and not give_up():
         try:
-            reply: zenoh.Reply | None = replies.try_recv()
+            reply = replies.try_recv()
         except zenoh.ZError:  # the query ended without an answer
             return None
         if reply is not None:
@@ -168,12 +172,11 @@ def header_of(sample: zenoh.Sample) -> bytes | None:
     return header if key == str(sample.key_expr).encode() else None
 
 
-def next_payload(subscriber: Any) -> bytes | None:
+def next_payload(subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]") -> bytes | None:
     """Return the payload of a subscriber's next message with its key; None without one."""
     while (sample := subscriber.try_recv()) is not None:
         if header_of(sample) is not None:
-            payload: bytes = sample.payload.to_bytes()
-            return payload
+            return sample.payload.to_bytes()
     return None
 
 
@@ -257,10 +260,20 @@ class ControlPlane:
         since_s = self._coordinator_gone_s
         return since_s is not None and time.monotonic() - since_s >= for_s
 
-    def publish(self, *parts: str, content: str | bytes, header: bytes = b"", **how: Any) -> None:
-        """Send a message to the subscribers of a key; ``how`` has options of zenoh."""
+    def publish(
+        self,
+        *parts: str,
+        content: str | bytes,
+        header: bytes = b"",
+        priority: Priority | None = None,
+        congestion_control: CongestionControl | None = None,
+    ) -> None:
+        """Send a message to the subscribers of a key."""
         key = self.key(*parts)
-        self.session.put(key, content, attachment=label(key, header), **how)
+        self.session.put(
+            key, content, attachment=label(key, header),
+            priority=priority, congestion_control=congestion_control,
+        )  # fmt: skip
 
     def request_stop(self, reason: str) -> None:
         """Ask all processes of the run to stop."""
@@ -300,13 +313,17 @@ class ControlPlane:
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        how = {"congestion_control": CongestionControl.DROP, "priority": Priority.BACKGROUND}
-        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
+        self.publish(
+            "telemetry", self.role, table, content=payload, header=header,
+            priority=Priority.BACKGROUND, congestion_control=CongestionControl.DROP,
+        )  # fmt: skip
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        how = {"congestion_control": CongestionControl.BLOCK}
-        self.publish("telemetry", self.role, table, content=payload, header=header, **how)
+        block = CongestionControl.BLOCK
+        self.publish(
+            "telemetry", self.role, table, content=payload, header=header, congestion_control=block
+        )
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:

@@ -10,12 +10,12 @@ import socket
 import weakref
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import numpy as np
 
 from noack.core.clock import RunClock
-from noack.core.core_library import core, ffi
+from noack.core.core_library import CData, core, ffi
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.topology import ENDS, RECEIVES, SENDS, receiver_of, sender_to
 from noack.protocol.wire_format import (
@@ -103,7 +103,7 @@ class LiveDriver:
     ) -> None:
         self.machines, self._wire = machines, wire
         self._scratch = np.zeros(core.noack_driver_scratch_bytes() + 64, np.uint8)
-        self.core: Any = ffi.new(
+        self.core: CData = ffi.new(
             "noack_driver *",
             {
                 "process": machines.core, "wire": wire.core[0], "clock": {"speed": 1.0},
@@ -203,7 +203,7 @@ class LiveDriver:
             "loops": [reception_report(one) for one in reports],
         }
 
-    def _each_machine(self) -> list[Any]:
+    def _each_machine(self) -> list[CData]:
         process = self.machines.core
         return [core.noack_process_machine(process, loop) for loop in range(process.loops)]
 

@@ -27,8 +27,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVarTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S, RunClock
@@ -52,10 +53,13 @@ _MAPPING = re.compile(
 )
 
 
+Arguments = TypeVarTuple("Arguments")
+
+
 class RowSink(Protocol):
     """Where rows of the record go."""
 
-    def extend_table(self, table: str, rows: NDArray[Any]) -> None:
+    def extend_table(self, table: str, rows: NDArray[np.void]) -> None:
         """Add rows of a table."""
         ...
 
@@ -196,7 +200,7 @@ def realtime(
         yield applied
 
 
-def _attempt(apply: Callable[..., None], *arguments: Any) -> str:
+def _attempt(apply: Callable[[*Arguments], None], *arguments: *Arguments) -> str:
     try:
         apply(*arguments)
     except (OSError, AttributeError) as error:

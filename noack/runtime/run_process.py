@@ -20,7 +20,7 @@ from contextlib import ExitStack, closing, contextmanager
 from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from setproctitle import setproctitle
 
@@ -115,7 +115,7 @@ class RunProcess:
         """Where in the run its work begins."""
         self.replaces: str | None = None
         """Of a restarted process: how the one before it ended."""
-        self.report: dict[str, Any] = {}
+        self.report: dict[str, object] = {}
         self._applied: dict[str, str] = {}
         self._clock_record: ClockRecord | None = None
 

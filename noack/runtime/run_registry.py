@@ -7,7 +7,7 @@ of its control plane.
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import zenoh
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -69,12 +69,12 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
     raise CallerError(f"no run is active {which}; {active}")
 
 
-def request_change(run: OpenRun, settings: Mapping[str, Any]) -> ChangeReply:
+def request_change(run: OpenRun, settings: Mapping[str, object]) -> ChangeReply:
     """Request a change of runtime parameters; without settings, their values. Return the answer.
 
     Raise CallerError, with one line per mistake, for wrong settings, PeerError without an answer.
     """
-    request = message_json(ChangeRequest(settings=dict(settings)))
+    request = message_json(ChangeRequest.model_validate({"settings": dict(settings)}))
     try:
         with open_session(RUNS, run.name, listen=False) as plane:
             answer = answer_to(plane, f"noack/{run.name}/runtime_parameters", request, _ANSWER_S)

@@ -11,7 +11,6 @@ import io
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +26,7 @@ from noack.scenario.toml_file import brief
 from noack.settings.section import ReadTable, require_shape, rows_of
 from noack.settings.user_files import NamedFile
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[np.generic]]
 NPZ, MAT = ".npz", ".mat"
 GAIN = "gain"
 _GAINS = (GAIN, "K")
@@ -55,9 +54,9 @@ def with_matrices(content: ReadTable, folder: Path, source: str) -> ReadTable:
         ]
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
         section = content.get(table)
-        if isinstance(section, Mapping) and _can_be_read(section):
+        if isinstance(section, Mapping) and (names := _names(section)) is not None:
             file = NamedFile(section["file"], folder, f"{source}: {table}")
-            read[table] = _replaced(section, keys, file)
+            read[table] = _replaced(section, keys, file, names)
     return read
 
 
@@ -66,22 +65,25 @@ def _is_flat(loop: object) -> bool:
     return isinstance(loop, Mapping) and "loops" not in loop
 
 
-def _can_be_read(section: ReadTable) -> bool:
-    """Whether a section names a file correctly; the validation refuses incorrect entries."""
+def _names(section: ReadTable) -> Mapping[str, str] | None:
+    """Return the names of the matrices in a section's file.
+
+    None if it names no file, or has an incorrect entry, which the validation refuses.
+    """
     names = section.get("names", {})
-    return (
-        isinstance(section.get("file"), str)
-        and isinstance(names, Mapping)
-        and all(isinstance(name, str) for name in names.values())
-        and names.keys() <= {"A", "B", GAIN}
-    )
+    if not isinstance(section.get("file"), str) or not isinstance(names, Mapping):
+        return None
+    are_names = all(isinstance(name, str) for name in names.values())
+    return names if are_names and names.keys() <= {"A", "B", GAIN} else None
 
 
-def _replaced(section: ReadTable, keys: tuple[str, ...], file: NamedFile) -> ReadTable:
+def _replaced(
+    section: ReadTable, keys: tuple[str, ...], file: NamedFile, names: Mapping[str, str]
+) -> ReadTable:
     for key in ("A", "B"):
         if key in section:
             file.wrong(f"the file has {key}, and so has the scenario; give one or the other")
-    found = read_matrices(file, dict(section.get("names", {})))
+    found = read_matrices(file, names)
     rest = {key: value for key, value in section.items() if key not in ("file", "names")}
     return {key: found[key].tolist() for key in keys if key in found} | rest
 
@@ -190,7 +192,7 @@ _HEADERS = {
 }
 
 
-def _matrix(file: NamedFile, name: str, value: NDArray[Any]) -> Matrix:
+def _matrix(file: NamedFile, name: str, value: NDArray[np.generic]) -> Matrix:
     if value.dtype.kind not in _NUMBERS:
         file.wrong(f"{name} is not of real numbers")
     if value.ndim != 2 or not value.size:
@@ -208,7 +210,7 @@ def _missing(name: str, arrays: Arrays) -> str:
 
 
 def model_of(
-    system: Any,
+    system: object,
     gain: ArrayLike,
     *,
     state_names: Sequence[str] | None = None,
@@ -237,7 +239,7 @@ def model_of(
         raise CallerError(f"the system: {brief(error)}") from None
 
 
-def save_model(path: str | Path, system: Any, gain: ArrayLike | None = None) -> None:
+def save_model(path: str | Path, system: object, gain: ArrayLike | None = None) -> None:
     """Write an ``.npz`` or ``.mat`` file for ``model.file`` or ``plant.file`` of a scenario.
 
     Without the gain K of u = K x, (m, n), the scenario must give it. Raise CallerError as
@@ -249,7 +251,7 @@ def save_model(path: str | Path, system: Any, gain: ArrayLike | None = None) -> 
         raise CallerError(f"{path}: cannot be written: {error}") from None
 
 
-def matrices_of(system: Any, gain: ArrayLike | None = None) -> dict[str, Matrix]:
+def matrices_of(system: object, gain: ArrayLike | None = None) -> dict[str, Matrix]:
     """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
 
     Arguments and errors are those of :func:`model_of`.
@@ -266,7 +268,7 @@ def matrices_of(system: Any, gain: ArrayLike | None = None) -> dict[str, Matrix]
                 f"the system: an object of type {type(system).__name__} has no {missing[0]}; "
                 "give a state space, e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
             )
-        A, B, C, D, dt = system.A, system.B, system.C, system.D, getattr(system, "dt", None)
+        A, B, C, D, dt = (getattr(system, key, None) for key in ("A", "B", "C", "D", "dt"))
     found = {"A": _numbers_of("A", A), "B": _numbers_of("B", B)}
     n, m = found["B"].shape
     try:

@@ -11,7 +11,7 @@ import json
 from bisect import bisect
 from collections.abc import Callable, Iterator
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -140,34 +140,40 @@ def announcement_outputs(
     return outputs
 
 
-class AppliedParameters(NamedTuple):
+Prepared = TypeVar("Prepared", covariant=True)
+
+
+class AppliedParameters(NamedTuple, Generic[Prepared]):
     """A scenario, and the machine's own time from which it is in force."""
 
     since_ns: int
     number: int  # number of the change; −1 for the run's initial scenario
     settings: ReadTable
     scenario: Scenario
-    prepared: Any  # data that the machine computed from the scenario when the change was announced
+    prepared: Prepared | None
+    """Data that the machine computed from the scenario when the change was announced."""
 
 
-class ChangeSchedule:
+class ChangeSchedule(Generic[Prepared]):
     """The scenarios of a run in the order of time, as announced to a machine.
 
     ``prepare`` computes the data that the machine needs of a scenario, before it is in force.
     """
 
     def __init__(
-        self, scenario: Scenario, prepare: Callable[[Scenario], Any] = lambda scenario: None
+        self, scenario: Scenario, prepare: Callable[[Scenario], Prepared] | None = None
     ) -> None:
         self._prepare = prepare
-        self._results: dict[tuple[tuple[int, int], ...], tuple[Scenario, Any, Any]] = {}
-        self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
+        self._results: dict[
+            tuple[tuple[int, int], ...], tuple[Scenario, Prepared | None, ReadTable]
+        ] = {}
+        self._all = [AppliedParameters[Prepared](-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
         """Time at which the next scenario that is not yet applied takes effect; None if there is
         none."""
 
-    def of_alike(self, scenario: Scenario) -> "ChangeSchedule":
+    def of_alike(self, scenario: Scenario) -> "ChangeSchedule[Prepared]":
         """Return a schedule for a loop that differs in its draws only.
 
         What the same changes make of the scenario is computed once for both.
@@ -194,9 +200,9 @@ class ChangeSchedule:
         """Raise CallerError if the scenario would be invalid after a change; announce nothing."""
         self._with(change, max(change.t_ns, reached_ns + 1))
 
-    def _with(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters]:
+    def _with(self, change: ParameterChange, since_ns: int) -> list[AppliedParameters[Prepared]]:
         """Return the scenarios with a change that is in force from a time on."""
-        entry = AppliedParameters(
+        entry = AppliedParameters[Prepared](
             since_ns, change.number, change.settings, self._all[0].scenario, None
         )
         every = [*self._all]
@@ -208,12 +214,13 @@ class ChangeSchedule:
             if key not in self._results:
                 scenario, own = every[place - 1].scenario, every[place].settings
                 scenario = changed(scenario, own)
-                self._results[key] = scenario, self._prepare(scenario), own  # the id stays its own
+                prepared = self._prepare(scenario) if self._prepare is not None else None
+                self._results[key] = scenario, prepared, own  # the id stays its own
             scenario, prepared, _ = self._results[key]
             every[place] = every[place]._replace(scenario=scenario, prepared=prepared)
         return every
 
-    def take(self, t_ns: int) -> AppliedParameters | None:
+    def take(self, t_ns: int) -> AppliedParameters[Prepared] | None:
         """Return the next scenario that is due at a time and not yet applied, or None."""
         if self.next_ns is None or self.next_ns > t_ns:
             return None
@@ -232,7 +239,7 @@ class ChangeSchedule:
         """The scenario with all announced changes."""
         return self._all[-1].scenario
 
-    def at(self, t_ns: int) -> AppliedParameters:
+    def at(self, t_ns: int) -> AppliedParameters[Prepared]:
         """The scenario that is in force at a time."""
         return self._all[bisect(self._all, t_ns, key=lambda one: one.since_ns) - 1]
 

@@ -66,19 +66,24 @@ def require_runtime_parameters(settings: ReadTable, trigger: PolicySettings) -> 
 
 def put_settings(content: Table, settings: ReadTable) -> None:
     """Write checked settings into a scenario's content; a new loss model replaces all its keys."""
-    model = f"{LOSS}.model"
-    if model in settings and settings[model] != content["network"]["loss"].get("model"):
-        content["network"]["loss"] = {}
+    if (model := f"{LOSS}.model") in settings:
+        network = _inner_table(content, "network", model)
+        if settings[model] != _inner_table(network, "loss", model).get("model"):
+            network["loss"] = {}
     # A table before the keys in it.
     for key in sorted(settings):
         table = content
         *path, last = key.split(".")
         for part in path:
-            inner = table.setdefault(part, {})
-            if not isinstance(inner, dict):
-                raise ValueError(f"{key}: {part} is not a table")
-            table = inner
+            table = _inner_table(table, part, key)
         table[last] = settings[key]
+
+
+def _inner_table(table: Table, part: str, key: str) -> Table:
+    inner = table.setdefault(part, {})
+    if not isinstance(inner, dict):
+        raise ValueError(f"{key}: {part} is not a table")
+    return inner
 
 
 def is_of_loss_alone(settings: ReadTable) -> bool:

@@ -109,15 +109,17 @@ def with_loop_tables(
     sections = []
     for place, section in enumerate(scenario.loops or ()):
         update: Table = {}
+        file = section.scenario if isinstance(section.scenario, dict) else {}
         changed = change(f"loops.{place}", loop_scenario(scenario, section))
         for path, table in changed.items():
             part, _, inner = path.partition(".")
             content = table.content()
             if (own := getattr(section, part)) is not None and (not inner or inner in own):
                 update[part] = own | {inner: content} if inner else content
-            elif part in (file := update.get("scenario", section.scenario) or {}):
-                own = file[part] | {inner: content} if inner else content
-                update["scenario"] = file | {part: own}
+            elif part in file:
+                given = file[part]
+                own = given | {inner: content} if inner and isinstance(given, dict) else content
+                update["scenario"] = file = {**file, part: own}
         sections.append(section.model_copy(update=update))
     return scenario.model_copy(update={"loops": tuple(sections) or None})
 
@@ -209,7 +211,7 @@ def _seeds(
 @cache
 def parts_model(parts: frozenset[str], *, others: bool = False) -> type[ScenarioSection]:
     """Return a model of some of a scenario's parts; with ``others``, those are optional keys."""
-    fields: Table = {}
+    fields: dict[str, Any] = {}
     for name, field in Scenario.model_fields.items():
         kind: Any = field.annotation
         if name in parts:

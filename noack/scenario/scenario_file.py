@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from os.path import commonprefix
 from pathlib import Path
-from typing import Any
 
 import tomli_w
 
@@ -201,7 +200,7 @@ def _apply(content: Table, override: str) -> str:
     return name
 
 
-def value_of(text: str, source: str) -> Any:
+def value_of(text: str, source: str) -> object:
     """Return the value of a text on the command line; a bare word is a string.
 
     Raise CallerError if the text is not a TOML value; ``source`` names it.
@@ -214,7 +213,7 @@ def value_of(text: str, source: str) -> Any:
         return text
 
 
-def put(content: Table, key: str, value: Any, source: str) -> None:
+def put(content: Table, key: str, value: object, source: str) -> None:
     """Set the value of a key such as ``trigger.beta``, which may be short; create missing tables.
 
     An entry of a list is named by its number: ``network.impairments.0.rate_bps``.
@@ -223,23 +222,41 @@ def put(content: Table, key: str, value: Any, source: str) -> None:
         CallerError: a part of the key is a value, not a table; a list has no such entry; or the key
             has too many parts.
     """
-    table: Any = content
+    table: object = content
     *path, last = full_key(key).split(".")
     if len(path) >= toml_file.MOST_LEVELS:
         raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
     for depth, part in enumerate(path):
-        place = _place(table, part, f"{source}: {'.'.join(path[:depth])}")
-        table = table.setdefault(place, {}) if isinstance(table, dict) else table[place]
-    table[_place(table, last, f"{source}: {'.'.join(path)}")] = copy.deepcopy(value)
-
-
-def _place(table: Any, part: str, source: str) -> Any:
-    """Return a key of a table, or the number of an entry of a list."""
+        if isinstance(table, dict):
+            table = table.setdefault(part, {})
+        else:
+            entries, number = _entry(table, part, f"{source}: {'.'.join(path[:depth])}")
+            table = entries[number]
     if isinstance(table, dict):
-        return part
+        table[last] = copy.deepcopy(value)
+    else:
+        entries, number = _entry(table, last, f"{source}: {'.'.join(path)}")
+        entries[number] = copy.deepcopy(value)
+
+
+def remove(content: Table, key: str) -> None:
+    """Remove a key such as ``trigger.beta``, which may be short; it need not be there."""
+    table: object = content
+    *path, last = full_key(key).split(".")
+    for part in path:
+        if isinstance(table, list) and part.isdecimal():
+            table = table[int(part)] if int(part) < len(table) else None
+        else:
+            table = table.get(part) if isinstance(table, dict) else None
+    if isinstance(table, dict):
+        table.pop(last, None)
+
+
+def _entry(table: object, part: str, source: str) -> tuple[list[object], int]:
+    """Return a list and the number of its entry that a part of a key names."""
     if not isinstance(table, list):
         raise CallerError(printable(f"{source} is not a table"))
     if part.isdecimal() and int(part) < len(table):
-        return int(part)
+        return table, int(part)
     entries = f"the entries 0 to {len(table) - 1}" if table else "no entries"
     raise CallerError(printable(f"{source} has {entries}, not {part}"))

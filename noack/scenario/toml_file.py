@@ -15,7 +15,6 @@ from pathlib import Path
 from types import UnionType
 from typing import (
     Annotated,
-    Any,
     Literal,
     NamedTuple,
     TypeAlias,
@@ -33,7 +32,6 @@ from noack.core.file_access import read_regular
 from noack.settings.section import ReadTable, ScenarioSection, Table
 
 M = TypeVar("M", bound=ScenarioSection)
-Value: TypeAlias = Any  # what JSON has
 Kind: TypeAlias = object
 """The annotation of a value: a class, a union, a list."""
 
@@ -400,7 +398,7 @@ def _choices(kind: Kind) -> tuple[Mapping[str, type[ScenarioSection]], str]:
     return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
 
-def _own_check(key: str, value: Value, message: str) -> str:
+def _own_check(key: str, value: object, message: str) -> str:
     """Add key and value to the message of a section's check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
@@ -408,9 +406,11 @@ def _own_check(key: str, value: Value, message: str) -> str:
         return f"{key}{shown}: {message}"
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
-        try:
-            value = value[int(part) if isinstance(value, list) else part]
-        except (KeyError, IndexError, ValueError, TypeError):
+        if isinstance(value, list) and part.isdecimal() and int(part) < len(value):
+            value = value[int(part)]
+        elif isinstance(value, Mapping) and part in value:
+            value = value[part]
+        else:
             return f"{path}: {rest}"
     return f"{path} = {show_value(value)}: {rest}"
 

@@ -14,7 +14,7 @@ from importlib import import_module
 from itertools import pairwise
 from operator import or_
 from pkgutil import iter_modules
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -32,9 +32,9 @@ from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
 
-Table = dict[str, Any]
-"""A table of a settings file before it is validated: the values that JSON has."""
-ReadTable = Mapping[str, Any]
+Table = dict[str, object]
+"""A table of a settings file before it is validated: the values that JSON or TOML has."""
+ReadTable = Mapping[str, object]
 """The same, where it is only read."""
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -206,7 +206,7 @@ def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[s
 
 def union_of(
     kinds: Mapping[str, type[ScenarioSection]], key: str = "kind", default: str | None = None
-) -> Any:
+) -> object:
     """Return the type of a table that is one of these kinds, for pydantic.
 
     The field ``key`` names the kind; it may be omitted in a table of the kind ``default``.

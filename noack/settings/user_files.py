@@ -93,7 +93,7 @@ class FileSettings(ScenarioSection):
 def file_tables(scenario: BaseModel) -> Iterator[tuple[str, FileSettings]]:
     """Return the tables of a scenario that name a file, each with its place."""
     for place in PLACES:
-        table: Any = scenario
+        table: object = scenario
         for part in place.split("."):
             table = getattr(table, part)
         if isinstance(table, FileSettings) and table.file is not None:

@@ -57,7 +57,7 @@ def _texts(file: IO[bytes]) -> Iterator[str]:
         yield piece.decode("ascii", errors="replace")  # only numbers and fixed words are used
 
 
-def _entries(texts: Iterator[str]) -> Iterator[Any]:
+def _entries(texts: Iterator[str]) -> Iterator[object]:
     text = ""
     for piece in texts:
         text += piece

@@ -12,7 +12,6 @@ measurements*, INFOCOM 1999.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,12 +124,12 @@ def packet_trace(
     return _with_missing(number, sent, np.where(lost, LOST_NS, received))
 
 
-def _refuse(places: NDArray[Any], row: NDArray[Any], message: str) -> None:
+def _refuse(places: NDArray[np.intp], row: Int64s, message: str) -> None:
     if len(places):
         raise TraceRecordError(int(row[places[0]]), message)
 
 
-def _check_numbers(number: Int64s, row: NDArray[Any], most_packets: int) -> None:
+def _check_numbers(number: Int64s, row: Int64s, most_packets: int) -> None:
     again = np.flatnonzero(number[1:] == number[:-1]) + 1
     _refuse(again, row, "has a sequence number that an earlier record has")
     packets = int(number[-1]) - int(number[0]) + 1

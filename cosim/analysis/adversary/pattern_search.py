@@ -13,7 +13,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,9 @@ class Nodes(NamedTuple):
 
     def take(self, which: Indices | Flags | slice) -> "Nodes":
         """Return a selection of the runs."""
-        columns: Sequence[Any] = self
-        return Nodes(*(column[which] for column in columns))
+        return Nodes(
+            self.t_s[which], self.z[which], self.state[which], self.value[which], self.entry[which]
+        )
 
 
 def root(flow: PatternFlow) -> Nodes:

@@ -226,7 +226,7 @@ class Worst:
         """The pattern, one letter per event: ``D`` delivered, ``L`` lost."""
         return outcome_letters(self.pattern)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all fields for JSON; an infinite value becomes null."""
         found = asdict(self) | {
             "objective": self.objective.value,
@@ -274,7 +274,7 @@ def _square_integral(constants: Constants, until_s: float) -> float:
 
 def document(
     found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate, trigger: str
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the results as JSON."""
     return {
         "scenario": resolved.name,

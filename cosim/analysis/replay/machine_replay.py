@@ -7,7 +7,6 @@ difference, and answers what the core asks: for users' code, and for changes of 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from cosim.record.record_source import Rows, Slice
 from cosim.record.run_record import RunRecord
 from netem.channel import NO_TIME_NS, Channel, channel_of
 from noack.core.cached_method import cached_method
-from noack.core.core_library import core, ffi, pointer_to
+from noack.core.core_library import CData, core, ffi, pointer_to
 from noack.core.errors import CallerError
 from noack.machines.loop_machines import LoopMachines
 from noack.protocol.machine_interface import GENERATION, Record, Start
@@ -71,7 +70,7 @@ class InputReplay:
         self._machine, self._sizes = machine, sizes
         self._is_network = isinstance(machine, Channel)
         width = _DATAGRAM_WORDS if self._is_network else _HEADER_WORDS + max(sizes.values())
-        self._core: Any = ffi.new("noack_input_replay *", {
+        self._core: CData = ffi.new("noack_input_replay *", {
             "role": _ROLES[role], "before_ns": -(2**63), "sent_width": width, "loop": loop,
             ("channel" if self._is_network else "process"): machine.core,
         })  # fmt: skip
@@ -184,12 +183,14 @@ class InputReplay:
             number = place_of.number(table, row)
             self.difference = rows_differ(table, number, rows[row], replayed[0])
 
-    def _note(self, place_of: "_Places", at: int, what: str, *values: Any) -> None:
+    def _note(
+        self, place_of: "_Places", at: int, what: str, column: str = "", *values: int | None
+    ) -> None:
         """Keep a difference at an input, if it is the first one."""
         table, row, rows = place_of(at)
         number, now_ns = place_of.number(table, row), int(rows["now_ns"][row])
         if self.difference is None:
-            self.difference = difference(table, number, now_ns, what, *values)
+            self.difference = difference(table, number, now_ns, what, column, *values)
 
 
 class _Places:
@@ -241,10 +242,9 @@ def received_words(table: str, rows: Rows) -> tuple[Numbers, list[str]]:
     return words, names
 
 
-def _recorded_table(table: str, rows: Rows) -> dict[str, Any]:
+def _recorded_table(table: str, rows: Rows) -> dict[str, object]:
     """Return a ``noack_recorded_table``; it is valid while the rows live."""
     skipped, stride = _prefix_bytes(rows.dtype), rows.dtype.itemsize
-    fields: Mapping[str, Any] = rows.dtype.fields or {}
     vector: list[tuple[int, int]] = []
     if table in SETTINGS:
         kind = core.NOACK_SETTINGS
@@ -254,7 +254,7 @@ def _recorded_table(table: str, rows: Rows) -> dict[str, Any]:
         kind = core.NOACK_ACKNOWLEDGEMENTS
     else:
         kind = core.NOACK_MESSAGES
-        if OWNER[table] != "netem":
+        if OWNER[table] != "netem" and (fields := rows.dtype.fields) is not None:
             columns = (fields[column] for column in received_columns(table, rows.dtype))
             vector = [(offset - skipped, of.shape[0]) for of, offset, *_ in columns]
     return {
@@ -271,7 +271,7 @@ def _prefix_bytes(dtype: np.dtype[np.void]) -> int:
     return 2 * (LOOP in (dtype.names or ()))
 
 
-def _settings(data: bytes) -> dict[str, Any]:
+def _settings(data: bytes) -> dict[str, object]:
     """Return the changes of settings without the invalid ones of a damaged record."""
     try:
         return settings_of(data)

@@ -3,9 +3,9 @@
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -45,7 +45,7 @@ def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> R
     raise ValueError("the rows are equal")
 
 
-def first_entry(recorded: Any, replayed: Any) -> tuple[int, object, object] | None:
+def first_entry(recorded: ArrayLike, replayed: ArrayLike) -> tuple[int, object, object] | None:
     """Return index and values of the first entry in which a column's two values differ."""
     pairs = zip(np.atleast_1d(recorded), np.atleast_1d(replayed), strict=True)
     for i, (one, other) in enumerate(pairs):
@@ -145,7 +145,7 @@ class Replay(SummaryPart):
             first_difference=self.first_difference,
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, object]:
         """The complete result for JSON."""
         verdict = self.verdict().model_dump(exclude={"error"})
         return verdict | {"gaps": self.gaps} | self.model_dump()

@@ -1,7 +1,7 @@
 """``noack run``, ``demo``, ``simulate``, ``set``: make a run, or change one that goes on."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
@@ -16,7 +16,7 @@ from cosim.cli.execute_run import (
     warn_of_violations,
 )
 from cosim.lazy_modules import lazy_modules
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError
 from noack.core.number_format import number
 
 with lazy_modules():
@@ -111,33 +111,30 @@ def _simulate_continuously(loaded: "scenario.Scenario", *, json: bool) -> int:
         run = continuous.run_continuous(resolved)
     found = continuous.summary(run, resolved)
     cli.show(json, lambda: continuous.document(run, resolved), _print_run, run, found)
-    return ExitStatus(found["exit"]["status"])
+    return found.exit_status
 
 
-def _print_run(console: "Console", run: "continuous.ContinuousRun", found: dict[str, Any]) -> None:
+def _print_run(
+    console: "Console", run: "continuous.ContinuousRun", found: "continuous.ContinuousSummary"
+) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     import numpy as np  # help and completion need neither of the two
     from rich.text import Text
 
-    ending = run_verdict.ending_line(
-        summary_model.ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"]
-    )
-    for line in (ending, run_verdict.transmission_line(found["events"], found["deliveries"])):
+    ended = summary_model.ExitPart(status=int(found.exit_status), reason=found.reason)
+    ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s)
+    for line in (ending, run_verdict.transmission_line(found.events, found.deliveries)):
         console.print(Text(line.text, line.style), soft_wrap=True)
-    mansd = found["mansd"]
     rows = (
-        run_tables.lost_row(found["drops"], found["deliveries"]),
-        run_tables.longest_burst(mansd, (), found["longest_loss_burst"]),
+        run_tables.lost_row(found.drops, found.deliveries),
+        run_tables.longest_burst(found.mansd, (), found.longest_loss_burst),
         *run_tables.interval_rows(
-            *(
-                found[key]
-                for key in ("inter_event_min_s", "inter_event_median_s", "inter_delivery_median_s")
-            )
+            found.inter_event_min_s, found.inter_event_median_s, found.inter_delivery_median_s
         ),
-        ("‖x‖ at the start", number(found["initial_state_norm"])),
-        ("‖x‖ at the end", number(found["final_state_norm"])),
+        ("‖x‖ at the start", number(found.initial_state_norm)),
+        ("‖x‖ at the end", number(found.final_state_norm)),
     )
-    title = run_tables.title_of(found["scenario"], found["mode"], mansd, (), found["kind"])
+    title = run_tables.title_of(found.scenario, found.mode, found.mansd, (), "continuous")
     run_verdict.print_numbers(console, title, rows)
     since_s = np.diff(run.event_s, prepend=0.0)
     with np.errstate(all="ignore"):  # a run may diverge
@@ -204,12 +201,12 @@ def set_(
         _print_parameters(cli.console(), answer)
 
 
-def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
+def parsed(words: list[str] | tuple[str, ...]) -> dict[str, object]:
     """Return the settings that words give as KEY VALUE or KEY=VALUE.
 
     Raise CallerError if a value is missing, or a key is given twice.
     """
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     left = list(words)
     while left:
         word = left.pop(0)

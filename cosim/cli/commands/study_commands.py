@@ -348,8 +348,8 @@ class StudyOptions(cli.ScenarioOptions):
                     f"--policy {text}: write it as NAME=TRIGGER, with a new name of letters, "
                     "digits, _ and -"
                 )
-            change = {"trigger": scenario_file.value_of(trigger, f"--policy {name}")}
-            found[name] = {"loops": [kind.under(change) for kind in kinds]}
+            value: Any = scenario_file.value_of(trigger, f"--policy {name}")
+            found[name] = {"loops": [kind.under({"trigger": value}) for kind in kinds]}
         return found
 
 

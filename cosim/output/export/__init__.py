@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from cosim.lazy_modules import lazy_modules
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, read_object
@@ -38,7 +39,7 @@ class ExportedRun:
     directory: Path
     record: "RunRecord"
     """Of the only loop, or of the network that the loops share."""
-    summary: dict[str, Any]
+    summary: dict[str, object]
     """The content of ``summary.json``, or its part about the loop."""
     inner: "Sequence[ExportedRun]" = ()
     """The loops that share the network."""
@@ -48,7 +49,7 @@ class ExportedRun:
     """Time of the run at which the loop's own time begins."""
 
     @property
-    def environment(self) -> dict[str, Any]:
+    def environment(self) -> dict[str, object]:
         """The content of ``environment.json``."""
         kind = {"kind": self.record.kind}
         return read_object(self.directory / ENVIRONMENT_FILE) | kind
@@ -93,7 +94,7 @@ def export_suffix(kind: str) -> str:
     return str(_module(kind).SUFFIX)
 
 
-def _module(kind: str) -> Any:
+def _module(kind: str) -> ModuleType:
     return import_module(f"{__name__}.{kind}{_ENDING}")
 
 

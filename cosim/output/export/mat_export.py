@@ -2,11 +2,12 @@
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.analysis.certificates import certificates_of
 from cosim.output.export import ExportedRun
@@ -30,7 +31,7 @@ def write(run: ExportedRun, path: Path, *, certificates: bool = True) -> list[Pa
     return save_mat(_content(run, certificates=certificates), path)
 
 
-def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
+def save_mat(content: Mapping[str, object], path: Path) -> list[Path]:
     """Write a document of JSON, or arrays, as variables; return the path.
 
     Raises:
@@ -41,16 +42,16 @@ def save_mat(content: Mapping[str, Any], path: Path) -> list[Path]:
     buffer = io.BytesIO()
     try:
         file: Any = buffer  # SciPy's types know names of files only
-        savemat(file, _structure(content), oned_as="column")
+        savemat(file, _fields(content), oned_as="column")
     except (ValueError, OverflowError, TypeError) as error:
         raise MachineError(f"{path}: not possible as a .mat file of version 5: {error}") from None
     header = b"MATLAB 5.0 MAT-file, written by noack".ljust(116)  # without a date
     return [write_whole(path, header + buffer.getvalue()[len(header) :])]
 
 
-def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
+def _content(run: ExportedRun, *, certificates: bool) -> dict[str, object]:
     record = run.record
-    found: dict[str, Any] = {table: _columns(record[table]) for table in record.tables}
+    found: dict[str, object] = {table: _columns(record[table]) for table in record.tables}
     found["summary"] = run.summary
     found["scenario"] = record.scenario.model_dump(mode="json", exclude_none=True)
     found["environment"] = run.environment
@@ -71,7 +72,7 @@ def _content(run: ExportedRun, *, certificates: bool) -> dict[str, Any]:
     return found
 
 
-def _certificates(scenario: Scenario) -> dict[str, Any]:
+def _certificates(scenario: Scenario) -> dict[str, object]:
     """Return the certificates of a scenario, or the reason why there are none."""
     try:
         return certificates_of(scenario).to_json()
@@ -79,9 +80,9 @@ def _certificates(scenario: Scenario) -> dict[str, Any]:
         return {"none": str(error)}
 
 
-def _columns(rows: Rows) -> dict[str, Any]:
+def _columns(rows: Rows) -> dict[str, object]:
     """Return the columns of a table: (k, 1), vectors (k, n), bytes (k, width)."""
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for name in rows.dtype.names or ():
         column = rows[name]
         if column.dtype.kind == "V":
@@ -90,17 +91,21 @@ def _columns(rows: Rows) -> dict[str, Any]:
     return found
 
 
-def _array(values: Any) -> Any:
+def _array(values: NDArray[np.generic]) -> NDArray[np.generic]:
     return values.astype(object) if values.dtype.kind in "OU" else values
 
 
-def _structure(value: Any) -> Any:
+def _fields(content: Mapping[str, object]) -> dict[str, object]:
+    found: dict[str, object] = {}
+    for key, entry in content.items():
+        found[_free_name(_name(key), found)] = _structure(entry)
+    return found
+
+
+def _structure(value: object) -> object:
     """Return a value as :func:`scipy.io.savemat` takes it; None is an empty array."""
     if isinstance(value, Mapping):
-        found: dict[str, Any] = {}
-        for key, entry in value.items():
-            found[_free_name(_name(key), found)] = _structure(entry)
-        return found
+        return _fields(value)
     if value is None:
         return np.zeros((0, 0))
     if isinstance(value, list | tuple):
@@ -108,13 +113,13 @@ def _structure(value: Any) -> Any:
     return value
 
 
-def _array_or_cells(values: list[Any] | tuple[Any, ...]) -> Any:
+def _array_or_cells(values: Sequence[object]) -> NDArray[np.generic]:
     """Return numbers as an array; anything else as a cell array."""
     numeric = [isinstance(one, int | float) and not isinstance(one, bool) for one in values]
     if values and all(numeric):
         return np.array(values, dtype=np.float64)
     if values and all(isinstance(one, list | tuple) and one for one in values):
-        rows = [_array_or_cells(one) for one in values]
+        rows = [_array_or_cells(one) for one in values if isinstance(one, list | tuple)]
         if all(row.dtype == np.float64 and row.shape == rows[0].shape for row in rows):
             return np.array(rows)
     cells = np.empty((len(values), 1), dtype=object)
@@ -129,7 +134,7 @@ def _name(key: str) -> str:
     return (name if name[:1].isalpha() else f"f_{name}")[:_LONGEST_NAME]
 
 
-def _free_name(name: str, taken: Mapping[str, Any]) -> str:
+def _free_name(name: str, taken: Mapping[str, object]) -> str:
     number, free = 1, name
     while free in taken:
         number += 1

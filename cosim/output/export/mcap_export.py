@@ -8,7 +8,7 @@ epoch.
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic_core import to_json
@@ -32,7 +32,7 @@ _CHUNK_BYTES = 2**20
 ERRORS, LOG = "/loop/errors", "/log"
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _HEX = "^([0-9a-f]{2})*$"
-_REAL: dict[str, Any] = {"type": ["number", "null"]}  # null: not finite
+_REAL: dict[str, object] = {"type": ["number", "null"]}  # null: not finite
 _TABLES = {table.name: table for table in TABLES}
 _SCHEMAS = json.loads(Path(__file__).with_name("mcap_schemas.json").read_bytes())
 """Of the messages that are no rows of a table."""
@@ -84,9 +84,9 @@ def _write(writer: "Writer", run: ExportedRun) -> None:
         _write_errors(writer, one)
 
 
-def _channel(writer: "Writer", run: ExportedRun, topic: str, schema: dict[str, Any]) -> int:
+def _channel(writer: "Writer", run: ExportedRun, topic: str, schema: dict[str, object]) -> int:
     prefix = f"/{run.name}" if run.name else ""
-    schema_id = writer.register_schema(schema["title"], "jsonschema", to_json(schema))
+    schema_id = writer.register_schema(str(schema["title"]), "jsonschema", to_json(schema))
     names = {}
     if not run.record.is_network:
         loop = run.record.loop
@@ -123,7 +123,7 @@ def _messages(rows: Rows, phase_ns: int) -> Iterator[Message]:
         yield (*times, sequence, to_json(content, inf_nan_mode="null"))  # type: ignore[misc]
 
 
-def _values(name: str, column: Rows) -> Callable[[int], Any]:
+def _values(name: str, column: Rows) -> Callable[[int], object]:
     if column.dtype.kind != "V":
         values = column.tolist()
         return lambda i: values[i]
@@ -174,7 +174,7 @@ def _topic(table: str) -> str:
     return f"/{owner}/{table.removeprefix(f'{owner}_')}"
 
 
-def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, Any]:
+def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, object]:
     """Return the JSON Schema of a table's messages; a vector is an array.
 
     Args:
@@ -182,7 +182,7 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, Any]:
         rows: type of its rows in the run.
     """
     described = {column.name: column for column in (*COMMON, *_TABLES[table].columns)}
-    properties: dict[str, Any] = {}
+    properties: dict[str, object] = {}
     for name in rows.names or ():
         unit = described[name].unit
         text = described[name].meaning + (f" [{unit}]" if unit else "")
@@ -193,7 +193,7 @@ def _schema(table: str, rows: np.dtype[np.void]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _type(name: str, field: np.dtype[Any]) -> dict[str, Any]:
+def _type(name: str, field: np.dtype[np.generic]) -> dict[str, object]:
     if field.kind == "V" and field.subdtype is None:
         return {"type": "string"} if name == "change" else {"type": "string", "pattern": _HEX}
     one = _REAL if field.base.kind == "f" else {"type": "integer"}

@@ -31,7 +31,7 @@ from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Self
+from typing import IO, Self
 from urllib.parse import parse_qs, quote
 
 from cosim.analysis.network_summary import worst_loop
@@ -220,7 +220,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
         super().end_headers()
 
-    def log_message(self, *_: Any) -> None:
+    def log_message(self, *_: object) -> None:
         """Log nothing."""
 
     def _send_to_recording(self, path: str, query: str) -> None:
@@ -464,7 +464,7 @@ def script_to_open_at(t_ns: int) -> bytes:
     return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
 
 
-def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]) -> None:
+def move_window_to(t_ns: int, window: "subprocess.Popen[bytes]", output: IO[bytes]) -> None:
     """Move the cursor of a window once the recording is loaded, unless the window closes before.
 
     Args:

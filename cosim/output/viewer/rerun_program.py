@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from noack.core.errors import MachineError, PeerError
 
@@ -59,7 +59,10 @@ def start_rerun(
 
 
 def logged_port(
-    process: "subprocess.Popen[Any]", output: IO[bytes], address: re.Pattern[bytes], within_s: float
+    process: "subprocess.Popen[bytes]",
+    output: IO[bytes],
+    address: re.Pattern[bytes],
+    within_s: float,
 ) -> int | None:
     """Wait until rerun logs an address; return its port, None if that takes too long.
 
@@ -77,7 +80,9 @@ def logged_port(
     return None
 
 
-def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) -> None:
+def end_process(
+    process: "subprocess.Popen[bytes] | subprocess.Popen[str]", *, patience_s: float = 0.0
+) -> None:
     """End a process that was asked to end ``patience_s`` ago, by SIGTERM, then by SIGKILL."""
     for wait_s, act in ((patience_s, process.terminate), (1.0, process.kill)):
         with contextlib.suppress(subprocess.TimeoutExpired):

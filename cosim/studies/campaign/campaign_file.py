@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, cast
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self, cast
 
 from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
@@ -30,7 +30,7 @@ Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
 
 
-def _require_scalar(given: Any) -> Any:
+def _require_scalar(given: object) -> object:
     if isinstance(given, list | dict):
         raise ValueError(
             "should be a number, a text, true or false; for matrices and tables use variants, "
@@ -63,7 +63,7 @@ def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | N
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
 
 
-def scales_loops(key: str, value: Any) -> bool:
+def scales_loops(key: str, value: object) -> bool:
     """Whether a setting is a number of loops, which is applied after all other settings."""
     return key == LOOPS and isinstance(value, int)
 

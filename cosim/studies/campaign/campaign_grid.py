@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from noack.scenario import toml_file
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import completed, put
-from noack.settings.section import Rows, require_shape
+from noack.settings.section import Rows, Table, require_shape
 
 SCENARIOS = "scenarios"
 
@@ -62,7 +62,7 @@ class ContinuousWork:
         return run_batch(self.setting, self.box.population(self.seed, draws))
 
 
-def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
+def base_of(campaign: Campaign, path: Path) -> tuple[Path, Table]:
     """Return path and content of the scenario of all runs, with the common settings.
 
     Raises:
@@ -99,7 +99,7 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
         values = {axis.name: (axis.numbers or axis.labels)[i] for axis, i in chosen}
         source = f"{path}: at {', '.join(f'{name} = {label}' for name, label in labels.items())}"
         given = [item for axis, i in chosen for item in axis.settings[i].items()]
-        scaled = [value for key, value in given if scales_loops(key, value)]
+        scaled = [value for key, value in given if key == LOOPS and isinstance(value, int)]
         if scaled:
             content.setdefault(LOOPS, [{"name": "loop"}])
         for key, value in given:
@@ -133,7 +133,7 @@ def row_type(points: Sequence[Point]) -> np.dtype[np.void]:
     return work.row_type if isinstance(work, SharedNetworkWork) else ROW
 
 
-def _scaled(entries: Any, value: Any, source: str) -> list[dict[str, Any]]:
+def _scaled(entries: object, value: int, source: str) -> list[Table]:
     """Return the entries of [[loops]] with so many loops in all, in the same proportions."""
     if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
         raise CallerError(f"{source}: loops: should be a list of tables")
@@ -174,13 +174,22 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
                 )
 
 
+class _Measured(TypedDict):
+    """The settings of the metrics that all kinds of work have."""
+
+    Q: Matrix | None
+    R: Matrix | None
+    settle: float
+    most_events: int
+
+
 def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
     """Return the work, and the certified bound Δβ or None."""
     metrics = campaign.metrics
     n, m = scenario.model.dimensions
     Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
     R = _weight(metrics.R, "metrics.R", m, "one row per input")
-    measured: dict[str, Any] = {
+    measured: _Measured = {
         "Q": Q,
         "R": R,
         "settle": metrics.settle,
@@ -190,8 +199,10 @@ def _work(campaign: Campaign, scenario: Scenario) -> tuple[Work, float | None]:
         if campaign.time != "sampled":
             raise CallerError('loops: a network that loops share needs time = "sampled"')
         judges = "loops_claims_held" in campaign.measured_metrics
-        measured |= {"judges": judges, "count_from_s": metrics.count_from_s}
-        work = SharedNetworkWork(in_virtual_time(scenario), campaign.seed, **measured)
+        work = SharedNetworkWork(
+            in_virtual_time(scenario), campaign.seed, **measured,
+            judges=judges, count_from_s=metrics.count_from_s,
+        )  # fmt: skip
         return work, None
     resolved = resolve(scenario)
     if campaign.time == "sampled":

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import tomli_w
 from pydantic_core import to_json
@@ -38,7 +38,7 @@ _MOST_REMARKS = 5
 def write_report(
     summary: CampaignSummary,
     store: Store,
-    base: Mapping[str, Any],
+    base: Mapping[str, object],
     figure_files: FigureFiles | None = None,
 ) -> list[Path]:
     """Write page, summary and figures; return their paths and the path of the runs.
@@ -93,7 +93,7 @@ def claims_table(summary: CampaignSummary) -> ResultTable:
     return ResultTable("claims", what, ("claim", "where", "draws", "verdict"), rows)
 
 
-def page(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> str:
+def page(summary: CampaignSummary, store: Store, base: Mapping[str, object]) -> str:
     """Return the page as HTML; all text except the figures is escaped.
 
     ``base`` is the content of the scenario of all runs.
@@ -241,7 +241,7 @@ class FinishedCampaign(NamedTuple):
 
     summary: CampaignSummary
     store: Store
-    base: Mapping[str, Any]
+    base: Mapping[str, object]
     """The content of the scenario of all runs."""
     made: int
     """Number of runs that were computed now."""

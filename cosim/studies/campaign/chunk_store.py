@@ -129,7 +129,7 @@ class Store:
 
 
 @contextmanager
-def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterator[None]:
+def opened(campaign: Campaign, base: Mapping[str, object], store: Store) -> Iterator[None]:
     """Lock a campaign's folder: a new folder, or one of the same campaign.
 
     The number of draws and the figures may differ from earlier. If no run is missing, code and
@@ -172,7 +172,7 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
         yield
 
 
-def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
+def _claim(folder: Path, manifest: Mapping[str, object]) -> Mapping[str, str]:
     """Write or check the folder's manifest; return the code and libraries of its runs."""
     path = folder / MANIFEST
     try:
@@ -209,10 +209,10 @@ def _identity(campaign: Campaign) -> dict[str, object]:
     return content
 
 
-def _difference(there: Any, here: Any, key: str = "") -> str | None:
+def _difference(there: object, here: object, key: str = "") -> str | None:
     """Return the first difference as text; None if there is none."""
     if isinstance(there, dict) and isinstance(here, dict):
-        names: list[Any] = sorted(there.keys() | here.keys())
+        names: list[object] = sorted(there.keys() | here.keys())
         pairs = [(there.get(name), here.get(name)) for name in names]
     elif isinstance(there, list) and isinstance(here, list):
         if len(there) != len(here):

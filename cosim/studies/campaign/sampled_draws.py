@@ -13,7 +13,6 @@ Runs of several loops on one network follow at the end.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,7 +164,7 @@ the largest number of events. loops_claims_held: share of the loops of which eve
 loops_guarantee_used: share of the loops that used up the guarantee. updates_late: share of the
 delivered updates that were late. delay_max_s: largest time of a delivered update in the network.
 """
-_OF_ALL: Mapping[str, Callable[[NDArray[Any]], Any]] = {
+_OF_ALL: Mapping[str, Callable[[NDArray[np.float64]], float]] = {
     "transmissions": np.sum, "deliveries": np.sum, "longest_loss_burst": np.max,
     "inter_event_min_s": np.min, "inter_event_mean_s": np.mean, "settling_s": np.max,
     "cost": np.mean, "sup_e_c_scaled": np.max, "final_norm": np.max,
@@ -254,7 +253,7 @@ def _updates(record: RunRecord, from_s: float) -> Rows:
     return counted
 
 
-def used_up(fates: NDArray[Any], burst: int) -> bool:
+def used_up(fates: NDArray[np.int64], burst: int) -> bool:
     """Whether ``burst`` ≥ 1 consecutive losses include one in a full queue."""
     losses = overflows = 0
     for fate, delivered in zip(fates, effective(fates), strict=True):

@@ -15,9 +15,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from pydantic import JsonValue
 
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Metrics
 from cosim.studies.campaign.sampled_draws import cost_of
@@ -32,7 +33,7 @@ from noack.trigger.periodic_trigger import PeriodicSettings
 
 PERIODIC, ZOH, MODEL = "periodic", "zoh", "model"
 _PERIOD_PER_TIME_CONSTANT = 0.3
-Entry = dict[str, Any]
+Entry = dict[str, JsonValue]
 
 
 class Kind(NamedTuple):
@@ -53,14 +54,14 @@ class Kind(NamedTuple):
         """Whether it is periodic in the scenario."""
         return isinstance(self.scenario.trigger, PeriodicSettings)
 
-    def under(self, change: Mapping[str, Any]) -> Entry:
+    def under(self, change: Mapping[str, JsonValue]) -> Entry:
         """Return its entry with other keys; those that are None are left out."""
         if self.is_periodic:
             return self.entry | {"mode": self.scenario.mode}
         changed = {**self.entry, **change}
         return {key: value for key, value in changed.items() if value is not None}
 
-    def disturbed(self, pulse: Mapping[str, Any], amplitude: float) -> list[dict[str, Any]]:
+    def disturbed(self, pulse: Entry, amplitude: float) -> list[Entry]:
         """Return its disturbances, and with an amplitude a pulse on all its inputs."""
         own = self.scenario.plant.disturbances
         found = [one.model_dump(mode="json", exclude_none=True) for one in own]
@@ -102,13 +103,16 @@ def smallest_mixture(kinds: Sequence[Kind]) -> int:
     return sum(counts) // math.gcd(*counts)
 
 
-def policies_of(kinds: Sequence[Kind]) -> dict[str, dict[str, Any]]:
+def policies_of(kinds: Sequence[Kind]) -> dict[str, Entry]:
     """Return the settings of the policies that are always compared."""
 
-    def settings(mode: str, *, periodic: bool = False) -> dict[str, Any]:
-        triggers = [{"policy": "periodic", "period_s": kind.period_s} for kind in kinds]
-        changes = [{"mode": None} | ({"trigger": one} if periodic else {}) for one in triggers]
-        loops = [kind.under(change) for kind, change in zip(kinds, changes, strict=True)]
+    def settings(mode: str, *, periodic: bool = False) -> Entry:
+        loops: list[JsonValue] = []
+        for kind in kinds:
+            change: Entry = {"mode": None}
+            if periodic:
+                change["trigger"] = {"policy": "periodic", "period_s": kind.period_s}
+            loops.append(kind.under(change))
         return {"mode": mode, "loops": loops}
 
     return {
@@ -184,11 +188,11 @@ class CapacityPlan:
     kinds: tuple[Kind, ...]
     """The kinds of loops."""
     file: Path
-    settings: Mapping[str, Any]
+    settings: Mapping[str, JsonValue]
     """Settings of all runs, which replace the scenario's."""
     deadline_s: float
     counts: tuple[int, ...]
-    policies: Mapping[str, Mapping[str, Any]]
+    policies: Mapping[str, Mapping[str, JsonValue]]
     """Settings of each policy."""
     amplitude: float
     """Amplitude of the common disturbance; 0: no such runs."""
@@ -247,7 +251,7 @@ class CapacityPlan:
         ]
         if self.amplitude:
             begin_s = self.scenario.horizon_s / 2
-            pulse = {"kind": "step", "from_s": begin_s, "until_s": begin_s + _PULSE_S}
+            pulse: Entry = {"kind": "step", "from_s": begin_s, "until_s": begin_s + _PULSE_S}
             variants = {
                 name: {
                     f"loops.{place}.plant.disturbances": kind.disturbed(pulse, amplitude)
@@ -280,13 +284,15 @@ class CapacityPlan:
         title = "number of loops"
         if self.is_one_kind:
             return Axis(name=LOOPS, title=title, key="loops", values=self.counts)
-        shared: dict[str, Any] = {str(count): {"loops": count} for count in self.counts}
-        own = {unshared(count): {"loops": count, **self._faster(count)} for count in self.counts}
+        shared: dict[str, Entry] = {str(count): {"loops": count} for count in self.counts}
+        own: dict[str, Entry] = {
+            unshared(count): {"loops": count, **self._faster(count)} for count in self.counts
+        }
         return Axis(name=LOOPS, title=title, variants={**shared, **own})
 
-    def _faster(self, factor: int) -> dict[str, Any]:
+    def _faster(self, factor: int) -> Entry:
         """Return the settings of bottlenecks that are so many times as fast, with longer queues."""
-        settings: dict[str, Any] = {}
+        settings: Entry = {}
         for place, one in enumerate(self.scenario.network.impairments):
             if isinstance(one, Rate):
                 key = f"network.impairments.{place}"

@@ -6,7 +6,7 @@ Each function returns numbers for the page, from the exact simulator or from lin
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import schur
@@ -34,7 +34,7 @@ from noack.theory.certificates.scenario_certificates import certify
 from noack.theory.paper import Interval, longest_interval_s, theorem_1, theorem_2
 from noack.trigger.trigger_rule import TriggerRule, error_form
 
-Numbers = dict[str, Any]
+Numbers = dict[str, object]
 Mode = Literal["model", "zoh"]
 MODES: tuple[Mode, ...] = ("model", "zoh")
 SEED = 0
@@ -136,7 +136,7 @@ def _growth(scenario: Scenario, draws: int) -> Numbers:
 
 def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
     """Return how near MB-ET comes to its certified bounds, and Theorem 2's δ̲; the last is ours."""
-    rows, theorems = list[Numbers](), list[Numbers]()
+    rows, theorems = list[dict[str, float]](), list[dict[str, float]]()
     for draw in draws:
         resolved = resolved_draw(scenario, draw, "model")
         constants = certify(resolved, ideal_conditions(resolved)).constants
@@ -172,7 +172,7 @@ def _certificates(scenario: Scenario, draws: Sequence[int]) -> Numbers:
     }
 
 
-def _theorem_2(resolved: Scenario, constants: Constants) -> list[Numbers]:
+def _theorem_2(resolved: Scenario, constants: Constants) -> list[dict[str, float]]:
     """Return Theorem 2 with the certified Δ: eq:tau at t_i = 0, and its smallest value.
 
     ``negative`` is 1 if F̄ < 0, so that eq:tau falls with t_i. Without the theorem there is no row.
@@ -321,18 +321,18 @@ def _standstill(scenario: Scenario) -> Numbers:
     }
 
 
-def _overshoot(scenario: Scenario, representative: int) -> Numbers:
+def _overshoot(scenario: Scenario, representative: int) -> dict[str, list[float]]:
     """Return sup ‖x‖ / ‖x(0)‖ for a sequence of decreasing x(0)."""
     scales = (1.0, 1e-2, 1e-4)
     scenario = scenario.model_copy(update={"horizon_s": 100.0})
-    found: Numbers = {"scales": list(scales)}
+    found: dict[str, list[float]] = {"scales": list(scales), "model": [], "zoh": []}
     for mode, scale in itertools.product(MODES, scales):
         resolved = resolved_draw(scenario, representative, mode)
         start = tuple(scale * value for value in resolved.plant.initial_state)
         plant = resolved.plant.model_copy(update={"initial_state": start})
         run = run_continuous(resolved.model_copy(update={"plant": plant}))
         norms = np.linalg.norm(run.at(np.linspace(0, run.reached_s, 2001)).x, axis=1)
-        found.setdefault(mode, []).append(float(norms.max() / norms[0]))
+        found[mode].append(float(norms.max() / norms[0]))
     return found
 
 

@@ -10,13 +10,13 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, ClassVar, Literal, Self, get_args
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import BaseModel, Field, FiniteFloat, model_validator
 
 from noack.core.clock import NS_PER_S
 from noack.core.core_library import core, ffi
-from noack.impairments.clauses import Clause, Part, Table, Word
+from noack.impairments.clauses import Clause, Part, Word
 from noack.impairments.feature import (
     TC_CORRELATION,
     FileFeature,
@@ -36,7 +36,7 @@ from noack.impairments.words import (
     percent_text,
     time_text,
 )
-from noack.settings.section import Correlation
+from noack.settings.section import Correlation, Table
 from noack.settings.user_files import NamedFile
 
 Distribution = Literal["uniform", "normal", "pareto", "paretonormal", "empirical"]
@@ -59,7 +59,8 @@ _DELAY = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*
 class _JitterPart(Part):
     """The jitter, which a distribution other than the uniform one needs."""
 
-    def is_default(self, settings: Any) -> bool:
+    def is_default(self, settings: BaseModel) -> bool:
+        assert isinstance(settings, Delay)
         return super().is_default(settings) and settings.distribution in ("uniform", "empirical")
 
     def described(self, after: str) -> Iterator[Word]:
@@ -79,10 +80,12 @@ class _DistributionPart(Part):
         if "jitter_s" not in table:
             reader.wrong("has no effect without jitter; write delay TIME JITTER distribution NAME")
 
-    def is_default(self, settings: Any) -> bool:
+    def is_default(self, settings: BaseModel) -> bool:
+        assert isinstance(settings, Delay)
         return settings.distribution == "uniform" or settings.samples_s is not None
 
-    def text(self, settings: Any) -> str:
+    def text(self, settings: BaseModel) -> str:
+        assert isinstance(settings, Delay)
         name = settings.file
         if name is None:
             return f"distribution {settings.distribution}"

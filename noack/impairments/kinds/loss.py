@@ -4,11 +4,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
-from noack.impairments.clauses import Clause, Table, Word
+from noack.impairments.clauses import Clause, Word
 from noack.impairments.feature import Impairment, Stage, StageTables
 from noack.impairments.loss_models import LOSS_MODELS, Loss
 from noack.impairments.markov_chain import Chain, Pattern
 from noack.impairments.words import WordReader
+from noack.settings.section import Table
 
 _MODELS = {clause.word: (model, clause) for model in LOSS_MODELS for clause in model.clauses}
 LOSS_WORDS = tuple(_MODELS)

@@ -2,16 +2,18 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, Field, model_validator
 
-from noack.impairments.clauses import Clause, Part, Table, Word
+from noack.impairments.clauses import Clause, Part, Word
 from noack.impairments.disciplines import DISCIPLINES, Discipline
 from noack.impairments.disciplines.tail_drop import TailDrop
 from noack.impairments.feature import Impairment, Stage, StageTables
 from noack.impairments.words import COUNT, RATE_BPS, SIGNED_COUNT, WordReader, rate_text
+from noack.settings.section import Table
 
 _TC_HEADERS_BYTES = 42
 """Bytes that tc adds to a payload on an Ethernet device: headers of Ethernet, IPv4 and UDP."""
@@ -34,11 +36,13 @@ class _DisciplinePart(Part):
     def read(self, reader: WordReader, table: Table) -> None:
         table["discipline"] = self._clause.read(reader)
 
-    def is_default(self, settings: Any) -> bool:
+    def is_default(self, settings: BaseModel) -> bool:
+        assert isinstance(settings, Rate)
         return self._clause not in settings.discipline.clauses
 
-    def text(self, settings: Any) -> str:
-        return str(settings.discipline.text())
+    def text(self, settings: BaseModel) -> str:
+        assert isinstance(settings, Rate)
+        return settings.discipline.text()
 
     def described(self, after: str) -> Iterator[Word]:
         yield from (word._replace(grammar="") for word in self._clause.described(after))
@@ -94,9 +98,10 @@ class Rate(Impairment):
             )
         return self
 
-    def line_bits(self, payload_bytes: Any) -> Any:
-        """Return the bits that a payload needs on the link; for an array, those of each entry."""
-        line_bytes = np.maximum(payload_bytes + self.overhead_bytes, 0)
+    def line_bits(self, payload_bytes: ArrayLike) -> NDArray[np.int64]:
+        """Return the bits that payloads need on the link, of the shape of ``payload_bytes``."""
+        payload_bytes = np.asarray(payload_bytes, np.int64)
+        line_bytes: NDArray[np.int64] = np.maximum(payload_bytes + self.overhead_bytes, 0)
         if self.cell_bytes:
             line_bytes = -(-line_bytes // self.cell_bytes) * (
                 self.cell_bytes + self.cell_overhead_bytes

@@ -22,7 +22,7 @@ from noack.core.file_access import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
-Function = Callable[..., Any]
+Function = Callable[..., object]
 CALLED_BY_CODE: Mapping[str, bool] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """numba's options of a function that only compiled code calls. It is compiled without the entries
 for Python and C, each of which would hold its code once more."""

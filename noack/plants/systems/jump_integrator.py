@@ -11,15 +11,15 @@ under the held signs; where a sign is 0, that of the value itself counts.
 """
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 
-Rates = Any  # equations, as described above
-Model = Any  # handed to them
-Parameters = Any  # handed to them
+Rates = Callable[..., None]
+"""Equations, as described above."""
 DONE = 0
 TOO_MANY_STEPS = -2
 TOO_SMALL_STEPS = -3
@@ -77,10 +77,10 @@ def buffers(states: int, values: int) -> Work:
 
 def advance(
     rates: Rates,
-    model: Model,
+    model: object,
     z: Vector,
     v: Vector,
-    parameters: Parameters,
+    parameters: object,
     duration_s: float,
     tolerances: tuple[float, float],
     work: Work,
@@ -135,10 +135,10 @@ def advance(
 
 def attempt(
     rates: Rates,
-    model: Model,
+    model: object,
     z: Vector,
     v: Vector,
-    parameters: Parameters,
+    parameters: object,
     step_s: float,
     tolerances: tuple[float, float],
     work: Work,
@@ -173,10 +173,10 @@ def margin(signs: Vector, values: Vector) -> float:
 
 def locate(
     rates: Rates,
-    model: Model,
+    model: object,
     z: Vector,
     v: Vector,
-    parameters: Parameters,
+    parameters: object,
     step_s: float,
     work: Work,
 ) -> float:

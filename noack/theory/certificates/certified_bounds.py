@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,7 +112,7 @@ class ScenarioCertificate:
         """Bound of ‖x̂ − x‖_W at measurements (k,); NaN without a certificate."""
         return self._envelope(t_s, lambda c, level: c.estimation_error)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
         constants, late, rest = self.constants, self.floor_constants, self.persistent_constants
         return asdict(self) | {

@@ -7,7 +7,6 @@ is a constant disturbance of the loop in these coordinates.
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -64,8 +63,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     predicted_ns = resolved.timing.predicted_ns - tick_ns
     age_ns = max(min(oldest_ns, tick_ns), oldest_ns - predicted_ns)
     start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
-    return NetworkConditions(
-        **_losses(resolved),
+    return ideal_conditions(resolved)._replace(
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
         delay_s=delay_ns / NS_PER_S,
@@ -92,8 +90,14 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
 
 
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
-    """The paper's conditions: a continuous trigger, a network and input without delay."""
-    return NetworkConditions(**_losses(resolved))
+    """The paper's conditions: a continuous trigger, a network and input without delay.
+
+    The guarantee gives the longest burst of losses, and its rules except the cap M − 1.
+    """
+    guarantee = resolved.network.guarantee
+    assert guarantee.longest_burst is not None  # a scenario has a cap
+    further = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
+    return NetworkConditions(dropouts=guarantee.longest_burst, constraints=tuple(further))
 
 
 def most_events(resolved: Scenario, inter_event_s: float) -> int:
@@ -116,13 +120,6 @@ def kept_probability(
         return losses.keeps(guarantee, most_events(resolved, inter_event_s))
     except NotPredictableError:
         return None
-
-
-def _losses(resolved: Scenario) -> dict[str, Any]:
-    """Return what the guarantee says: its longest burst, and its rules except the cap M − 1."""
-    guarantee = resolved.network.guarantee
-    further = [rule for rule in guarantee.rules if not isinstance(rule, LongestBurst)]
-    return {"dropouts": guarantee.longest_burst, "constraints": tuple(further)}
 
 
 def about_setpoint(resolved: Scenario) -> Scenario:

@@ -18,7 +18,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +46,11 @@ class LossAccumulation:
         self, output: str, spacing_s: float, windows: Sequence[LossWindow], loop: int = 0
     ) -> float:
         """Return the bound of sup‖C x‖ / β̃ from all lost updates; infinite if it is not found."""
-        until_s = self._of_loop(self._until_s, loop)
+        until_s = self._until_s[self._place(self._until_s, loop)]
         bins = math.ceil(until_s / spacing_s) if spacing_s > 0 else _MOST_BINS
         if bins >= _MOST_BINS:
             return math.inf
-        effects = self._of_loop(self._effects[output], loop)
+        effects = self._effects[output][self._place(self._effects[output], loop)]
         highest = _over_bins(effects, spacing_s / (until_s / _CELLS), bins)
         return min(self._total(output, highest, spacing_s, window, loop) for window in windows)
 
@@ -65,14 +64,15 @@ class LossAccumulation:
         padded = np.zeros(blocks * packets)
         padded[: len(highest)] = highest
         ranked = np.sort(padded.reshape(blocks, packets), axis=1)[:, ::-1]
-        falling = self._of_loop(self._beyond[output], loop)
+        falling = self._beyond[output][self._place(self._beyond[output], loop)]
         # The blocks that begin beyond the grid.
         beyond = sum(most * f * (1 + 2 / (rate * packets * spacing_s)) for f, rate in falling)
         return float(ranked[:, :most].sum()) * _ROUNDING + float(beyond)
 
     @staticmethod
-    def _of_loop(values: Vector, loop: int) -> Any:
-        return values[loop if len(values) > 1 else 0]
+    def _place(values: NDArray[np.float64], loop: int) -> int:
+        """Return the index of a loop; loops that are alike have one value."""
+        return loop if len(values) > 1 else 0
 
     @cached_property
     def _kernels(self) -> tuple[KernelBounds, Mapping[str, KernelBounds]]:

@@ -1,6 +1,7 @@
 """Matrices with all rounding: enclosures in double precision, and 384 digits after the point.
 
 :class:`IntervalMatrix`: entries are known up to a radius. A computed product of k terms differs
+from numpy.typing import NDArray
 from the exact one by at most k u/(1 − k u) times the product of the absolute values, u = 2⁻⁵³, in
 whichever order it is summed (Higham, *Accuracy and Stability of Numerical Algorithms*, section
 3.1). The bounds themselves are rounded too; they are enlarged by more than that can be, and by more
@@ -12,7 +13,7 @@ double precision. The entries are Python integers, in units of 2⁻³⁸⁴.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ def inverse(matrix: Matrix) -> IntervalMatrix | None:
 class FixedPointMatrix:
     """A matrix; each entry differs from the exact one by at most ``error``."""
 
-    entries: Any
+    entries: NDArray[np.object_]
     """Integers in units of 2⁻³⁸⁴, an array of objects."""
     error: int = 0
     """In the same unit."""

@@ -21,7 +21,7 @@ probability below 1. :func:`unlimited_losses` says all of this of a scenario.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -256,7 +256,7 @@ class UnlimitedLosses:
     void: str | None
     """Why there are no moments; None if there are."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all fields for JSON."""
         return {
             **{name: getattr(self, name) for name in self.__dataclass_fields__},

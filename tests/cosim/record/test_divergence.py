@@ -102,7 +102,7 @@ def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:
 def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     resolved = unstable(content, 8.0)
     sampled = summarise(simulate(resolved), 0, "horizon").to_json()
-    continuous = summary(run_continuous(resolved), resolved)
+    continuous = summary(run_continuous(resolved), resolved).to_json()
     for found in (sampled, continuous):
         assert found["exit"]["status"] == 1
         assert found["exit"]["reason"].startswith("diverged: ‖x‖ passed ")

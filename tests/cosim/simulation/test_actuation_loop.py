@@ -103,7 +103,8 @@ def test_each_direction_has_its_own_losses_and_guarantee(messy: RunRecord) -> No
     updates, actuations = (packet_outcomes(messy, one) for one in messy.scenario.network.flows)
     assert actuations.longest_loss_burst() == 2
     assert updates.longest_loss_burst() in (3, 4)
-    part = from_controller(messy)["actuations"]
+    part = from_controller(messy, Flow.ACTUATION)
+    assert part is not None
     assert part.sent == len(actuations.lost) == 300
     assert part.lost == actuations.lost.sum() > 90
     assert set(messy[NETEM_PACKET]["flow"].tolist()) == {0, 1}
@@ -202,7 +203,8 @@ def test_each_loop_has_actuations_and_a_guarantee_of_its_own(tmp_path: Path) -> 
         loops = simulate_loops(load(several, fast)).loops
         bursts = [packet_outcomes(loop, Flow.ACTUATION).longest_loss_burst() for loop in loops]
         assert bursts == [3] * count
-        assert [from_controller(loop)["actuations"].sent for loop in loops] == [150] * count
+        parts = [from_controller(loop, Flow.ACTUATION) for loop in loops]
+        assert [part and part.sent for part in parts] == [150] * count
         assert [sum(unintended_losses(loop).values()) for loop in loops] == [0] * count
         if count == 1:
             for table in (PLANT_STEP, PLANT_ACTUATION, NETEM_PACKET):
