@@ -426,6 +426,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
         "inter_delivery_median_s": _or_none(np.median, np.diff(run.event_s[run.delivered])),
         "initial_state_norm": float(np.linalg.norm(samples.x[0])),
         "final_state_norm": float(np.linalg.norm(samples.x[-1])),
+        "sup_state_norm": float(np.linalg.norm(samples.x, axis=1).max()),
         "diverged_at_s": None if diverged is None else diverged.at_s,
         "exit": {
             "status": int(ExitStatus.OK if diverged is None else ExitStatus.FAILED),

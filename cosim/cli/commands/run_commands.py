@@ -123,8 +123,11 @@ def _print_run(console: "Console", run: "continuous.ContinuousRun", found: dict[
     from rich.text import Text
 
     ending = run_verdict.ending_line(
-        summary_model.ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"]
-    )
+        summary_model.ExitPart(**found["exit"]), found["reached_s"], found["horizon_s"],
+        "" if found["diverged_at_s"] else run_verdict.state_text(
+            found["sup_state_norm"], found["final_state_norm"], None
+        ),
+    )  # fmt: skip
     for line in (ending, run_verdict.transmission_line(found["events"], found["deliveries"])):
         console.print(Text(line.text, line.style), soft_wrap=True)
     mansd = found["mansd"]
