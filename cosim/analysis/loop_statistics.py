@@ -421,14 +421,16 @@ class SignalStatistics:
 
     def for_summary(self) -> Signals:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
-        first, last = None, None
+        first, last, largest = None, None, None
         for steps in self._record.source.batches(PLANT_STEP, ("x",)):
-            first = float(row_norms(steps["x"][:1])[0]) if first is None else first
-            last = float(row_norms(steps["x"][-1:])[0])
+            norms = row_norms(steps["x"])
+            first = float(norms[0]) if first is None else first
+            last, largest = float(norms[-1]), _larger(largest, norms)
         scale = max(self._scale, float(np.finfo(float).tiny))
         return {
             "initial_state_norm": first,
             "final_state_norm": last,
+            "sup_state_norm": largest,
             "sup_e_s_norm": self._sup_e_s,
             "sup_e_c_norm": self._sup_e_c,
             "sup_e_c_at_s": self._sup_e_c_at_s,

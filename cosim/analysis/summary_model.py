@@ -258,6 +258,15 @@ class ConditionsPart(SummaryPart):
     clock_error_s: Real = None
 
 
+class SchedulePart(SummaryPart):
+    """The times that a certificate covers, as in :class:`ConditionsPart`."""
+
+    sampling_s: float
+    delay_s: float
+    hold_s: float
+    start_s: float
+
+
 class ChangePart(SummaryPart):
     """A change of settings during the run."""
 
@@ -324,6 +333,7 @@ class LoopSummary(SummaryPart):
     inter_delivery_median_s: Real
     initial_state_norm: Real
     final_state_norm: Real
+    sup_state_norm: Real
     sup_e_s_norm: Real
     sup_e_c_norm: Real
     sup_e_c_at_s: Real
@@ -341,6 +351,8 @@ class LoopSummary(SummaryPart):
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     fidelity: FidelityPart | NoFidelityPart | None = None
     conditions: ConditionsPart | None = None
+    certified_for: SchedulePart | None = None
+    """The schedule that the certificates cover, if the run was later than its scenario allows."""
     claims: list[Claim] = []
     judged_until_s: Real = None
     exit: ExitPart

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.analysis.claims.condition_reader import READ, AssumptionMonitor
-from cosim.analysis.claims.observed_conditions import AssumptionViolation
+from cosim.analysis.claims.observed_conditions import SCHEDULE, AssumptionViolation
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_events import GrowthMonitor
 from cosim.record.run_record import Rows
@@ -20,10 +20,14 @@ from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolved_loops, tables_of
 from noack.scenario.scenario import Scenario, phases_ns
+from noack.theory.certificates.conditions import allowed_conditions
+from noack.theory.certificates.scenario_certificates import network_limit, own_plant
 
 MOST_CHECKED = 100
 _TURN_S = 0.01
 """CPU time of a turn; the recorder makes ten a second."""
+_LIMITS_S = 0.5
+"""CPU time for the largest certified times of a run; one takes about 0.1 s."""
 
 
 class Finding(NamedTuple):
@@ -39,7 +43,8 @@ class ClaimMonitor:
     """Reports each violated assumption and each divergence of a loop once."""
 
     def __init__(self, scenario: Scenario) -> None:
-        loops = resolved_loops(scenario)
+        self._loops = loops = resolved_loops(scenario)
+        self._limits_s = 0.0
         self._names = [loop.name for loop in loops]
         self._phases_ns, self._types = phases_ns(scenario), [tables_of(loop) for loop in loops]
         self._stopped: str | None = None
@@ -113,8 +118,26 @@ class ClaimMonitor:
         self, loop: int, check: Callable[[AssumptionMonitor], Sequence[AssumptionViolation]]
     ) -> None:
         for violation in check(self._monitors[loop]):
-            t_ns = round(violation.t_s * NS_PER_S)
-            self._add(loop, t_ns, "void", "void (assumption violated)", violation.text)
+            t_ns, text = round(violation.t_s * NS_PER_S), violation.text
+            if violation.cause in SCHEDULE:
+                limit = self._limit(loop, violation.cause)
+                self._add(loop, t_ns, "late", "later than allowed", f"{text}{limit}")
+            else:
+                self._add(loop, t_ns, "void", "void (assumption violated)", text)
+
+    def _limit(self, loop: int, cause: str) -> str:
+        """Return up to which time there are certificates, in words, while there is time for it."""
+        if self._limits_s > _LIMITS_S:
+            return ""
+        began_s = time.thread_time()
+        try:
+            scheduled = allowed_conditions(self._loops[loop])
+            limit_s = network_limit(own_plant(self._loops[loop]), scheduled, cause)
+        except Exception:  # the claims report it
+            return ""
+        finally:
+            self._limits_s += time.thread_time() - began_s
+        return f", certificates up to {limit_s:.4g} s" if limit_s else ""
 
     def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
         own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"

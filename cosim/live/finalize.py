@@ -27,6 +27,7 @@ from cosim.analysis.summary_model import (
     LoopSummary,
     ReplayPart,
     RunSummary,
+    SchedulePart,
     read_summary,
 )
 from cosim.live.process_pool import process_starts, processes
@@ -52,6 +53,7 @@ from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
 from noack.scenario.scenario import Scenario
+from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
@@ -321,6 +323,7 @@ def _claim_results(
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
     return {
         "conditions": ConditionsPart(**claims.conditions),
+        "certified_for": _schedule(claims.certified_for),
         "claims": claims.judge(),
         "judged_until_s": claims.judged_until_s,
         "assumption_violations": list_violations(
@@ -328,6 +331,12 @@ def _claim_results(
         ),
         "longest_loss_burst": longest,
     }
+
+
+def _schedule(conditions: NetworkConditions | None) -> SchedulePart | None:
+    if conditions is None:
+        return None
+    return SchedulePart(**{name: getattr(conditions, name) for name in SchedulePart.model_fields})
 
 
 def _replay(record: RunRecord, shared: SharedMachines | None = None) -> ReplayPart:

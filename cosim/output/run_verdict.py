@@ -4,6 +4,7 @@ Read :func:`verdict` (three lines), :func:`remarks` (what limits the validity of
 :func:`print_outcome`, which prints both with the tables of :mod:`cosim.output.run_tables`.
 """
 
+import math
 import shutil
 import sys
 from collections import Counter
@@ -16,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.claims.observed_conditions import CAUSES
+from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE
 from cosim.analysis.fidelity import Fidelity, SignalDifference
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import (
@@ -57,6 +58,8 @@ _ASSUMPTION_STYLES: dict[str, str] = {
 }
 _NAMED = 3
 """Largest number of claims of a verdict that are named."""
+_SETTLED = 0.1
+"""A loop is stable if ‖x‖ falls to this share of its largest value."""
 _MOST_LOOPS, _MOST_REASONS, _MOST_VIOLATIONS = 12, 3, 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
@@ -70,39 +73,64 @@ class VerdictLine(NamedTuple):
 
 
 def verdict(summary: RunSummary) -> tuple[VerdictLine, ...]:
-    """Return how the run ended, the transmissions of its loops, and their claims."""
+    """Return how the run ended and its state, whether its guarantee was kept, its transmissions."""
     loops = summary.loops
     events, delivered = sum(one.events for one in loops), sum(one.deliveries for one in loops)
     ideal = None
     if isinstance(loops[0].fidelity, FidelityPart) and not shares_network(summary):
         ideal = loops[0].fidelity.events_ideal
+    diverged = any(one.diverged_at_s is not None for one in loops)
     return (
-        ending_line(summary.exit, summary.reached_s, summary.horizon_s),
+        ending_line(
+            summary.exit, summary.reached_s, summary.horizon_s,
+            "" if diverged and summary.exit.status == ExitStatus.FAILED else _states(loops),
+        ),
+        _guarantee_line(loops),
         transmission_line(events, delivered, ideal),
-        _claims([claim for one in loops for claim in one.claims], _first_violation(summary)),
-    )
+    )  # fmt: skip
 
 
-def _first_violation(summary: RunSummary) -> tuple[str, float] | None:
-    """Return the first reason of the void claims of a single loop, and since when it holds."""
-    if shares_network(summary):
-        return None
-    (loop,) = summary.loops
-    why = next((claim.why for claim in loop.claims if claim.verdict == "void"), None)
-    found = (one for one in loop.assumption_violations if one.what == why and one.cause in CAUSES)
-    return next(((one.what, one.t_s) for one in found), None)
-
-
-def ending_line(end: ExitPart, reached_s: float, horizon_s: float) -> VerdictLine:
-    """Return how a run ended."""
+def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str = "") -> VerdictLine:
+    """Return how a run ended, with the words of :func:`state_text` about its loops."""
     reached = f"{reached_s:g} s"
     reached_of = f"{reached} of {horizon_s:g} s"
-    if end.status == ExitStatus.OK:
-        why = "" if end.reason == HORIZON else f": {end.reason}"
-        return VerdictLine(f"completed {reached}{why}", GOOD)
-    if end.status == ExitStatus.FAILED:
-        return VerdictLine(f"failed after {reached_of}: {end.reason}", BAD)
-    return VerdictLine(f"stopped after {reached_of}: {end.reason}", DOUBTFUL)
+    reason = "" if end.status == ExitStatus.OK and end.reason == HORIZON else end.reason
+    how, style = {
+        ExitStatus.OK: (f"completed {reached}", GOOD),
+        ExitStatus.FAILED: (f"failed after {reached_of}", BAD),
+    }.get(ExitStatus(end.status), (f"stopped after {reached_of}", DOUBTFUL))
+    details = "; ".join(filter(None, (reason, states)))
+    return VerdictLine(f"{how}: {details}" if details else how, style)
+
+
+def state_of(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
+    """Return the word for a loop's state: stable, bounded or diverged; empty without a state.
+
+    It is stable if ‖x‖ is at the end at most a tenth of its largest value.
+    """
+    if diverged_at_s is not None:
+        return "diverged"
+    if largest is None or final is None:
+        return ""
+    return "stable" if final <= _SETTLED * largest else "bounded"
+
+
+def state_text(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
+    """Return a loop's state as that word, with the largest and the last ‖x‖."""
+    word = state_of(largest, final, diverged_at_s)
+    if not word or diverged_at_s is not None:
+        return word
+    return f"{word}, ‖x‖ ≤ {largest:.3g}, {final:.3g} at the end"
+
+
+def _states(loops: Sequence[LoopSummary]) -> str:
+    states = [(one.sup_state_norm, one.final_state_norm, one.diverged_at_s) for one in loops]
+    if len(states) == 1:
+        return state_text(*states[0])
+    counts = Counter(filter(None, (state_of(*state) for state in states)))
+    (first, *others) = counts.most_common() or [("", 0)]
+    words = [f"{first[1]} of {len(loops)} loops {first[0]}"] if first[1] else []
+    return ", ".join([*words, *(f"{count} {word}" for word, count in others)])
 
 
 def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
@@ -111,28 +139,79 @@ def transmission_line(events: int, deliveries: int, ideal: int | None = None) ->
     return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
 
 
-def _claims(claims: Sequence[Claim], violation: tuple[str, float] | None) -> VerdictLine:
-    """Count the claims by verdict, each with its first reason; of void ones since when."""
-    if not claims:
-        return VerdictLine("claims: none", NEUTRAL)
-    counts = Counter(str(claim.verdict) for claim in claims)
-    parts, style = [f"claims: {counts['held']} of {len(claims)} held"], GOOD
-    for name, colour in (("violated", BAD), ("void", DOUBTFUL), ("not applicable", NEUTRAL)):
-        if counts[name]:
-            style = colour if style == GOOD else style
-            since = f" from {violation[1]:.3f} s on" if violation and name == "void" else ""
-            parts.append(f"{counts[name]} {name}{since}{_reason(claims, name)}")
-    return VerdictLine(", ".join(parts), style)
+class Guarantee(NamedTuple):
+    """Whether the claims about a loop held."""
+
+    style: str
+    """``GOOD``: kept; ``DOUBTFUL``: not checkable; ``BAD``: broken."""
+    since_s: float = 0.0
+    """From when on it is not."""
+    why: str = ""
+    """Why it is not; if it is kept, what limits it."""
 
 
-def _reason(claims: Sequence[Claim], name: str) -> str:
-    """Return the first reason of a verdict, in brackets; with it, unless void, which claims."""
-    concerned = [claim for claim in claims if claim.verdict == name]
-    why = next((claim.why for claim in concerned if claim.why), "")
-    what = [] if name == "void" else list(dict.fromkeys(claim.what for claim in concerned))
-    more = [f"{len(what) - _NAMED} more"] if len(what) > _NAMED else []
-    which = "; ".join([*what[:_NAMED], *more])
-    return f" ({': '.join(filter(None, (which, why)))})" if which or why else ""
+def guarantee_of(loop: LoopSummary) -> Guarantee:
+    """Return whether the claims about a loop held, and the guarantee of consecutive losses.
+
+    A claim that assumes an ideal loop cannot be broken by a run. Where a certificate covers the
+    lateness of the run, lateness breaks nothing.
+    """
+    violated = [claim for claim in loop.claims if claim.verdict == "violated"]
+    broken = [(one.t_s, one.what) for one in loop.assumption_violations if one.cause not in CAUSES]
+    if violated:
+        named = list(dict.fromkeys(claim.what for claim in violated))
+        more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
+        since_s = min(claim.since_s or 0.0 for claim in violated)
+        broken.append((since_s, "violated: " + "; ".join([*named[:_NAMED], *more])))
+    if broken:
+        return Guarantee(BAD, *min(broken))
+    certified = [claim for claim in loop.claims if "certificate" in claim.source]
+    if not certified:
+        why = next((claim.why for claim in loop.claims if claim.verdict == "void"), "")
+        return Guarantee(DOUBTFUL, 0.0, why or "no certificate covers this loop")
+    void = [claim for claim in loop.claims if claim.verdict == "void"]
+    late = [one.what for one in loop.assumption_violations if one.cause in SCHEDULE]
+    covered = f"certified for its lateness: {late[0]}" if late and loop.certified_for else ""
+    if not void:
+        return Guarantee(GOOD, 0.0, covered)
+    since_s, why = min(
+        (claim.since_s or 0.0, ("no certificate: " if claim.bound == "none" else "") + claim.why)
+        for claim in void
+    )
+    if late and late[0] == why and not loop.missing_samples:
+        why += "; no certificate covers that"
+    if any(claim.verdict == "held" for claim in certified):
+        unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
+        return Guarantee(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
+    return Guarantee(DOUBTFUL, since_s, why)
+
+
+def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
+    """Return whether the guarantee was kept in the loops, the worst first."""
+    found = [(guarantee_of(loop), loop) for loop in loops]
+    held = sum(claim.verdict == "held" for loop in loops for claim in loop.claims)
+    claims = f"{held} {'claim' if held == 1 else 'claims'} held, none violated"
+    worst = next(
+        (style for style in (BAD, DOUBTFUL) if any(one.style == style for one, _ in found)), GOOD
+    )
+    concerned = [(one, loop) for one, loop in found if one.style == worst]
+    one, loop = min(concerned, key=lambda pair: pair[0].since_s if pair[0].why else math.inf)
+    name, count = "" if len(loops) == 1 else f"{loop.name}: ", f"{len(concerned)} of {len(loops)}"
+    why = f": {name}{one.why}" if one.why else ""
+    since = f"{one.since_s:.3f} s"
+    if worst == GOOD:
+        where = "" if len(loops) == 1 else f" in all {len(loops)} loops"
+        text = f"guarantee kept{where}: {claims}" + (f"; {name}{one.why}" if one.why else "")
+    elif worst == BAD:
+        where = "" if len(loops) == 1 else f" in {count} loops,"
+        text = f"guarantee broken{where} since {since}{why}"
+    elif len(loops) > 1:
+        text = f"guarantee not checkable in {count} loops{why}"
+    elif one.since_s > 0:
+        text = f"guarantee kept until {since}, then not checkable{why}"
+    else:
+        text = f"guarantee not checkable{why}"
+    return VerdictLine(text, worst)
 
 
 class Remark(NamedTuple):
@@ -148,8 +227,12 @@ class Remark(NamedTuple):
 def remarks(summary: RunSummary) -> Iterator[Remark]:
     """Yield the remarks on one loop, the severe ones first; none if all went well."""
     (loop,) = summary.loops
-    stated = _first_violation(summary)  # by the verdict
-    violations = [one for one in loop.assumption_violations if (one.what, one.t_s) != stated]
+    stated = guarantee_of(loop).why  # by the verdict
+    violations = [
+        one
+        for one in loop.assumption_violations
+        if one.what not in stated and not (loop.certified_for and one.cause in SCHEDULE)
+    ]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
         severe = one.cause not in CAUSES  # the guarantee, or a change
@@ -172,9 +255,9 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for one in loop.assumptions:
         if one.verdict == AssumptionStatus.VIOLATED:
             yield f"assumption violated: {one.what} ({one.source}): {one.why}"
-    late = loop.lateness_us.get("plant")
-    if late and late.late_steps > _MOST_LATE * late.steps:
-        share = 100 * late.late_steps / late.steps
+    plant = loop.lateness_us.get("plant")
+    if plant and plant.late_steps > _MOST_LATE * plant.steps:
+        share = 100 * plant.late_steps / plant.steps
         yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
     first, last = loop.initial_state_norm, loop.final_state_norm
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
@@ -197,13 +280,13 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
-    # Claims are void because this machine was late.
-    causes = {one.cause for one in loop.assumption_violations} & {"delay", "hold"}
-    if causes and summary.kind == "live" and not loop.restarts:
+    late = {one.cause for one in loop.assumption_violations} & {"delay", "hold"}
+    unchecked = late and loop.certified_for is None
+    if unchecked and summary.kind == "live" and not loop.restarts:
         what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
-            f"{what} was late, so some claims were not checked to the end. To allow more "
-            "lateness, raise certificate.late_periods."
+            f"{what} was later than any certificate of this loop allows, so some claims were not "
+            "checked to the end: use a less busy machine, or a lower speed"
         )
     if _has_clocks(loop) and loop.replay is not None and not loop.replay.complete:
         yield (

@@ -403,6 +403,7 @@ class ContinuousSummary(NamedTuple):
     inter_delivery_median_s: float | None
     initial_state_norm: float
     final_state_norm: float
+    sup_state_norm: float
     diverged_at_s: float | None
     exit_status: ExitStatus
     reason: str
@@ -435,6 +436,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> ContinuousSummary:
         inter_delivery_median_s=_or_none(np.median, np.diff(run.event_s[run.delivered])),
         initial_state_norm=float(np.linalg.norm(samples.x[0])),
         final_state_norm=float(np.linalg.norm(samples.x[-1])),
+        sup_state_norm=float(np.linalg.norm(samples.x, axis=1).max()),
         diverged_at_s=None if diverged is None else diverged.at_s,
         exit_status=ExitStatus.OK if diverged is None else ExitStatus.FAILED,
         reason="horizon" if diverged is None else diverged.text,

@@ -58,6 +58,7 @@ from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
+from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint
 from noack.theory.certificates.scenario_certificates import outside_box
@@ -311,6 +312,12 @@ class RunClaims:
         if isinstance(first, ClaimEvaluation) and first.record is self._judged:
             return first.conditions
         return ClaimEvaluation(self._judged).conditions
+
+    @property
+    def certified_for(self) -> NetworkConditions | None:
+        """The wider schedule that the certificates of the run's first late part cover."""
+        parts = (one.certified_for for one in self.parts if not isinstance(one, Claim))
+        return next((one for one in parts if one is not None), None)
 
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated: in each part, the first violation of each."""

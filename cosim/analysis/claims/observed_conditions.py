@@ -61,6 +61,12 @@ CAUSES = {
 
 The other assumptions are the rules of the guarantee, under their own names; "dropouts" is the limit
 of consecutive losses."""
+SCHEDULE = ("sampling", "delay", "hold", "start")
+"""The assumptions whose limits are times of a certificate's conditions, ``sampling_s`` and so on.
+
+A certificate holds for every run that meets its conditions, however they were chosen. So a run that
+was later than its scenario allows has the certificate for the times that it took, if there is one.
+"""
 DROPOUTS = LongestBurst(0).name
 _NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
 """In place of a time until the first input, which is the only condition without an upper limit."""
@@ -82,6 +88,11 @@ class SampledSeries(NamedTuple):
         if not len(beyond):
             return None
         return float(self.t_s[beyond[0]]), float(self.value.max())
+
+    def before(self, t_s: float) -> "SampledSeries":
+        """Return the values before a time."""
+        early = self.t_s < t_s
+        return SampledSeries(self.t_s[early], self.value[early])
 
     def in_order(self) -> "SampledSeries":
         """Return the values in the order of time."""
@@ -216,6 +227,24 @@ class ObservedConditions(NamedTuple):
     ) -> VoidFrom | None:
         """Return the time at which the run first violated a condition; None if never."""
         return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
+
+    def widened(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
+        """Return conditions that the run's schedule meets up to a time.
+
+        Each time of ``SCHEDULE`` is the allowed one, or what the run took, if that was more.
+        """
+        observed = {"start_s": self.start_s if np.isfinite(self.start_s) else None} | {
+            f"{name}_s": series.before(until_s).largest()
+            for name, series in (
+                ("sampling", self.sampling), ("delay", self.delay), ("hold", self.hold),
+            )
+        }  # fmt: skip
+        most = {
+            name: max(getattr(allowed, name), value)
+            for name, value in observed.items()
+            if value is not None
+        }
+        return allowed._replace(**most)
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""

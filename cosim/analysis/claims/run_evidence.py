@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
     CLOCK_CAUSES,
+    SCHEDULE,
     AssumptionViolation,
     ObservedConditions,
     Reals,
@@ -157,17 +158,47 @@ class RunEvidence:
         return trajectory_delta(self.record, until_s)
 
     @cached_property
+    def late_conditions(self) -> NetworkConditions | None:
+        """The conditions of a run that was later than its scenario allows; None for any other.
+
+        A certificate holds for every run that meets its conditions, whenever they were chosen.
+        """
+        # The times of a run whose record has gaps are not known.
+        if not self.record.scenario.coverage.is_certifiable or not self._is_complete:
+            return None
+        allowed, until_s = self._allowed, self.part.until_s
+        late = self.observed.first_violation(allowed, SCHEDULE)
+        if late is None or late.t_s >= until_s:
+            return None
+        return self.observed.widened(allowed, until_s)
+
+    @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
-        """The certificates of the run's scenario under the scenario's schedule."""
-        found, void = [], self.part.void
+        """The certificates of the run's scenario under the schedule that the run kept.
+
+        This is the scenario's schedule; or a wider one, if the run was later than allowed and there
+        is a certificate nevertheless.
+        """
+        found, void, scenario = [], self.part.void, self.record.scenario
         scheduled = self.part.certificates
         if scheduled is None:
-            scheduled = scheduled_certificates(self.record.scenario, self.part.start_error)
-        for one in scheduled:
+            scheduled = scheduled_certificates(scenario, self.part.start_error)
+        wider: Sequence[ScenarioCertificate | None] = [None] * len(scheduled)
+        if self.late_conditions is not None and any(one.constants for one in scheduled):
+            wider = scheduled_certificates(scenario, self.part.start_error, self.late_conditions)
+        for one, late in zip(scheduled, wider, strict=True):
+            used = one if late is None or late.constants is None else late
             if one.scope in void:
-                one = replace(one, constants=None, floor_constants=None, void=void[one.scope])
-            found.append(one)
+                used = replace(one, constants=None, floor_constants=None, void=void[one.scope])
+            found.append(used)
         return found
+
+    @property
+    def certified_for(self) -> NetworkConditions | None:
+        """The wider schedule, if a certificate of it is used."""
+        late = self.late_conditions
+        used = [one.conditions for one in self.certificates if one.constants is not None]
+        return late if late in used else None
 
     @cached_property
     def _as_read(self) -> ObservedConditions:
@@ -201,12 +232,13 @@ class RunEvidence:
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
-        conditions = allowed_conditions(scenario)
-        if self.part.start_error is not None:
-            conditions = conditions._replace(start_s=0.0)
         causes = {*causes_of(scenario), *guarantee_causes(scenario)}
-        found = self.observed.violations(conditions, causes)
+        found = self.observed.violations(self._allowed, causes)
         return [one for one in found if one.t_s < self.part.until_s]
+
+    @cached_property
+    def _is_complete(self) -> bool:
+        return all(map((self.part.whole or self.record).is_complete, LOOP_ROLES))
 
     @cached_property
     def first_gap(self) -> VoidFrom | None:
@@ -214,9 +246,10 @@ class RunEvidence:
 
         The record is incomplete, or the error of a process's clock is not bounded as required.
         """
-        limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
+        limit, whole = _ANY, self.part.whole or self.record
+        if not self._is_complete:  # measurements may be missing
+            limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
-        whole = self.part.whole or self.record
         for role in LOOP_ROLES:
             if whole.is_complete(role):
                 continue
@@ -247,10 +280,9 @@ class RunEvidence:
     def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
         """Return how many events are missing in the input since the newest event, (k,).
 
-        In a part that begins with inputs of the part before, it is unknown until the first input.
+        The bounds assume that an update acts within their delay. Where the plant applied its first
+        input later than that, the number is unknown until then.
         """
-        if self.part.start_error is None:
-            return samples.since_event.missing
         event_s = samples.t_s - samples.since_event.age_s
         early = event_s + bounds.delay_s < self.started_s - 1e-9
         return np.asarray(np.where(early, UNKNOWN, samples.since_event.missing))
@@ -271,6 +303,12 @@ class RunEvidence:
     def _violations(self) -> dict[int, VoidFrom | None]:
         """First violations that are known already, by certificate."""
         return {}
+
+    @cached_property
+    def _allowed(self) -> NetworkConditions:
+        """The conditions of the scenario's certificates."""
+        allowed = allowed_conditions(self.record.scenario)
+        return allowed if self.part.start_error is None else allowed._replace(start_s=0.0)
 
     @cached_property
     def _schedule(self) -> NetworkConditions:
@@ -295,18 +333,23 @@ class RunEvidence:
 
 
 def scheduled_certificates(
-    scenario: Scenario, start_error: float | None = None
+    scenario: Scenario,
+    start_error: float | None = None,
+    conditions: NetworkConditions | None = None,
 ) -> list[ScenarioCertificate]:
-    """Return the certificates of a resolved scenario under its schedule, if it can have any.
+    """Return the certificates of a resolved scenario, if it can have any.
 
-    A part of a run that starts with an input of the part before has a ``start_error``.
+    They are those under some conditions; by default, under the scenario's schedule. A part of a run
+    that starts with an input of the part before has a ``start_error``.
     """
-    (found,) = certificates_together([scenario], start_error)
+    (found,) = certificates_together([scenario], start_error, conditions)
     return found
 
 
 def certificates_together(
-    scenarios: Sequence[Scenario], start_error: float | None = None
+    scenarios: Sequence[Scenario],
+    start_error: float | None = None,
+    conditions: NetworkConditions | None = None,
 ) -> list[list[ScenarioCertificate]]:
     """Return the certificates of several scenarios; see :func:`scheduled_certificates`."""
     searches: list[Search[ScenarioCertificate]] = []
@@ -314,11 +357,11 @@ def certificates_together(
     for number, scenario in enumerate(scenarios):
         if not scenario.coverage.is_certifiable:
             continue
-        conditions, error = allowed_conditions(scenario), 0.0
+        limits, error = conditions or allowed_conditions(scenario), 0.0
         if start_error is not None:
-            conditions, error = conditions._replace(start_s=0.0), start_error
+            limits, error = limits._replace(start_s=0.0), start_error
         for scope in filter(None, (own_plant(scenario, error), box(scenario, error))):
-            searches.append(scope.search(conditions))
+            searches.append(scope.search(limits))
             numbers.append(number)
     found: list[list[ScenarioCertificate]] = [[] for _ in scenarios]
     for number, certificate in zip(numbers, completed(searches), strict=True):

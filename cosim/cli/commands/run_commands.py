@@ -122,7 +122,12 @@ def _print_run(
     from rich.text import Text
 
     ended = summary_model.ExitPart(status=int(found.exit_status), reason=found.reason)
-    ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s)
+    state = (
+        ""
+        if found.diverged_at_s
+        else run_verdict.state_text(found.sup_state_norm, found.final_state_norm, None)
+    )
+    ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s, state)
     for line in (ending, run_verdict.transmission_line(found.events, found.deliveries)):
         console.print(Text(line.text, line.style), soft_wrap=True)
     rows = (

@@ -64,7 +64,7 @@ Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
 
 
-_WARNINGS = ("failed", "violation", "void", "diverges", "watchdog", "clock lost")
+_WARNINGS = ("failed", "violation", "void", "late", "diverges", "watchdog", "clock lost")
 
 
 def log_level(notice: Mapping[str, object]) -> str:

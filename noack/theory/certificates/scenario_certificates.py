@@ -380,15 +380,27 @@ class NetworkLimits(NamedTuple):
 
 def network_limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
     """Return the limits for some plants; 0 means that there is no certificate at any time."""
-
-    def limit(change: Callable[[float], NetworkConditions], usual_s: float) -> float:
-        return largest(lambda value_s: scope.loop_gain(change(value_s)), usual_s)
-
     return NetworkLimits(
-        limit(lambda v: scheduled._replace(sampling_s=v, spacing_s=v), scheduled.sampling_s),
-        limit(lambda v: scheduled._replace(delay_s=v, start_s=v), scheduled.delay_s),
-        limit(lambda v: scheduled._replace(hold_s=v), scheduled.hold_s),
+        *(network_limit(scope, scheduled, what) for what in ("sampling", "delay", "hold"))
     )
+
+
+_CHANGES: dict[str, Callable[[NetworkConditions, float], NetworkConditions]] = {
+    "sampling": lambda given, s: given._replace(sampling_s=s, spacing_s=s),
+    "delay": lambda given, s: given._replace(delay_s=s, start_s=s),
+    "hold": lambda given, s: given._replace(hold_s=s),
+    "start": lambda given, s: given._replace(start_s=s),
+}
+
+
+def network_limit(scope: CertificateScope, scheduled: NetworkConditions, what: str) -> float:
+    """Return the limit of one of the times ``sampling``, ``delay``, ``hold`` and ``start``, in s.
+
+    0 means that there is no certificate at any time.
+    """
+    change = _CHANGES[what]
+    usual_s: float = getattr(scheduled, f"{what}_s")
+    return largest(lambda value_s: scope.loop_gain(change(scheduled, value_s)), usual_s)
 
 
 def largest(loop_gain: Callable[[float], float], usual_s: float) -> float:

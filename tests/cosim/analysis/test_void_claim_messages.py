@@ -80,11 +80,11 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
         recorder.poll()
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
-    line = f"void (assumption violated) from 0.506 s on: {cause}"
-    void = [report.warnings for report in plane.reports]
-    assert void == [[]] * 5 + [[line]] * 6
+    line = f"later than allowed from 0.506 s on: {cause}, certificates up to 0.05502 s"
+    late = [report.warnings for report in plane.reports]
+    assert late == [[]] * 5 + [[line]] * 6
     notices = recorded(recorder, tmp_path).notices
-    assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
+    assert notices == [{"t_ns": 506_000_000, "level": "late", "text": line, "process": "recorder"}]
     assert load_record(tmp_path).notices == notices
 
 

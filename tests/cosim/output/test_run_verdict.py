@@ -1,6 +1,7 @@
 """The end of a run: three lines, one table that fits, and no warning without a cause."""
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,22 @@ from rich.console import Console
 
 import noack
 from cosim.analysis.run_summary import Outcome
-from cosim.analysis.summary_model import FidelityPart
+from cosim.analysis.summary_model import Claim, FidelityPart
 from cosim.live.finalize import reopen
 from cosim.output.run_tables import short_numbers
-from cosim.output.run_verdict import print_outcome, remarks, verdict
+from cosim.output.run_verdict import print_outcome, remarks, state_text, verdict
 from tests.cosim.summaries import with_values
 
-RED = "\x1b[1;31m"
+RED, RED_STYLE = "\x1b[1;31m", "bold red"
+LOST = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
+LATE = {"t_s": 1.0, "process": "recorder", "cause": "hold", "what": "an input was old"}
+COVERED = {"sampling_s": 0.002, "delay_s": 0.006, "hold_s": 0.02, "start_s": 0.006}
+
+
+def claim(verdict: str, why: str = "", what: str = "a") -> dict[str, Any]:
+    return {"what": what, "source": "certificate", "bound": "c", "ratio": 1.0, "since_s": 1.0,
+            "why": why, "verdict": verdict, "certified": 1.0, "observed": 1.0, "from_s": 0.0,
+            "until_s": None}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +46,6 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
     return file.getvalue()
 
 
-def claim(verdict: str, why: str = "", what: str = "a") -> dict[str, Any]:
-    return {"what": what, "source": "b", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": why,
-            "verdict": verdict, "certified": 1.0, "observed": 1.0, "from_s": 0.0,
-            "until_s": None}  # fmt: skip
-
-
 def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome: Outcome) -> None:
     summary = outcome.summary
     lines = [line.text for line in verdict(summary)]
@@ -49,14 +53,15 @@ def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome
     assert isinstance(loop.fidelity, FidelityPart)
     claims = len(loop.claims)
     assert lines == [
-        "completed 20 s",
+        f"completed 20 s: stable, ‖x‖ ≤ {loop.sup_state_norm:.3g}, "
+        f"{loop.final_state_norm:.3g} at the end",
+        f"guarantee kept: {claims} claims held, none violated",
         f"{loop.events} transmissions (ideal loop: {loop.fidelity.events_ideal}), "
         f"{loop.deliveries} delivered",
-        f"claims: {claims} of {claims} held",
     ]
     text = printed(outcome)
     assert RED not in text
-    assert "violated" not in text
+    assert text.count("violated") == 1
     assert len(text.splitlines()) <= 25
     *_, last = text.splitlines()
     assert "--verbose" in last
@@ -76,34 +81,90 @@ def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome
 def test_the_first_line_states_how_the_run_ended(
     outcome: Outcome, status: int, reason: str, message: str
 ) -> None:
-    first, *_ = verdict(with_values(outcome.summary, exit={"status": status, "reason": reason}))
+    ended = {"exit": {"status": status, "reason": reason}, "sup_state_norm": None}
+    first, *_ = verdict(with_values(outcome.summary, **ended))
     assert first.text == message
     assert (first.style == "bold red") == (status == 1)
 
 
-def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) -> None:
-    claims = [claim("held"), claim("void", "late"), claim("not applicable", "ideal")]
-    line = verdict(with_values(outcome.summary, claims=claims))[2]
-    assert line.text == "claims: 1 of 3 held, 1 void (late), 1 not applicable (a: ideal)"
-    worse = verdict(with_values(outcome.summary, claims=[*claims, claim("violated", what="b")]))[2]
-    assert worse.text.startswith("claims: 1 of 4 held, 1 violated (b), 1 void (late)")
-    assert worse.style == "bold red"
-    many = [claim("not applicable", "ideal", name) for name in "abcde"]
-    line = verdict(with_values(outcome.summary, claims=many))[2]
-    assert line.text == "claims: 0 of 5 held, 5 not applicable (a; b; c; 2 more: ideal)"
-    assert verdict(with_values(outcome.summary, claims=[]))[2].text == "claims: none"
+@pytest.mark.parametrize(
+    ("claims", "changed", "message", "style"),
+    [
+        ([claim("held"), claim("not applicable", "ideal")], {},
+         "guarantee kept: 1 claim held, none violated", "green"),
+        ([claim("held"), claim("violated", what="b"), claim("void", "late")], {},
+         "guarantee broken since 1.000 s: violated: b", "bold red"),
+        ([claim("violated", what=name) for name in "abcde"], {},
+         "guarantee broken since 1.000 s: violated: a; b; c; 2 more", "bold red"),
+        ([claim("held")], {"assumption_violations": [LOST]},
+         "guarantee broken since 2.500 s: MANSD violated: 6 lost", "bold red"),
+        ([claim("void", "old")], {},
+         "guarantee kept until 1.000 s, then not checkable: old", "yellow"),
+        ([claim("void", LATE["what"])], {"assumption_violations": [LATE], "missing_samples": 0},
+         "guarantee kept until 1.000 s, then not checkable: an input was old; no certificate "
+         "covers that", "yellow"),
+        ([claim("void", "gain 2") | {"bound": "none", "since_s": 0.0}], {},
+         "guarantee not checkable: no certificate: gain 2", "yellow"),
+        ([claim("held"), claim("void", "gain 2") | {"bound": "none", "since_s": 0.0}], {},
+         "guarantee kept: 1 claim held, none violated; 1 claim not checkable: no certificate: "
+         "gain 2", "green"),
+        ([claim("held")], {"assumption_violations": [LATE], "certified_for": COVERED},
+         "guarantee kept: 1 claim held, none violated; certified for its lateness: an input was "
+         "old", "green"),
+        ([claim("held") | {"source": "(I1)"}], {},
+         "guarantee not checkable: no certificate covers this loop", "yellow"),
+        ([], {}, "guarantee not checkable: no certificate covers this loop", "yellow"),
+    ],
+)  # fmt: skip
+def test_the_second_line_states_whether_the_guarantee_was_kept(
+    outcome: Outcome,
+    claims: list[dict[str, Any]],
+    changed: dict[str, Any],
+    message: str,
+    style: str,
+) -> None:
+    line = verdict(with_values(outcome.summary, claims=claims, **changed))[1]
+    assert line == (message, style)
+
+
+@pytest.mark.parametrize(
+    ("largest", "final", "diverged_at_s", "text"),
+    [
+        (2.0, 0.1999, None, "stable, ‖x‖ ≤ 2, 0.2 at the end"),
+        (2.0, 0.2001, None, "bounded, ‖x‖ ≤ 2, 0.2 at the end"),
+        (2.0, 9.0, 1.0, "diverged"),
+        (None, None, None, ""),
+    ],
+)
+def test_the_state_is_stable_bounded_or_diverged(
+    largest: float | None, final: float | None, diverged_at_s: float | None, text: str
+) -> None:
+    assert state_text(largest, final, diverged_at_s) == text
+
+
+def test_the_verdict_of_several_loops_counts_them(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("different_loops", {"horizon_s": 2.0}), runs=tmp_path)
+    summary = run.summary
+    first, second, _ = verdict(summary)
+    assert re.fullmatch(r"completed 2 s: \d of 4 loops (stable|bounded).*", first.text)
+    assert re.fullmatch(
+        r"guarantee kept in all 4 loops: \d+ claims held, none violated", second.text
+    )
+    loops = [*summary.loops]
+    loops[2] = loops[2].model_copy(update={"claims": [Claim(**claim("violated"))]})
+    broken = verdict(summary.model_copy(update={"loops": loops}))[1]
+    name = loops[2].name
+    assert broken == (
+        f"guarantee broken in 1 of 4 loops, since 1.000 s: {name}: violated: a",
+        RED_STYLE,
+    )
 
 
 def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
-    broken = {
-        "t_s": 2.5,
-        "process": "controller",
-        "cause": "dropouts",
-        "what": "MANSD violated: 6 lost",
-    }
-    text = printed(outcome, assumption_violations=[broken] * 7)
+    again = [LOST | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
+    text = printed(outcome, assumption_violations=[LOST, *again])
     assert text.count("assumption violated at t = 2.500 s (reported by controller): MANSD") == 5
-    assert "2 more violations of this kind" in text
+    assert "1 more violations of this kind" in text
     assert RED in text
 
 
@@ -117,10 +178,9 @@ def test_an_assumption_that_a_scenario_violates_is_a_warning(tmp_path: Path) -> 
 def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
     outcome: Outcome,
 ) -> None:
-    late = {"t_s": 1.0, "process": "recorder", "cause": "hold", "what": "an input was old"}
     found: dict[str, Any] = {
         "kind": "live", "unintended_losses": 3, "unintended_losses_by_leg": {"actuation": 3},
-        "assumption_violations": [late], "replay": {"complete": False, "bit_exact": None},
+        "assumption_violations": [LATE], "replay": {"complete": False, "bit_exact": None},
     }  # fmt: skip
 
     def texts(clock_error_s: float | None) -> str:
@@ -131,10 +191,10 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
         return "\n".join(one.text for one in remarks(summary))
 
     assert "lost elsewhere (kernel, or between the hosts; firewalls must pass" in texts(1e-4)
-    assert "A host or the network between hosts was late" in texts(1e-4)
+    assert "A host or the network between hosts was later than" in texts(1e-4)
     assert "noack collect RUN_DIRECTORY HOST:FOLDER" in texts(1e-4)
     assert "lost elsewhere (kernel): 3 on actuation" in texts(None)
-    assert "This machine was late" in texts(None)
+    assert "This machine was later than" in texts(None)
     assert "collect" not in texts(None)
 
 
@@ -144,7 +204,7 @@ def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
     rows = short_numbers(run.summary)
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
     # there is no other value to compare with
-    assert "ideal loop" not in verdict(run.summary)[1].text
+    assert "ideal loop" not in verdict(run.summary)[2].text
 
 
 def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> None:

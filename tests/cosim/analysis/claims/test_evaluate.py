@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -374,10 +375,12 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     return resolve(validate(content, "test"))
 
 
-def hostile(resolved: Scenario, seed: int) -> Any:
+def hostile(resolved: Scenario, seed: int, late_periods: int | None = None) -> Any:
     """Loses as many updates as allowed, or some; delays them as long as allowed, or less."""
     rng = np.random.default_rng(seed)
-    late_ns = resolved.certificate.late_periods * resolved.timing.plant_period_ns
+    if late_periods is None:
+        late_periods = resolved.certificate.late_periods
+    late_ns = late_periods * resolved.timing.plant_period_ns
     known = resolved.network.initial_sync == "known_state"
     share, events, run = float(rng.choice([0.5, 1.0])), 0, 0
 
@@ -413,6 +416,26 @@ def test_no_simulated_run_violates_its_certificate() -> None:
 
     check()
     assert judged[HELD] > 10 * judged.get(VOID, 0)
+
+
+def test_no_simulated_run_violates_the_certificate_of_its_lateness() -> None:
+    """Updates are later than the scenario allows; the certificate is chosen after the run."""
+    judged: Counter[str] = Counter()
+
+    @settings(
+        deadline=None, max_examples=20, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(scenarios(), st.integers(0, 2**32), st.integers(4, 40))
+    def check(resolved: Scenario, seed: int, late_periods: int) -> None:
+        claims = ClaimEvaluation(simulate(resolved, hostile(resolved, seed, late_periods)))
+        verdicts = {one.verdict for one in claims.judge() if one.source == "certificate"}
+        assert VIOLATED not in verdicts
+        if claims.certified_for is not None:
+            judged.update(verdicts)
+
+    check()
+    assert judged[HELD] > 3
 
 
 # --- claims that cannot be judged -----------------------------------------------------------------
