@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.machine_interface import Record
-from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
+from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario_file import validate
@@ -61,43 +61,6 @@ def test_late_steps_keep_their_length_and_are_caught_up() -> None:
         10 * H_NS + 123,
         11 * H_NS,
     ]
-
-
-def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
-    plant = new_plant()
-    outputs = [*plant.on_timer(0)]
-    outputs += plant.handle(actuation(7, [1.0, 0.0]), 100)
-    assert state_of(plant, "u").tolist() == [0.0, 0.0]
-    outputs += plant.handle(actuation(9, [0.0, 5.0]), 200)
-    outputs += plant.on_timer(H_NS)
-    assert state_of(plant, "u").tolist() == [0.0, 5.0]
-    outputs += plant.on_timer(2 * H_NS)  # no newer actuation: the input is held
-    steps = rows(outputs, PLANT_STEP)
-    assert steps["actuation"].tolist() == [-1, 9, 9]
-    assert steps["u"].tolist() == [[0.0, 0.0], [0.0, 5.0], [0.0, 5.0]]
-    assert steps["input"].tolist() == [0, 3, 4]
-    taken = rows(outputs, PLANT_ACTUATION)
-    assert taken["input"].tolist() == [1, 2]
-    assert taken["sequence"].tolist() == [7, 9]
-    assert taken["now_ns"].tolist() == [100, 200]
-    assert taken["u"].tolist() == [[1.0, 0.0], [0.0, 5.0]]
-
-
-@pytest.mark.parametrize(("horizon_ns", "steps"), [(5 * H_NS, 6), (5 * H_NS + 1, 6), (6 * H_NS, 7)])
-def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
-    plant, count = new_plant(horizon_ns), 0
-    while (t_ns := plant.next_deadline_ns()) is not None:
-        plant.on_timer(t_ns)
-        count += 1
-    assert count == steps
-
-
-def test_a_measurement_does_not_change_with_later_steps() -> None:
-    x0 = np.array([1.0, -0.5])
-    plant = linear_plant(A, B, x0, H_NS, horizon_ns=10**9)
-    (message,) = measured(plant.on_timer(0))
-    plant.on_timer(H_NS)
-    assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]
 
 
 @pytest.mark.parametrize("noise", [False, True])

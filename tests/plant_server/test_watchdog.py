@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import pytest
 
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import PLANT_STEP, tables
@@ -85,23 +84,3 @@ def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
         )
     ]  # fmt: skip
     assert driven.u(60 * MS) == 0.0
-
-
-@pytest.mark.parametrize("policy", ["hold", "zero", "model"])
-def test_the_watchdog_reports_each_trip_once_with_its_duration(policy: str) -> None:
-    driven = Driven(plant_of(scenario(policy)))
-    carried = (2.0, 0.0, 0.0)[: 3 if policy == "model" else 1]
-    driven.until(10 * MS)
-    driven.take(0, 5 * MS, *carried)
-    driven.until(120 * MS)
-    driven.take(1, 115 * MS, *carried)
-    driven.until(300 * MS)
-    assert [(notice.t_ns, notice.level) for notice in driven.notices] == [
-        (60 * MS, "watchdog"), (130 * MS, "watchdog"), (170 * MS, "watchdog"),
-    ]  # fmt: skip
-    trip, end, _ = (notice.text for notice in driven.notices)
-    assert trip.startswith("the newest actuation is too old: 0.055 s, 0.05 s allowed; ")
-    assert end == "actuations arrive again; there was none in time for 0.07 s"
-    # the newest actuation, even if it is not applied
-    assert driven.steps[80 * MS]["actuation"] == 0
-    assert driven.u(50 * MS) == driven.u(130 * MS) == 2.0

@@ -6,20 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import expm
 
 from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.observers.kalman import KalmanSettings
 from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import (
     EstimationModel,
-    ObserverSettings,
     observer_gain,
     unobservable_mode,
 )
-from noack.protocol.machine_interface import Notice, Output, Record, Start
+from noack.protocol.machine_interface import Output, Record
 from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
 from noack.scenario.scenario import Scenario
@@ -61,23 +58,6 @@ def measurement(sequence: int, t_ns: int, vector: Sequence[float]) -> Message:
     return Message(Flow.MEASUREMENT, sequence, t_ns, np.array(vector, dtype=float))
 
 
-class Estimator:
-    """The core's observer, of one input and one output."""
-
-    def __init__(self, settings: ObserverSettings, x: Vector) -> None:
-        self._memory, self.core = CoreMemory(), ffi.new("noack_observer *")
-        settings.fill(self.core, model(), x, self._memory)
-
-    def take(self, u: float, y: float) -> None:
-        """Predict with an input, and correct with a measurement."""
-        core.noack_observer_predict(self.core, 2, 1, self._memory.reals([u]))
-        core.noack_observer_correct(self.core, 2, self._memory.reals([y]))
-
-    @property
-    def x(self) -> Vector:
-        return reals_at(self.core.x, 2).copy()
-
-
 def luenberger(L: Matrix) -> LuenbergerSettings:
     return LuenbergerSettings.model_validate_json(
         json.dumps({"kind": "luenberger", "gain": L.tolist()})
@@ -89,22 +69,6 @@ def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> OneLoop:
     start = np.array(x_hat)
     observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
     return machine(Sensor(np.zeros((2, 2)), absolute_rule(1.0), observer=observer))
-
-
-def test_the_kalman_filter_converges_to_the_observer_with_the_steady_gain() -> None:
-    """P converges to the solution of the Riccati equation, from there on L is constant."""
-    settings = {"kind": "kalman", "initial_std": [1.0, 1.0], "Q": Q.tolist(), "R": R.tolist()}
-    kalman = Estimator(KalmanSettings.model_validate_json(json.dumps(settings)), np.zeros(2))
-    for _ in range(2000):
-        kalman.take(0.0, 0.0)
-    before = solve_discrete_are(expm(A * H_NS * 1e-9).T, C.T, Q, R)
-    after = np.linalg.inv(np.linalg.inv(before) + C.T @ np.linalg.inv(R) @ C)
-    np.testing.assert_allclose(reals_at(kalman.core.P, 2, 2), after, rtol=1e-9)
-    steady = Estimator(luenberger(after @ C.T @ np.linalg.inv(R)), kalman.x)
-    for u, y in np.random.default_rng(1).normal(size=(20, 2)):
-        for observer in (kalman, steady):
-            observer.take(u, y)
-        np.testing.assert_allclose(kalman.x, steady.x, rtol=1e-8)
 
 
 def test_complex_poles_and_several_outputs_are_placed() -> None:
@@ -137,23 +101,6 @@ def estimates(outputs: Sequence[Output]) -> Vector:
     (record,) = [one for one in outputs if isinstance(one, Record)]
     found: Vector = record.row[4]
     return found
-
-
-def test_a_restarted_sensor_restarts_its_observer_and_reports_it(observed: dict[str, Any]) -> None:
-    observed["network"]["initial_sync"] = "known_state"
-    scenario = resolved(observed)
-    t_ns, y, u = 400_000_000, 0.7, 0.1
-    again = sensor_of(scenario, Start(1, t_ns)).handle(measurement(40, t_ns, [y, u]), t_ns)
-    (notice,) = [one for one in again if isinstance(one, Notice)]
-    assert notice.text == "the observer restarts from its initial estimate"
-    # From x̂ = 0 and P(0) = I: y has the weight P/(P + R) and carries no information on the
-    # velocity.
-    np.testing.assert_allclose(estimates(again), [y / (1 + 1e-4), 0.0], rtol=1e-12)
-    first = sensor_of(scenario).handle(measurement(0, 0, [y, 0.0]), 0)
-    assert not [one for one in first if isinstance(one, Notice)]
-    weight = 1 / (1 + 1e-4)
-    expected = [1.0 + weight * (y - 1.0), 0.0]  # x(0) is known
-    np.testing.assert_allclose(estimates(first), expected, rtol=1e-12)
 
 
 def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(
