@@ -40,11 +40,3 @@ def stages() -> list[Stage]:
     """Return the stages of all examples of the features."""
     made = (one.stage(StageTables()) for one in IMPAIRED if not names_file(one))
     return [stage for stage in made if stage is not None]
-
-
-def test_stage_numbers_have_the_fields_of_their_structure() -> None:
-    structures = dict(ffi.typeof("noack_stage").fields)
-    for stage in stages():
-        if stage.numbers:
-            structure = structures[stage.structure or stage.kind].type
-            assert stage.numbers.keys() <= dict(structure.fields).keys(), stage.kind

@@ -17,22 +17,13 @@ def clock_at(speed: float, wall_ns: int) -> RunClock:
     return RunClock(EPOCH_NS, speed, lambda: EPOCH_NS + wall_ns)
 
 
-@given(st.integers(-(10**12), 10**15))
-def test_at_speed_one_no_nanosecond_is_lost(wall_ns: int) -> None:
-    assert clock_at(1.0, wall_ns).now_ns() == wall_ns
-
-
-@given(speeds, st.integers(0, 10**14))
+@given(speeds, st.integers(-(10**12), 10**15))
 def test_simulated_time_is_wall_time_times_speed(speed: float, wall_ns: int) -> None:
     exact = Fraction(speed) * wall_ns
     # Rounded down to a nanosecond, after one product with a relative error of 2⁻⁵³.
-    assert abs(clock_at(speed, wall_ns).now_ns() - exact) <= 1 + exact / 2**53
-
-
-@given(speeds, st.lists(st.integers(-(10**12), 10**14), min_size=2))
-def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
-    times = [clock_at(speed, wall_ns).now_ns() for wall_ns in sorted(walls)]
-    assert times == sorted(times)
+    error_ns = abs(clock_at(speed, wall_ns).now_ns() - exact)
+    assert error_ns <= 1 + abs(exact) / 2**53
+    assert error_ns == 0 or speed != 1.0
 
 
 def in_core(clock: RunClock) -> Any:
