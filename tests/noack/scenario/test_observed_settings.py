@@ -6,11 +6,9 @@ from typing import Any
 import pytest
 
 from noack.core.errors import CallerError
-from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import dumps, validate
 
-KALMAN: dict[str, Any] = {"kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0]}
 POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
 
 
@@ -24,13 +22,6 @@ def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> No
     }  # fmt: skip
     with pytest.raises(CallerError, match=r"^file: plant.disturbances.0.at = .* a linear plant"):
         validate(content, "file")
-
-
-def test_every_flow_has_its_vector_length(content: dict[str, Any]) -> None:
-    content["plant"] |= {"measurement": POSITION, "measure_every": 3}
-    scenario = validate(content | {"observer": KALMAN}, "file")
-    lengths = [scenario.message_sizes.entries(flow) for flow in Flow]
-    assert lengths == [1 + 3, 2, 1, 0]  # y and three inputs; x̂; u; empty
 
 
 def test_a_resolved_scenario_has_its_gain_and_resolves_to_itself(content: dict[str, Any]) -> None:

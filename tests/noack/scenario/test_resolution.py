@@ -14,7 +14,7 @@ from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import input_at
-from noack.scenario.scenario_file import dumps, load, validate
+from noack.scenario.scenario_file import load, validate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)
@@ -92,16 +92,6 @@ def test_widening_one_interval_does_not_change_the_other_draws(box: dict[str, An
     assert after.B.tolist() == after.B_model.tolist()
 
 
-def test_a_resolved_scenario_has_no_random_values_left(box: dict[str, Any]) -> None:
-    once = resolved(box, plant=3, initial_state=4)
-    assert once.plant.draw == "given"
-    assert once.model.name is None
-    assert once.plant.initial_state_halfwidth is None
-    assert resolve(once) == once
-    other_seeds = once.model_copy(update={"seeds": resolved(box, plant=8, initial_state=8).seeds})
-    assert resolve(other_seeds).plant == once.plant
-
-
 @pytest.mark.parametrize("draw", ["nominal", "given"])
 def test_a_plant_that_is_not_drawn_is_what_the_file_says(
     content: dict[str, Any], draw: str
@@ -112,19 +102,6 @@ def test_a_plant_that_is_not_drawn_is_what_the_file_says(
     assert loop.A.tolist() == given.get("A", [[0.0, 1.0], [0.0, 0.0]])
     assert loop.B.tolist() == given.get("B", [[0.0], [1.0]])
     assert loop.A_model.tolist() == [[0.0, 1.0], [0.0, 0.0]]
-
-
-@pytest.mark.parametrize(
-    ("mode", "H"), [("model", [[0.0, 1.0], [-1.0, -1.5]]), ("zoh", [[0.0, 0.0], [0.0, 0.0]])]
-)
-def test_the_models_are_the_nominal_closed_loop_or_a_hold(
-    content: dict[str, Any], mode: str, H: list[list[float]]
-) -> None:
-    content |= {"mode": mode}
-    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
-    loop = loop_of(resolved(content))
-    assert loop.H.tolist() == H
-    assert (loop.n, loop.m) == (2, 1)
 
 
 def test_signal_names_are_the_models_or_generated(content: dict[str, Any]) -> None:
@@ -164,20 +141,6 @@ def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     assert off_B.max() <= 0.05 + 1e-14
 
 
-A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-
-
-@pytest.mark.parametrize(("stiffness", "force"), [(0.0, 0.0), (2.0, 6.0)])
-def test_the_equilibrium_input_balances_the_spring(stiffness: float, force: float) -> None:
-    A = np.array([[0.0, 1.0], [-stiffness, -0.1]])
-    assert input_at(A, B_DOUBLE, np.array([3.0, 0.0])) == pytest.approx([force])
-
-
-def test_a_set_point_that_moves_is_refused_with_the_nearest_equilibrium() -> None:
-    with pytest.raises(ValueError, match=r"dimension 1, and the nearest one is \[2, 0\]"):
-        input_at(A_DOUBLE, B_DOUBLE, np.array([2.0, 1.0]))
-
-
 def test_the_equilibrium_that_a_refusal_names_is_taken() -> None:
     A, B = np.array([[0.0, 1.0, 0.0], [0.0, -3.0, 0.7], [0.0, 0.0, 0.0]]), np.eye(3)[:, 2:]
     with pytest.raises(ValueError, match="nearest one is") as refused:
@@ -200,16 +163,3 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
     found = input_at(A, B, x_r)
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
-
-
-def test_the_set_point_of_a_scenario_is_used_in_its_loop(content: dict[str, Any]) -> None:
-    content["controller"] = {"setpoint": [2.0, 0.0]}
-    scenario = validate(content, "here")
-    loop = loop_of(resolve(scenario))
-    assert loop.setpoint is not None
-    assert loop.setpoint_input is not None
-    assert loop.setpoint.tolist() == [2.0, 0.0]
-    assert loop.setpoint_input.tolist() == [0.0]
-    assert "setpoint" in dumps(scenario)
-    content["controller"] = {"setpoint": [0.0, 0.0]}
-    assert loop_of(resolve(validate(content, "here"))).setpoint is None
