@@ -1,16 +1,30 @@
-"""The sensor's events, checked by hand; also with acknowledgements."""
+"""The sensor's events and its observers; cosim/simulation/test_whole_loop.py has whole runs."""
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pytest
+from scipy.linalg import expm
 
+from noack.core.core_library import core, ffi
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.observers.luenberger import LuenbergerSettings
+from noack.observers.observer_settings import (
+    EstimationModel,
+    observer_gain,
+    unobservable_mode,
+)
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
-from noack.protocol.wire_format import Flow, Message
-from sensor_node.sensor import Sensor
-from tests.machine_parts import OneLoop, machine, state_of
+from noack.protocol.wire_format import Encoder, Flow, Message, Wire
+from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
+from sensor_node.sensor import Observer, Sensor
+from tests.machine_parts import OneLoop, machine, sensor_of, state_of
 from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -77,3 +91,138 @@ def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
     before = state_of(one, "x_s")
     _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
     assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()
+
+
+A = np.array([[0.0, 1.0], [4.0, -0.3]])
+B = np.array([[0.0], [1.5]])
+C = np.array([[1.0, 0.2]])
+H_NS = 10_000_000
+Q = np.array([[1e-4, 2e-5], [2e-5, 4e-4]])
+R = np.array([[0.03]])
+
+
+def model(steps: int = 1) -> EstimationModel:
+    Ad, Bd = discretise(A, B, H_NS)
+    _, Gd = discretise(A, np.eye(2), H_NS)
+    return EstimationModel(Ad, Bd, Gd, C, Q, R, steps)
+
+
+@pytest.fixture
+def observed(content: dict[str, Any]) -> dict[str, Any]:
+    """The double integrator with a noisy position measurement."""
+    content["plant"] |= {"rate_hz": 100.0, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.01]}}
+    content["controller"] = {"rate_hz": 100.0}
+    content["observer"] = {
+        "kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0],
+    }  # fmt: skip
+    return content
+
+
+def resolved(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "test"))
+
+
+def luenberger(L: Matrix) -> LuenbergerSettings:
+    return LuenbergerSettings.model_validate_json(
+        json.dumps({"kind": "luenberger", "gain": L.tolist()})
+    )
+
+
+def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> OneLoop:
+    """A sensor with a Luenberger observer that starts at a known estimate."""
+    start = np.array(x_hat)
+    observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
+    return machine(Sensor(np.zeros((2, 2)), absolute_rule(1.0), observer=observer))
+
+
+def test_complex_poles_and_several_outputs_are_placed() -> None:
+    Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
+    wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
+    for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
+        L = observer_gain(Ad, outputs, wanted)
+        found = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
+
+
+def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
+    Ad = np.diag([1.5, 0.5, 0.9])
+    assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
+    assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
+    assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+
+
+def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
+    sensor = observing(np.zeros((2, 1)), [1.0, 1.0], 2)
+    x = estimates(sensor.handle(measurement(0, 5 * H_NS, [0.0, 0.7, -0.4]), 0))
+    Ad, Bd, *_ = model()
+    expected = np.ones(2)
+    for u in (0.7, 0.7, 0.7, 0.7, -0.4):
+        expected = Ad @ expected + Bd @ np.array([u])
+    np.testing.assert_allclose(x, expected, rtol=1e-14)
+
+
+def estimates(outputs: Sequence[Output]) -> Vector:
+    (record,) = [one for one in outputs if isinstance(one, Record)]
+    found: Vector = record.row[4]
+    return found
+
+
+def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(
+    observed: dict[str, Any],
+) -> None:
+    observed["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "input", "std": [0.3]},
+        {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
+        {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
+    ]
+    del observed["observer"]["input_std"]
+    scenario = resolved(observed)
+    believed, h = assumed_model(scenario), 0.01
+    into = np.array([h**2 / 2, h])  # of the double integrator with a held input
+    expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
+    np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
+    assert believed.R.tolist() == [[0.01**2]]
+    observed["observer"] |= {"process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5]}
+    told = assumed_model(resolved(observed))
+    np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
+    assert told.R.tolist() == [[0.25]]
+    np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
+
+
+def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str, Any]) -> None:
+    """P⁻ = a²P⁻R/(P⁻ + R) + q, solved by hand."""
+    a, h, r, q = 2.0, 0.01, 0.04, 9e-4
+    content["model"] = {"A": [[a]], "B": [[1.0]], "gain": [[-3.0]]}
+    content["plant"] = {
+        "initial_state": [0.0], "rate_hz": 100.0,
+        "measurement": {"noise_std": [0.2]},
+    }  # fmt: skip
+    content["observer"] = {"kind": "kalman", "Q": [[q]], "initial_std": [1.0]}
+    content["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "state", "std": [np.sqrt(q) * a / np.expm1(a * h)]}
+    ]
+    f = np.exp(2 * a * h)
+    b = r * (1 - f) - q
+    before = (-b + np.sqrt(b**2 + 4 * q * r)) / 2
+    found = steady_state(resolved(content))
+    assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
+    assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
+    assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)
+
+
+def test_a_measurement_after_the_runs_end_is_rejected(observed: dict[str, Any]) -> None:
+    """An authentic one of any time cannot keep the observer busy with the steps up to it."""
+    scenario = resolved(observed)
+    own, horizon_ns = sensor_of(scenario), scenario.timing.horizon_ns
+    wire, encoder = Wire(1, bytes(32)), Encoder(1, bytes(32))
+    reception, message = own.machines[0].machine.received, ffi.new("noack_message *")
+    values = np.zeros(reception.entries)
+    for t_ns, expected in (
+        (horizon_ns, core.NOACK_ACCEPTED), (horizon_ns + 1, core.NOACK_BAD_RANGE),
+        (10**15, core.NOACK_BAD_RANGE),
+    ):  # fmt: skip
+        datagram = encoder.encode(Message(Flow.MEASUREMENT, 1, t_ns, values))
+        found = core.noack_wire_examine(
+            wire.core, ffi.addressof(reception), 0, datagram, len(datagram), True, False, message
+        )
+        assert found == expected

@@ -16,7 +16,6 @@ from noack.core.errors import CallerError
 from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
-from noack.plants.systems.plant_linearisation import linearise
 from noack.settings.user_files import located
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
@@ -58,21 +57,6 @@ def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path
         atol=1e-9,
     )
     assert system.z == pytest.approx([(system.x[1] ** 2 + system.x[0] ** 2) / 2])
-
-
-@VERSIONS
-def test_the_same_steps_give_bit_identical_states(version: int, tmp_path: Path) -> None:
-    loaded = settings(build(tmp_path, version))
-    one, other = (motion(FmuSystem(loaded, X0), INPUTS[:50]) for _ in "ab")
-    assert one.tobytes() == other.tobytes()
-
-
-@VERSIONS
-def test_its_linearisation_is_that_of_its_equations(version: int, tmp_path: Path) -> None:
-    loaded = settings(build(tmp_path, version), parameters={"mu": 0.7, "k": 3.0})
-    A, B = linearise(lambda x0: FmuSystem(loaded, x0), 2, 1)
-    np.testing.assert_allclose(A, [[0.0, 1.0], [-3.0, 0.7]], atol=1e-6)
-    np.testing.assert_allclose(B, [[0.0], [1.0]], atol=1e-6)
 
 
 @VERSIONS

@@ -189,14 +189,6 @@ def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_pa
     assert len(trigger.sha256) == 64
 
 
-def test_a_shipped_scenario_is_found_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
-    content["network"] = {"mansd": 4, "loss": {"model": "bernoulli", "probability": 0.8}}
-    loops = [{"name": "mass", "scenario": "double_integrator"}]
-    (loop,) = loops_of(load(write(tmp_path, "run.toml", content | {"loops": loops})))
-    assert loop.model.name == "double_integrator"
-    assert resolve(loop).plant.draw == "given"
-
-
 NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
 
 

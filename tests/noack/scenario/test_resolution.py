@@ -1,6 +1,7 @@
 """From a scenario to a run: draws, matrices, and set points with their equilibria."""
 
 import json
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from noack.core.errors import CallerError
 from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import input_at
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import dumps, load, validate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)
@@ -163,3 +165,29 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
     found = input_at(A, B, x_r)
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
+
+
+POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
+
+
+def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> None:
+    content["model"] = {
+        "A": [[0.0] * 4] * 4, "B": [[0.0]] * 4, "gain": [[0.0] * 4], "allow_unstable": True,
+    }  # fmt: skip
+    content["plant"] = {
+        "system": {"kind": "cart_pole"}, "initial_state": [0.0] * 4,
+        "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
+    }  # fmt: skip
+    with pytest.raises(CallerError, match=r"^file: plant.disturbances.0.at = .* a linear plant"):
+        validate(content, "file")
+
+
+def test_a_resolved_scenario_has_its_gain_and_resolves_to_itself(content: dict[str, Any]) -> None:
+    content["plant"]["measurement"] = POSITION
+    content["observer"] = {"kind": "luenberger", "poles_per_s": [[-5.0, 1.0]]}
+    once = resolve(validate(content, "file"))
+    assert once.observer is not None
+    assert once.observer.kind == "luenberger"
+    assert once.observer.gain is not None
+    again = validate(tomllib.loads(dumps(once)), "again")
+    assert again == once == resolve(again)

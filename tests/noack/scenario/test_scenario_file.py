@@ -152,11 +152,6 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
         assert line.startswith(begins), line
 
 
-def test_an_empty_file_reports_every_required_key(tmp_path: Path) -> None:
-    required = ["name", "horizon_s", "model", "plant", "trigger", "network"]
-    assert [line.split(": ")[1] for line in mistakes("", tmp_path)] == required
-
-
 def test_a_long_value_is_shortened(tmp_path: Path) -> None:
     (line,) = mistakes(LANE, tmp_path, [f'mode="{"x" * 500}"'])
     assert len(line) < 200
