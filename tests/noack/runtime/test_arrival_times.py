@@ -61,7 +61,7 @@ def stamp_of(time_ns: int) -> tuple[int, int, bytes]:
 
 
 CHANGES_PS = [sign * 10**k * PS for k in range(11) for sign in (1, -1)]
-ARRIVALS = 1000
+ARRIVALS = 300
 
 
 class FakeEndpoint:

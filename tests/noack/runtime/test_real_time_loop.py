@@ -151,24 +151,26 @@ def test_a_machine_that_is_done_waits_for_the_others_for_a_while(others_turns: i
 _FIFO_PROGRAM = """
 import os, sys
 from noack.runtime.real_time_loop import realtime
-with realtime(True, int(sys.argv[1]), int(sys.argv[2])) as applied:
-    if {applied["sched_fifo"], applied["affinity"]} != {"applied"}:
-        sys.exit("skip: SCHED_FIFO needs a privilege, pinning two cores")
-    print(os.sched_getparam(0).sched_priority, *os.sched_getaffinity(0))
+for place in range(4):
+    with realtime(True, int(sys.argv[1]), place) as applied:
+        if {applied["sched_fifo"], applied["affinity"]} != {"applied"}:
+            sys.exit("skip: SCHED_FIFO needs a privilege, pinning two cores")
+        print(os.sched_getparam(0).sched_priority, *os.sched_getaffinity(0))
 """
 
 
-def _applied(priority: int, place: int) -> tuple[int, ...]:
-    command = [sys.executable, "-c", _FIFO_PROGRAM, str(priority), str(place)]
+def _applied(priority: int) -> list[tuple[int, ...]]:
+    """Return the priority and the cores of each place."""
+    command = [sys.executable, "-c", _FIFO_PROGRAM, str(priority)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.stderr.startswith("skip"):
         pytest.skip(done.stderr)
-    return tuple(map(int, done.stdout.split()))
+    return [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux")
 def test_receiver_interrupts_its_sender_on_the_same_core() -> None:
-    (plant, *plant_cores), *others = [_applied(50, place) for place in range(4)]
+    (plant, *plant_cores), *others = _applied(50)
     priorities = [plant, *(priority for priority, *_ in others)]
     assert priorities == [47, 48, 49, 50]
     assert len({tuple(cores) for _, *cores in others}) == 1
@@ -177,7 +179,7 @@ def test_receiver_interrupts_its_sender_on_the_same_core() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux")
 def test_lowest_priority_is_1() -> None:
-    assert [_applied(1, place)[0] for place in range(4)] == [1, 1, 1, 1]
+    assert [priority for priority, *_ in _applied(1)] == [1, 1, 1, 1]
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux")

@@ -58,24 +58,23 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
 """
 
 
+INT = (signal.SIGINT, 130, "stopped by the user (SIGINT)")
+TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
+
+
 @pytest.mark.parametrize(
-    ("number", "status", "why"),
+    ("words", "ended"),
     [
-        (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
-        (signal.SIGTERM, 143, "stopped on request (SIGTERM)"),
-    ],
-)
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["cosim.cli", "typer", "--version"],
-        ["netem", "netem.channel", "--help"],
-        ["plant_server", "noack.runtime.run_process", "--help"],
+        (["cosim.cli", "typer", "--version"], INT),
+        (["cosim.cli", "typer", "--version"], TERM),
+        (["netem", "netem.channel", "--help"], INT),
+        (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],
 )
 def test_a_signal_during_the_imports_gives_one_line(
-    words: list[str], number: signal.Signals, status: int, why: str
+    words: list[str], ended: tuple[signal.Signals, int, str]
 ) -> None:
+    number, status, why = ended
     command = [sys.executable, "-c", INTERRUPTED, str(int(number)), *words]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert (done.returncode, done.stdout, done.stderr) == (status, "", f"noack: {why}\n")

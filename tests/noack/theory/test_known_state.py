@@ -58,7 +58,7 @@ def test_the_bounds_of_a_scalar_loop(missing: int, error: float, input_error: fl
     assert exact <= found <= 1.03 * exact
 
 
-@settings(SEARCH, max_examples=6)
+@settings(SEARCH, max_examples=15)
 @given(systems(beta=0.01, mismatch=0.5, delay_steps=0, hold_steps=0))
 def test_a_later_event_gives_a_smaller_bound(system: System) -> None:
     """If nothing is known about losses, the newest event gives the smallest bound of ‖x‖."""
