@@ -1,4 +1,3 @@
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -6,11 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import expm
 
 from controller_node.controller import Controller
 from noack.controllers.linear_feedback import LinearFeedback
-from noack.core.linear_systems import product
 from noack.impairments.loss_guarantee import (
     DeliveriesBetweenBursts,
     LongestBurst,
@@ -21,7 +18,7 @@ from noack.impairments.loss_guarantee import (
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from tests.machine_parts import OneLoop, machine, state_of
+from tests.machine_parts import OneLoop, machine
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])
@@ -73,58 +70,6 @@ def notices(outputs: Sequence[Output]) -> list[Notice]:
     return [output for output in outputs if isinstance(output, Notice)]
 
 
-def propagated(x: Sequence[float] | np.ndarray, dt_ns: int) -> np.ndarray:
-    return np.asarray(expm(H * dt_ns * 1e-9) @ x)
-
-
-def test_actuations_are_sent_on_their_grid_up_to_the_horizon() -> None:
-    controller = new_controller(first_ns=MS, horizon_ns=9 * MS)
-    sent = []
-    while controller.next_deadline_ns() is not None:
-        sent.append(tick(controller)[0])
-    assert [message.t_ns for message in sent] == [MS, 3 * MS, 5 * MS, 7 * MS, 9 * MS]
-    assert [message.sequence for message in sent] == [0, 1, 2, 3, 4]
-    assert {message.flow for message in sent} == {Flow.ACTUATION}
-
-
-@given(
-    st.lists(st.none() | st.tuples(st.integers(0, 40), st.integers(0, 3)), max_size=40),
-    st.booleans(),
-)
-def test_the_model_follows_the_newest_update_and_its_time_never_runs_back(
-    inputs: list[tuple[int, int] | None], known: bool
-) -> None:
-    """Ticks (None) and updates of any age and gap arrive in any order."""
-    start, safe = np.array([0.3, -1.7]), np.array([0.1, -0.2, 0.3])
-    controller = new_controller(mansd=0, x0=start if known else None, safe_input=safe)
-    model_ns, sequence, newest = 0, -1, (0, start) if known else None
-
-    def expected() -> np.ndarray:
-        return np.zeros(2) if newest is None else propagated(newest[1], model_ns - newest[0])
-
-    for number, item in enumerate(inputs):
-        if item is None:
-            message, row = tick(controller)
-            model_ns = max(model_ns, row["t_ns"])
-            assert message.t_ns == model_ns  # the time of the model state used for the input
-            u = safe if newest is None else product(K, state_of(controller, "x_c"))
-            assert message.vector.tobytes() == u.tobytes() == row["u"].tobytes()
-        else:
-            event_ms, gap = item
-            sequence += 1 + gap
-            x = [math.sin(sequence), math.cos(sequence)]
-            outputs = controller.handle(update(sequence, event_ms * MS, x), 50 * MS)
-            (row,) = rows(outputs, CONTROLLER_DELIVERY)
-            model_ns = max(model_ns, event_ms * MS)
-            np.testing.assert_allclose(row["x_c_before"], expected(), atol=1e-12)
-            newest = (event_ms * MS, np.array(x))
-            assert (row["dropouts"], row["t_ns"], row["now_ns"]) == (gap, event_ms * MS, 50 * MS)
-            assert row["x"].tolist() == x
-        assert (row["model_t_ns"], row["input"]) == (model_ns, number)
-        np.testing.assert_allclose(state_of(controller, "x_c"), expected(), atol=1e-12)
-        np.testing.assert_array_equal(row["x_c"], state_of(controller, "x_c"))
-
-
 def test_late_ticks_carry_their_nominal_time() -> None:
     late, in_time = new_controller(x0=np.ones(2)), new_controller(x0=np.ones(2))
     for k in range(5):
@@ -135,27 +80,6 @@ def test_late_ticks_carry_their_nominal_time() -> None:
         assert message.vector.tobytes() == expected.vector.tobytes()
         (row,) = rows([record], CONTROLLER_STEP)
         assert row["now_ns"] == 50 * MS
-
-
-@pytest.mark.parametrize("mansd", [0, 3])
-@pytest.mark.parametrize("gap", [0, 1, 3, 4])
-def test_a_violation_is_reported_exactly_when_losses_exceed_m_minus_1(mansd: int, gap: int) -> None:
-    controller = new_controller(mansd=mansd)
-    assert notices(controller.handle(update(0, 0), 0)) == []
-    outputs = controller.handle(update(1 + gap, 77 * MS), 90 * MS)
-    (row,) = rows(outputs, CONTROLLER_DELIVERY)
-    assert row["dropouts"] == gap
-    if gap <= mansd:
-        assert notices(outputs) == []
-    else:
-        (notice,) = notices(outputs)
-        assert (notice.t_ns, notice.level) == (77 * MS, "violation")
-        assert notice.text == (
-            f"MANSD violated: {gap} successive dropouts before update {1 + gap}, "
-            f"at most {mansd} assumed"
-        )
-    # the count starts again
-    assert notices(controller.handle(update(2 + gap, 78 * MS), 91 * MS)) == []
 
 
 @given(st.lists(st.booleans(), max_size=25))

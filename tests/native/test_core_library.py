@@ -1,4 +1,4 @@
-"""The loader of the core: row types, pointers, and one line if there is no right library."""
+"""The loader of the core, and the names that Python has for the things of native/noack.h."""
 
 import shutil
 import subprocess
@@ -18,6 +18,10 @@ from noack.core.core_library import (
     pointer_to,
 )
 from noack.core.errors import CallerError
+from noack.impairments.feature import Stage, StageTables
+from noack.impairments.link_settings import Counters, RecordedDecision
+from noack.protocol.record_tables import Fate
+from tests.netem.feature_examples import IMPAIRED, names_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,3 +84,34 @@ def test_a_command_says_so_without_a_traceback(tmp_path: Path, missing: str) -> 
     (line,) = done.stderr.splitlines()
     assert line.startswith("noack: noack's core in C")
     assert "make setup" in line
+
+
+def constants(name: str) -> dict[str, int]:
+    """Return the constants of an enumeration."""
+    return {word: number for number, word in ffi.typeof(f"enum {name}").elements.items()}
+
+
+def test_fates_have_the_same_numbers() -> None:
+    assert constants("noack_fate") == {f"NOACK_{fate.name}": fate.value for fate in Fate}
+
+
+def test_records_have_the_same_fields_in_the_same_order() -> None:
+    assert dtype_of("noack_counters").names == tuple(Counters.__dataclass_fields__)
+    assert dtype_of("noack_recorded").names == RecordedDecision._fields
+
+
+def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:
+    kinds = [
+        name.removeprefix("NOACK_").lower()
+        for name, number in constants("noack_stage_kind").items()
+        if number != core.NOACK_STAGE_KINDS
+    ]
+    assert {path.stem for path in (ROOT / "native" / "impairments").glob("*.c")} == set(kinds)
+    made = {stage.kind for stage in stages()}
+    assert made == set(kinds)
+
+
+def stages() -> list[Stage]:
+    """Return the stages of all examples of the features."""
+    made = (one.stage(StageTables()) for one in IMPAIRED if not names_file(one))
+    return [stage for stage in made if stage is not None]

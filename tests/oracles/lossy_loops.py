@@ -128,15 +128,6 @@ def certified_or_skipped(
         raise
 
 
-def assert_not_smaller(larger: Constants, smaller: Constants, system: System) -> None:
-    """δ is searched with a relative accuracy of 0.1 % and enclosed with 1 %."""
-    for name in ("delta", "overshoot", "input_error", "state", "mismatch"):
-        assert getattr(smaller, name) <= getattr(larger, name) * 1.01, name
-    longest_s = 5 / system.alpha  # beyond all other times of the loop, δ is as coarse as its grid
-    least_s = min(larger.inter_event_s or 0.0, longest_s)
-    assert (smaller.inter_event_s or 0.0) >= least_s * 0.98
-
-
 class Trace(NamedTuple):
     """Norms of signals in every run and step, (runs, STEPS), and the shortest inter-event time."""
 

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from noack.disturbances.gaussian import GaussianDisturbance
-from noack.disturbances.step import StepDisturbance
-from noack.disturbances.uniform import UniformDisturbance
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from plant_server.plant import BLOCK, MeasurementModel, disturbance_of, measurement_model_of
+from plant_server.plant import BLOCK, MeasurementModel, disturbance_of
 from tests.machine_parts import OneLoop, plant_of, state_of
 
 STEPS = 4000
@@ -116,19 +113,6 @@ def test_an_input_disturbance_acts_on_a_nonlinear_plant(content: dict[str, Any])
     np.testing.assert_array_equal(state_of(disturbed, "x"), state_of(plain, "x"))
 
 
-def test_measurements_carry_the_inputs_of_every_step_since_the_last(
-    disturbed: dict[str, Any],
-) -> None:
-    disturbed["plant"] |= {"measure_every": 3}
-    disturbed["observer"] = {"kind": "luenberger", "gain": [[0.1, 0.0], [0.0, 0.1]]}
-    scenario = resolved(disturbed)
-    rows, sent = steps_of(plant_of(scenario), scenario, 31)
-    assert [message.t_ns for message in sent] == [k * 30_000_000 for k in range(11)]
-    assert sent[0].vector[2:].tolist() == [0.0, 0.0, 0.0]
-    for k, message in enumerate(sent[1:], 1):
-        assert message.vector[2:].tolist() == rows["u"][3 * k - 3 : 3 * k, 0].tolist()
-
-
 def test_noise_has_its_distribution() -> None:
     C = np.array([[1.0, 2.0]])
     measuring = MeasurementModel(C, np.array([0.5]), np.array([0.0]), seed=7)
@@ -137,14 +121,3 @@ def test_noise_has_its_distribution() -> None:
     measuring = MeasurementModel(C, np.array([0.0]), np.array([0.2]), seed=7)
     (v,) = measuring.noise(0, STEPS).T
     assert kstest(v, "uniform", (-0.2, 0.4)).pvalue > 1e-3
-
-
-def test_measurements_without_noise_equal_the_state(content: dict[str, Any]) -> None:
-    content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
-    assert measurement_model_of(resolved(content)) is None
-
-
-def test_variances_are_those_of_the_distributions() -> None:
-    assert UniformDisturbance(kind="uniform", bound=(3.0,)).variance.tolist() == [3.0]
-    assert GaussianDisturbance(kind="gaussian", std=(3.0,)).variance.tolist() == [9.0]
-    assert StepDisturbance(kind="step", amplitude=(3.0,)).variance.tolist() == [0.0]

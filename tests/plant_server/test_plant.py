@@ -1,16 +1,18 @@
+"""The plant: late steps, shared descriptions, and the watchdog of the last actuation."""
+
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from noack.protocol.machine_interface import Record
-from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from noack.scenario.resolution import resolved_loops
+from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import validate
 from plant_server.plant import plants_of
-from tests.machine_parts import OneLoop, linear_plant, state_of
+from tests.machine_parts import OneLoop, linear_plant, plant_of, state_of
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])
@@ -63,43 +65,6 @@ def test_late_steps_keep_their_length_and_are_caught_up() -> None:
     ]
 
 
-def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
-    plant = new_plant()
-    outputs = [*plant.on_timer(0)]
-    outputs += plant.handle(actuation(7, [1.0, 0.0]), 100)
-    assert state_of(plant, "u").tolist() == [0.0, 0.0]
-    outputs += plant.handle(actuation(9, [0.0, 5.0]), 200)
-    outputs += plant.on_timer(H_NS)
-    assert state_of(plant, "u").tolist() == [0.0, 5.0]
-    outputs += plant.on_timer(2 * H_NS)  # no newer actuation: the input is held
-    steps = rows(outputs, PLANT_STEP)
-    assert steps["actuation"].tolist() == [-1, 9, 9]
-    assert steps["u"].tolist() == [[0.0, 0.0], [0.0, 5.0], [0.0, 5.0]]
-    assert steps["input"].tolist() == [0, 3, 4]
-    taken = rows(outputs, PLANT_ACTUATION)
-    assert taken["input"].tolist() == [1, 2]
-    assert taken["sequence"].tolist() == [7, 9]
-    assert taken["now_ns"].tolist() == [100, 200]
-    assert taken["u"].tolist() == [[1.0, 0.0], [0.0, 5.0]]
-
-
-@pytest.mark.parametrize(("horizon_ns", "steps"), [(5 * H_NS, 6), (5 * H_NS + 1, 6), (6 * H_NS, 7)])
-def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
-    plant, count = new_plant(horizon_ns), 0
-    while (t_ns := plant.next_deadline_ns()) is not None:
-        plant.on_timer(t_ns)
-        count += 1
-    assert count == steps
-
-
-def test_a_measurement_does_not_change_with_later_steps() -> None:
-    x0 = np.array([1.0, -0.5])
-    plant = linear_plant(A, B, x0, H_NS, horizon_ns=10**9)
-    (message,) = measured(plant.on_timer(0))
-    plant.on_timer(H_NS)
-    assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]
-
-
 @pytest.mark.parametrize("noise", [False, True])
 def test_loops_with_the_same_plant_share_its_description(
     content: dict[str, Any], *, noise: bool
@@ -111,3 +76,78 @@ def test_loops_with_the_same_plant_share_its_description(
     assert len({id(part) for part in plants.parts}) == (3 if noise else 1)
     for name in ("x", "u"):
         assert np.array_equal(state_of(plants, name, 2), state_of(plants, name))
+
+
+MS = 1_000_000
+K = np.array([[-3.0, -1.5]])
+
+
+def scenario(policy: str, **changes: Any) -> Any:
+    content: dict[str, Any] = {
+        "name": "watched", "horizon_s": 1.0,
+        "model": {"A": [[0.0, 1.0], [1.0, 0.5]], "B": [[0.0], [1.0]], "gain": K.tolist()},
+        "plant": {
+            "initial_state": [1.0, 0.0], "rate_hz": 100.0,
+            "watchdog": {"policy": policy, "timeout_s": 0.05},
+        },
+        "controller": {"rate_hz": 100.0},
+        "trigger": {"beta": 0.1, "alpha_per_s": 0.1},
+        "network": {"mansd": 2, "loss": {"model": "lossless"}},
+    }  # fmt: skip
+    return resolve(validate(content | changes, "here"))
+
+
+class Driven:
+    """A plant that executes every step on time."""
+
+    def __init__(self, plant: OneLoop) -> None:
+        self.plant = plant
+        self.steps: dict[int, Any] = {}
+        self.notices: list[Notice] = []
+
+    def until(self, t_ns: int) -> None:
+        """Execute every step up to ``t_ns``."""
+        while (due_ns := self.plant.next_deadline_ns()) is not None and due_ns <= t_ns:
+            for out in self.plant.on_timer(due_ns):
+                if isinstance(out, Notice):
+                    self.notices.append(out)
+                elif isinstance(out, Record):
+                    self.steps[due_ns] = np.array([out.row], tables(2, 1)[PLANT_STEP])[0]
+
+    def u(self, t_ns: int) -> float:
+        return float(self.steps[t_ns]["u"].item())
+
+    def take(self, sequence: int, t_ns: int, *entries: float) -> None:
+        self.plant.handle(Message(Flow.ACTUATION, sequence, t_ns, np.array(entries)), t_ns)
+
+
+def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> None:
+    for policy, then in (("hold", 2.0), ("zero", 0.0)):
+        for sent_ns, u, trips in ((10 * MS, 2.0, False), (10 * MS - 1, then, True)):
+            driven = Driven(plant_of(scenario(policy)))
+            driven.take(0, sent_ns, 2.0)
+            driven.until(60 * MS)
+            assert (driven.u(50 * MS), driven.u(60 * MS)) == (2.0, u)
+            expected = [(60 * MS, "watchdog")] if trips else []
+            assert [(notice.t_ns, notice.level) for notice in driven.notices] == expected
+
+
+def test_the_default_timeout_is_50_controller_periods() -> None:
+    plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
+    default = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
+    assert default.timing.actuation_timeout_ns == 250 * MS
+    assert default.plant.watchdog.policy == "hold"
+
+
+def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
+    driven = Driven(plant_of(scenario("hold")))
+    driven.until(50 * MS)
+    assert driven.notices == []
+    driven.until(60 * MS)
+    assert driven.notices == [
+        Notice(
+            60 * MS, "watchdog",
+            "no actuation for 0.06 s, 0.05 s allowed; the input is held",
+        )
+    ]  # fmt: skip
+    assert driven.u(60 * MS) == 0.0

@@ -1,21 +1,30 @@
-"""The sensor's events, checked by hand; also with acknowledgements."""
+"""The sensor's events and its observers; cosim/simulation/test_whole_loop.py has whole runs."""
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.core.linear_systems import Matrix, transition
+from noack.core.core_library import core, ffi
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.observers.luenberger import LuenbergerSettings
+from noack.observers.observer_settings import (
+    EstimationModel,
+    observer_gain,
+    unobservable_mode,
+)
 from noack.protocol.machine_interface import Output, Record
-from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
-from noack.protocol.wire_format import Flow, Message
-from sensor_node.sensor import Sensor
-from tests.machine_parts import OneLoop, machine, state_of
+from noack.protocol.record_tables import SENSOR_MEASUREMENT, tables
+from noack.protocol.wire_format import Encoder, Flow, Message, Wire
+from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
+from sensor_node.sensor import Observer, Sensor
+from tests.machine_parts import OneLoop, machine, sensor_of, state_of
 from tests.trigger_rules import absolute_rule, decaying_rule
 from tests.wire_decoder import NO_VECTOR
 
@@ -43,71 +52,6 @@ def test_an_error_equal_to_the_threshold_is_no_event() -> None:
         assert len(updates(sensor.handle(measurement(0, 0, [x]), 0))) == events
 
 
-@st.composite
-def measured_runs(draw: st.DrawFn) -> tuple[Matrix, Matrix | None, list[tuple[int, np.ndarray]]]:
-    n = draw(st.integers(1, 4))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    H = rng.uniform(-1, 1, (n, n)) * draw(st.sampled_from([0.0, 1.0]))
-    # Diagonally dominant, hence invertible.
-    W = 3 * np.eye(n) + rng.uniform(-0.5, 0.5, (n, n)) if draw(st.booleans()) else None
-    gaps = draw(st.lists(st.integers(1, 5), min_size=1, max_size=30))  # measurements may be missing
-    x, t_ns, run = rng.uniform(-1, 1, n), draw(st.integers(0, 5)) * GRID_NS, []
-    for gap in gaps:
-        run.append((t_ns, x))
-        x = x + rng.normal(0, 0.05, n)
-        t_ns += gap * GRID_NS
-    return H, W, run
-
-
-@given(measured_runs(), st.booleans(), st.sampled_from([0.0, 0.18]))
-def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
-    system: tuple[Matrix, Matrix | None, list[tuple[int, np.ndarray]]], known: bool, floor: float
-) -> None:
-    H, W, run = system
-    x0 = run[0][1] + 0.02
-    sensor = machine(Sensor(H, decaying_rule(0.2, 0.5, floor, W, len(H)), x0 if known else None))
-    reset_ns, reset = (0, x0) if known else (0, None)
-    for k, (t_ns, x) in enumerate(run):
-        outputs = sensor.handle(measurement(k, t_ns, x), t_ns)
-        (row,), sent = rows(outputs, len(x)), updates(outputs)
-        # x_s from the last event in one step, not measurement by measurement.
-        x_s = x if reset is None else expm(H * (t_ns - reset_ns) * 1e-9) @ reset
-        e_s = x_s - x if W is None else W @ (x_s - x)
-        error = float(np.linalg.norm(e_s))
-        threshold = max(0.2 * math.exp(-0.5 * t_ns * 1e-9), floor)
-        # Thirty propagations, each with an error of about 1e-15, amplified by ‖e^{Ht}‖ < e^{4 ·
-        # 1.5}.
-        np.testing.assert_allclose(row["x_s"], x_s, atol=1e-11)
-        assert row["e_s_norm"] == pytest.approx(error, abs=1e-10)
-        assert row["threshold"] == pytest.approx(threshold, rel=1e-14)
-        if abs(error - threshold) > 1e-9:
-            assert bool(sent) == (reset is None or error > threshold)
-        assert (row["event"] != NO_SEQUENCE) == bool(sent)
-        if sent:  # whether or not the packet arrives
-            assert state_of(sensor, "x_s").tolist() == x.tolist()
-            reset_ns, reset = t_ns, x
-
-
-def test_an_update_carries_the_measured_state_and_its_time() -> None:
-    sensor = machine(Sensor(np.zeros((2, 2)), decaying_rule(0.1, 1.0)))
-    outputs: list[Output] = []
-    for k, x in enumerate([[1.0, 2.0], [1.0, 2.05], [3.0, 2.0], [3.0, 7.0]]):
-        outputs += sensor.handle(measurement(10 + k, k * GRID_NS, x), k * GRID_NS + 777)
-    sent = updates(outputs)
-    assert [(m.flow, m.sequence, m.t_ns, m.vector.tolist()) for m in sent] == [
-        (Flow.UPDATE, 0, 0, [1.0, 2.0]),
-        (Flow.UPDATE, 1, 2 * GRID_NS, [3.0, 2.0]),
-        (Flow.UPDATE, 2, 3 * GRID_NS, [3.0, 7.0]),
-    ]
-    record = rows(outputs, 2)
-    assert record["event"].tolist() == [0, NO_SEQUENCE, 1, 2]
-    assert record["input"].tolist() == [0, 1, 2, 3]
-    assert record["sequence"].tolist() == [10, 11, 12, 13]
-    assert record["now_ns"].tolist() == [k * GRID_NS + 777 for k in range(4)]
-    # Before the reset, so that the record contains e_s(t_k⁻).
-    assert record["x_s"].tolist() == [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0], [3.0, 2.0]]
-
-
 def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     """Read on time or up to seconds late, the datagrams give the same results, bit for bit."""
     rng = np.random.default_rng(0)
@@ -127,20 +71,8 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     assert runs[0] == runs[1]
 
 
-def test_the_sensor_acts_on_measurements_only() -> None:
-    sensor = machine(Sensor(ZOH, decaying_rule(0.5, 0.25, n=1)))
-    sensor.handle(measurement(0, 0, [1.0]), 0)
-    assert sensor.next_deadline_ns() is None
-    assert not sensor.on_timer(10**9)
-
-
-MS = 1_000_000
 H = np.array([[0.0, 1.0], [-2.0, -3.0]])
 ALWAYS = absolute_rule(1e-9)
-
-
-def acknowledgement(of: Message) -> Message:
-    return Message(Flow.ACKNOWLEDGEMENT, of.sequence, of.t_ns, NO_VECTOR)
 
 
 def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
@@ -154,35 +86,143 @@ def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) ->
     return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
 
 
-@pytest.mark.parametrize("periods", [1, 2, 5])
-def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_timeout(
-    periods: int,
-) -> None:
-    one = waiting(periods * GRID_NS, x0=[0.0, 0.0])
-    sent = []
-    for k in range(1, 21):
-        sent += split(one.handle(measurement(k, k * GRID_NS, [float(k), 0.0]), k * GRID_NS))[0]
-    assert [message.t_ns // GRID_NS for message in sent] == list(range(1, 21, periods))
-    assert [message.vector[0] for message in sent] == [message.t_ns // GRID_NS for message in sent]
-    assert [message.sequence for message in sent] == list(range(len(sent)))
-
-
-def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
-    one = waiting(GRID_NS, x0=[0.0, 0.0])
-    (first,), _ = split(one.handle(measurement(1, GRID_NS, [1.0, 0.0]), 0))
-    (second,), _ = split(one.handle(measurement(2, 2 * GRID_NS, [2.0, 0.0]), 0))
-    one.handle(acknowledgement(first), 2 * GRID_NS)
-    np.testing.assert_allclose(
-        state_of(one, "x_s"), transition(H, GRID_NS) @ [1.0, 0.0], rtol=1e-14
-    )
-    late = Message(Flow.MEASUREMENT, 3, 2 * GRID_NS + 1, np.array([9.0, 0.0]))
-    assert split(one.handle(late, 2 * GRID_NS + 1))[0] == []
-    one.handle(acknowledgement(second), 2 * GRID_NS + 2)
-    np.testing.assert_allclose(state_of(one, "x_s"), transition(H, 1) @ [2.0, 0.0], rtol=1e-14)
-
-
 def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
     one = waiting(x0=[1.0, 1.0])
     before = state_of(one, "x_s")
     _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
     assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()
+
+
+A = np.array([[0.0, 1.0], [4.0, -0.3]])
+B = np.array([[0.0], [1.5]])
+C = np.array([[1.0, 0.2]])
+H_NS = 10_000_000
+Q = np.array([[1e-4, 2e-5], [2e-5, 4e-4]])
+R = np.array([[0.03]])
+
+
+def model(steps: int = 1) -> EstimationModel:
+    Ad, Bd = discretise(A, B, H_NS)
+    _, Gd = discretise(A, np.eye(2), H_NS)
+    return EstimationModel(Ad, Bd, Gd, C, Q, R, steps)
+
+
+@pytest.fixture
+def observed(content: dict[str, Any]) -> dict[str, Any]:
+    """The double integrator with a noisy position measurement."""
+    content["plant"] |= {"rate_hz": 100.0, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.01]}}
+    content["controller"] = {"rate_hz": 100.0}
+    content["observer"] = {
+        "kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0],
+    }  # fmt: skip
+    return content
+
+
+def resolved(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "test"))
+
+
+def luenberger(L: Matrix) -> LuenbergerSettings:
+    return LuenbergerSettings.model_validate_json(
+        json.dumps({"kind": "luenberger", "gain": L.tolist()})
+    )
+
+
+def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> OneLoop:
+    """A sensor with a Luenberger observer that starts at a known estimate."""
+    start = np.array(x_hat)
+    observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
+    return machine(Sensor(np.zeros((2, 2)), absolute_rule(1.0), observer=observer))
+
+
+def test_complex_poles_and_several_outputs_are_placed() -> None:
+    Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
+    wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
+    for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
+        L = observer_gain(Ad, outputs, wanted)
+        found = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
+
+
+def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
+    Ad = np.diag([1.5, 0.5, 0.9])
+    assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
+    assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
+    assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+
+
+def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
+    sensor = observing(np.zeros((2, 1)), [1.0, 1.0], 2)
+    x = estimates(sensor.handle(measurement(0, 5 * H_NS, [0.0, 0.7, -0.4]), 0))
+    Ad, Bd, *_ = model()
+    expected = np.ones(2)
+    for u in (0.7, 0.7, 0.7, 0.7, -0.4):
+        expected = Ad @ expected + Bd @ np.array([u])
+    np.testing.assert_allclose(x, expected, rtol=1e-14)
+
+
+def estimates(outputs: Sequence[Output]) -> Vector:
+    (record,) = [one for one in outputs if isinstance(one, Record)]
+    found: Vector = record.row[4]
+    return found
+
+
+def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(
+    observed: dict[str, Any],
+) -> None:
+    observed["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "input", "std": [0.3]},
+        {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
+        {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
+    ]
+    del observed["observer"]["input_std"]
+    scenario = resolved(observed)
+    believed, h = assumed_model(scenario), 0.01
+    into = np.array([h**2 / 2, h])  # of the double integrator with a held input
+    expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
+    np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
+    assert believed.R.tolist() == [[0.01**2]]
+    observed["observer"] |= {"process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5]}
+    told = assumed_model(resolved(observed))
+    np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
+    assert told.R.tolist() == [[0.25]]
+    np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
+
+
+def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str, Any]) -> None:
+    """P⁻ = a²P⁻R/(P⁻ + R) + q, solved by hand."""
+    a, h, r, q = 2.0, 0.01, 0.04, 9e-4
+    content["model"] = {"A": [[a]], "B": [[1.0]], "gain": [[-3.0]]}
+    content["plant"] = {
+        "initial_state": [0.0], "rate_hz": 100.0,
+        "measurement": {"noise_std": [0.2]},
+    }  # fmt: skip
+    content["observer"] = {"kind": "kalman", "Q": [[q]], "initial_std": [1.0]}
+    content["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "state", "std": [np.sqrt(q) * a / np.expm1(a * h)]}
+    ]
+    f = np.exp(2 * a * h)
+    b = r * (1 - f) - q
+    before = (-b + np.sqrt(b**2 + 4 * q * r)) / 2
+    found = steady_state(resolved(content))
+    assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
+    assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
+    assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)
+
+
+def test_a_measurement_after_the_runs_end_is_rejected(observed: dict[str, Any]) -> None:
+    """An authentic one of any time cannot keep the observer busy with the steps up to it."""
+    scenario = resolved(observed)
+    own, horizon_ns = sensor_of(scenario), scenario.timing.horizon_ns
+    wire, encoder = Wire(1, bytes(32)), Encoder(1, bytes(32))
+    reception, message = own.machines[0].machine.received, ffi.new("noack_message *")
+    values = np.zeros(reception.entries)
+    for t_ns, expected in (
+        (horizon_ns, core.NOACK_ACCEPTED), (horizon_ns + 1, core.NOACK_BAD_RANGE),
+        (10**15, core.NOACK_BAD_RANGE),
+    ):  # fmt: skip
+        datagram = encoder.encode(Message(Flow.MEASUREMENT, 1, t_ns, values))
+        found = core.noack_wire_examine(
+            wire.core, ffi.addressof(reception), 0, datagram, len(datagram), True, False, message
+        )
+        assert found == expected

@@ -20,14 +20,6 @@ def test_arrays_are_copies_that_live_with_their_memory() -> None:
     assert reals_at(memory.zeros(0), 0).tolist() == []
 
 
-def test_a_field_becomes_a_number_a_copy_or_null() -> None:
-    memory, observer = CoreMemory(), ffi.new("noack_observer *")
-    memory.fill(observer, {"p": 2, "C": np.ones((2, 2)), "Q": np.zeros(1)})
-    assert (observer.p, observer.C[3]) == (2, 1.0)
-    memory.fill(observer, {"Q": None})
-    assert ffi.NULL == observer.Q
-
-
 def test_models_with_the_same_matrix_share_its_exponentials() -> None:
     memory, H = CoreMemory(), np.array([[0.0, 1.0], [-2.0, -0.5]])
     one, other = memory.transitions(H, (5, 0)), memory.transitions(H.copy(), (7,))

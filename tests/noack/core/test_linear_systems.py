@@ -1,4 +1,9 @@
+"""Matrix functions of the core against scipy, closed forms, and themselves on other processors."""
+
 import math
+import os
+import subprocess
+import sys
 from fractions import Fraction
 
 import numpy as np
@@ -7,15 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm, solve_continuous_lyapunov
 
 from noack.core.linear_systems import (
     Matrix,
+    ModelFlow,
     Propagator,
     discretise,
+    exponential,
     norm,
     product,
     row_norms,
-    spectral_abscissa,
+    solve_lyapunov,
     transition,
 )
 
@@ -30,7 +38,6 @@ def square(n: int) -> st.SearchStrategy[Matrix]:
 
 
 generators = st.integers(1, 5).flatmap(square)
-steps_ns = st.integers(0, 2_000_000_000)
 
 
 @st.composite
@@ -48,17 +55,6 @@ def test_a_scalar_system_is_discretised_as_its_closed_form(a: float, dt_ns: int)
     assert Bd.item() == pytest.approx(b * (math.expm1(a * dt) / a if a else dt), rel=ROUNDING)
 
 
-def test_a_singular_matrix_that_is_not_nilpotent_is_discretised_as_its_closed_form() -> None:
-    v, w, dt = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -1.0]), 0.7
-    A, rate = np.outer(v, w), float(w @ v)  # A² = rate · A gives the series a closed form
-    B = np.array([[1.0, 0.0], [0.0, 2.0], [-1.0, 1.0]])
-    Ad, Bd = discretise(A, B, 700_000_000)
-    grown = math.expm1(rate * dt)
-    np.testing.assert_allclose(Ad, np.eye(3) + grown / rate * A, rtol=ROUNDING, atol=ROUNDING)
-    expected = dt * B + (grown - rate * dt) / rate**2 * A @ B
-    np.testing.assert_allclose(Bd, expected, rtol=ROUNDING, atol=ROUNDING)
-
-
 @given(systems(), st.integers(1, 500_000_000), st.integers(0, 2**32))
 def test_a_held_input_gives_what_an_integrator_gives(
     system: tuple[Matrix, Matrix], dt_ns: int, seed: int
@@ -74,26 +70,12 @@ def test_a_held_input_gives_what_an_integrator_gives(
     np.testing.assert_allclose(Ad @ x0 + Bd @ u, solution.y[:, -1], atol=1e-9)
 
 
-@given(generators, steps_ns, steps_ns)
-def test_transitions_form_a_group(G: Matrix, s_ns: int, t_ns: int) -> None:
-    first, second = transition(G, s_ns), transition(G, t_ns)
-    scale = np.linalg.norm(first) * np.linalg.norm(second)
-    np.testing.assert_allclose(second @ first, transition(G, s_ns + t_ns), atol=1e-13 * scale)
-
-
 @given(generators, st.lists(st.integers(1, 10**9), min_size=1, max_size=5))
 def test_cached_and_fresh_matrices_are_the_same_bits(A: Matrix, steps: list[int]) -> None:
     free, state = Propagator(A), np.ones(len(A))
     for dt_ns in [*steps, *reversed(steps)]:
         assert free.transition(dt_ns).tobytes() == transition(A, dt_ns).tobytes()
         assert free(state, dt_ns).tobytes() == Propagator(A)(state, dt_ns).tobytes()
-
-
-def test_a_propagator_keeps_its_own_matrix() -> None:
-    A = np.array([[-1.0]])
-    free = Propagator(A)
-    A[:] = 7.0
-    assert free(np.array([1.0]), 10**9) == pytest.approx(math.exp(-1), rel=ROUNDING)
 
 
 def test_zero_time_and_zero_dynamics_leave_the_state_unchanged() -> None:
@@ -140,12 +122,6 @@ def test_a_norm_is_the_hypotenuse(values: list[float]) -> None:
     assert norm(np.array(values)) == pytest.approx(expected, rel=1e-14, abs=1e-320, nan_ok=True)
 
 
-def test_the_abscissa_is_the_largest_real_part() -> None:
-    # Eigenvalues −0.5 ± 3i and −2, from the block structure.
-    matrix = np.array([[-0.5, 3.0, 1.0], [-3.0, -0.5, 4.0], [0.0, 0.0, -2.0]])
-    assert spectral_abscissa(matrix) == pytest.approx(-0.5, rel=ROUNDING)
-
-
 @pytest.mark.parametrize("size", [1e300, 1e160, 1e-160, 1e-300, 5e-324])
 def test_row_norms_neither_overflow_nor_vanish(size: float) -> None:
     rows = np.array([[3.0, 4.0], [0.0, -2.0], [0.0, 0.0]]) * size
@@ -160,3 +136,104 @@ def test_row_norms_of_non_finite_rows_are_not_finite() -> None:
     with np.errstate(invalid="ignore"):
         found = row_norms(np.array([[np.inf, 1.0], [np.nan, 1.0], [1.0, 0.0]]))
     np.testing.assert_array_equal(found, [np.inf, np.nan, 1.0])
+
+
+_PRINT_BITS = """
+import numpy as np
+from noack.core.linear_systems import exponential
+draw = np.random.default_rng(3)
+for n in (1, 2, 4, 9, 16):
+    for scale in (1e-6, 0.1, 1.0, 30.0):
+        print(exponential(scale * draw.normal(size=(n, n))).tobytes().hex())
+"""
+OTHER_PROCESSORS = [
+    {"OPENBLAS_CORETYPE": "Prescott"},
+    {"OPENBLAS_CORETYPE": "Haswell"},
+    {"NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3 AVX512F"},
+    {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"},
+]
+"""Make numpy, its BLAS and the C library compute as on an older processor, if this is an x86."""
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 14])
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 0.3, 0.95, 4.0, 60.0])
+def test_the_exponential_is_that_of_scipy(n: int, scale: float) -> None:
+    matrix = scale * np.random.default_rng(n).uniform(-1, 1, (n, n)) / np.sqrt(n)
+    expected = expm(matrix)
+    error = np.linalg.norm(exponential(matrix) - expected)
+    assert error <= 1e-13 * max(scale, 1) * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e5])
+def test_a_large_input_matrix_costs_no_accuracy(size: float) -> None:
+    """[[a, b], [0, 0]] has the exponential [[e^a, b (e^a - 1)/a], [0, 1]]."""
+    a, b = -0.25, size
+    found = exponential(np.array([[a, b], [0.0, 0.0]]))
+    assert found[0, 0] == pytest.approx(np.exp(a), rel=1e-15)
+    assert found[0, 1] == pytest.approx(b * np.expm1(a) / a, rel=1e-15)
+    assert found[1].tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("entry", [800.0, 1e300, np.inf, np.nan])
+def test_an_exponential_that_overflows_is_not_finite_and_ends(entry: float) -> None:
+    assert not np.isfinite(exponential(np.array([[entry, 1.0], [0.0, 1.0]]))).all()
+
+
+def test_every_processor_gives_the_same_exponentials() -> None:
+    own = _bits({})
+    for settings in OTHER_PROCESSORS:
+        assert _bits(settings) == own, settings
+
+
+def _bits(settings: dict[str, str]) -> str:
+    environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_CORETYPE"}
+    found = subprocess.run(
+        [sys.executable, "-c", _PRINT_BITS], env=environment | settings, check=True,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    return found.stdout
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 14])
+def test_lyapunov_equations_are_solved(n: int) -> None:
+    rng = np.random.default_rng(n)
+    M = rng.uniform(-1, 1, (n, n)) - 3 * np.eye(n)
+    Q = rng.uniform(-1, 1, (n, n))
+    found = solve_lyapunov(M, Q)
+    assert M @ found + found @ M.T == pytest.approx(Q, abs=1e-12)
+    assert found == pytest.approx(solve_continuous_lyapunov(M, Q), abs=1e-12)
+
+
+def test_a_lyapunov_equation_without_a_solution_is_an_error() -> None:
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_lyapunov(np.diag([1.0, -1.0]), np.eye(2))
+
+
+H = np.array([[0.0, 1.0], [-1.0, -1.5]])
+X = np.array([1.0, -0.5])
+
+
+def test_without_a_set_point_the_flow_is_the_propagator_bit_for_bit() -> None:
+    flow = ModelFlow(H)
+    flow.change(5, None)
+    assert not flow.moved
+    assert flow(X, 3, 10**9).tobytes() == Propagator(H)(X, 10**9 - 3).tobytes()
+
+
+def test_the_model_converges_to_the_set_point() -> None:
+    x_r = np.array([2.0, 0.0])
+    flow = ModelFlow(H, x_r)
+    assert flow(x_r, 0, 10**9).tolist() == x_r.tolist()
+    assert flow(X, 0, 40 * 10**9) == pytest.approx(x_r, abs=1e-9)
+
+
+@given(st.lists(st.integers(0, 5 * 10**9), min_size=2, max_size=8))
+def test_changes_on_the_way_are_taken_where_they_are(times: list[int]) -> None:
+    *inner, end_ns = sorted(times)
+    flow, by_hand, now_ns, x_r = ModelFlow(H), X, 0, np.zeros(2)
+    for number, t_ns in enumerate(inner):
+        by_hand = x_r + expm(H * (t_ns - now_ns) * 1e-9) @ (by_hand - x_r)
+        now_ns, x_r = t_ns, np.array([float(number), 0.0])
+        flow.change(t_ns, x_r)
+    by_hand = x_r + expm(H * (end_ns - now_ns) * 1e-9) @ (by_hand - x_r)
+    assert flow(X, 0, end_ns) == pytest.approx(by_hand, abs=1e-9)

@@ -3,21 +3,8 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
-
-seeds = st.integers(0, 2**64 - 1)
-names = st.lists(st.text("abc/", max_size=4), min_size=1, max_size=4)
-
-
-@given(seeds, names)
-def test_a_stream_is_fixed_by_its_seed_and_name(seed: int, name: list[str]) -> None:
-    first, again = stream(seed, *name), stream(seed, *name)
-    other = stream(seed, "something", "else")
-    other.random(100)  # drawing from one does not change the others
-    assert first.random(20).tobytes() == again.random(20).tobytes()
 
 
 def test_a_stream_is_the_documented_generator() -> None:

@@ -45,17 +45,6 @@ def test_the_operating_point_is_an_equilibrium(name: str, overrides: list[str]) 
 
 
 @pytest.mark.parametrize(("name", "overrides"), list(cases()))
-def test_names_and_dimensions_agree(name: str, overrides: list[str]) -> None:
-    scenario = scenario_of(name, overrides)
-    n, m = scenario.model.dimensions
-    settings, system = scenario.plant.system, system_of(scenario)
-    assert len(system.x) == n
-    assert len(system.z) == len(settings.internal_names)
-    assert len(settings.states) in (0, n)
-    assert len(settings.inputs) in (0, m)
-
-
-@pytest.mark.parametrize(("name", "overrides"), list(cases()))
 def test_the_same_inputs_give_bit_identical_states(name: str, overrides: list[str]) -> None:
     scenario = scenario_of(name, overrides)
     inputs = 0.01 * np.random.default_rng(1).normal(size=(STEPS, scenario.model.dimensions[1]))

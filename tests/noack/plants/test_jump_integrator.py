@@ -51,13 +51,6 @@ def test_parabolas_between_jumps_are_exact(duration_s: float) -> None:
     assert rates.evaluations <= 60 + 60 * jumps  # a step without a jump takes six or seven
 
 
-def test_a_smooth_equation_has_the_integrators_accuracy() -> None:
-    rates = Switched(lambda z, sign: [z[1], -z[0]])
-    code, z = advanced(rates, [2.0, 0.0], 10.0)
-    assert code == DONE
-    np.testing.assert_allclose(z, [2 * math.cos(10.0), -2 * math.sin(10.0)], atol=1e-4)
-
-
 def test_endless_changes_of_a_sign_end_the_integration(monkeypatch: pytest.MonkeyPatch) -> None:
     """z slides along the jump: no sign can be held, and an error control cannot pass."""
     monkeypatch.setattr(jump_integrator, "_MAX_STEPS", 1000)
@@ -71,11 +64,3 @@ def test_endless_changes_of_a_sign_end_the_integration(monkeypatch: pytest.Monke
 def test_equations_that_are_not_finite_are_a_failure() -> None:
     code, _ = advanced(Switched(lambda z, sign: [math.nan]), [1.0], 1.0)
     assert code == jump_integrator.TOO_SMALL_STEPS
-
-
-def test_no_time_gives_the_slope() -> None:
-    work, z = buffers(2, 1), np.array([3.0, 1.0])
-    rates = Switched(lambda z, sign: [z[1], -sign])
-    assert advance(rates, None, z, np.zeros(0), None, 0.0, TOLERANCES, work) == DONE
-    assert work.slopes[0].tolist() == [1.0, -1.0]
-    assert z.tolist() == [3.0, 1.0]

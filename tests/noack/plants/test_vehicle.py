@@ -45,28 +45,6 @@ def test_a_vehicle_starts_in_the_state_x(model: str, car: str) -> None:
     assert len(system.z) == len(settings(model=model).internal_names)
 
 
-def test_the_lateral_velocity_of_a_kinematic_vehicle_follows_from_its_yaw_rate() -> None:
-    system = OdeSystem(settings(model="kinematic").equations(), X0)
-    behind = parameters("bmw_320i").b
-    np.testing.assert_allclose(system.x, [0.1 * behind, *X0[1:]], rtol=1e-12)
-
-
-@pytest.mark.parametrize("model", ["kinematic", "single_track", "drift", "multi_body"])
-def test_the_lane_position_agrees_with_the_lane_model(model: str) -> None:
-    """Ẏ_g = V − v ψ and ψ̇ = r, for small angles."""
-    system = OdeSystem(
-        settings(model=model, speed_m_per_s=15.0).equations(), np.array([0.0, 0.0, 0.01, 0.0])
-    )
-    states = motion(system, [0.003] * 250)
-    t_s = np.arange(251) * H_NS * 1e-9
-    V, r, psi, Y_g = states.T
-    turned = np.trapezoid(r, t_s)
-    assert psi[-1] - psi[0] == pytest.approx(turned, rel=1e-3)
-    assert psi[-1] > psi[0]
-    aside = np.trapezoid(V - 15.0 * psi, t_s)
-    assert Y_g[-1] - Y_g[0] == pytest.approx(aside, rel=0.01)  # its speed is not quite constant
-
-
 def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
     return linearise(
         lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
@@ -165,17 +143,6 @@ def test_steering_is_limited_to_the_vehicles_rate_and_angle() -> None:
     assert system.z[2] == pytest.approx(limits.max, rel=1e-6)
 
 
-def test_a_car_turns_less_on_ice() -> None:
-    yaw = [
-        motion(
-            OdeSystem(settings(model="drift", friction=friction).equations(), np.zeros(4)),
-            [0.1] * 400,
-        )[-1, 2]
-        for friction in (1.0, 0.1)
-    ]
-    assert 0 < yaw[1] < 0.5 * yaw[0]
-
-
 def test_a_truck_is_simulated_with_its_trailer() -> None:
     truck = settings(model="kinematic", parameters="truck", speed_m_per_s=10.0)
     system = OdeSystem(truck.equations(), np.zeros(4))
@@ -250,12 +217,6 @@ def test_the_equations_give_the_librarys_values(model: str, car: int) -> None:
                 np.testing.assert_allclose(rates(z, *inputs), expected, rtol=1e-12, atol=1e-12)
             np.testing.assert_array_equal(z, before)
     assert compared > 30
-
-
-@pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
-def test_equations_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
-    assert (compiled.compiled_dynamics(model) is not None) == is_compiled
-    assert compiled.is_compiled(model)
 
 
 def test_equations_that_cannot_be_compiled_are_run_in_python(

@@ -20,12 +20,3 @@ def test_the_recorded_head_of_a_datagram_is_its_whole_header() -> None:
     """The record shows which update was dropped, although the network does not read payloads."""
     assert wire_format.HEADER_BYTES == PACKET_HEAD_BYTES
     assert tables(1, 1)[NETEM_PACKET]["head"].itemsize == PACKET_HEAD_BYTES
-
-
-def test_rows_have_the_vector_lengths_of_the_loop() -> None:
-    for n, m in ((1, 1), (4, 2), (64, 3)):
-        for table, dtype in tables(n, m, acknowledged=True, predictive=True).items():
-            for column in dtype.names or ():
-                shape = dtype[column].shape
-                expected = (m,) if column == "u" else (n,) if column.startswith("x") else ()
-                assert shape == expected, (table, column)

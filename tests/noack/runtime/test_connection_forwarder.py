@@ -180,12 +180,6 @@ def test_connections_that_one_host_holds_keep_no_other_host_out() -> None:
         assert echoed(crowd[0], b"hello") == b"hello"  # the newest was ended
 
 
-def test_a_long_message_passes_unchanged() -> None:
-    with echo() as listening, connected(listening.getsockname(), KEYS, KEYS.joining) as connection:
-        for at in range(0, len(MESSAGE), 32_000):
-            assert echoed(connection, MESSAGE[at : at + 32_000]) == MESSAGE[at : at + 32_000]
-
-
 @pytest.mark.parametrize("own", [None, new_tls_keys("127.0.0.1").joining, KEYS.coordinator])
 def test_without_a_certificate_of_the_run_nothing_passes(own: KeyPair | None) -> None:
     """With TLS 1.3 a client learns that it was refused when it reads."""

@@ -89,17 +89,6 @@ def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     assert list(private_folder().iterdir()) == []
 
 
-def test_a_ticket_whose_recorder_was_killed_is_not_joined(
-    fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with published(loads(json.dumps(fields)), "lab") as path:
-        text = path.read_text()
-    path.write_text(text)
-    assert find_ticket("lab") is None
-    assert not path.exists()
-
-
 def test_a_missing_runtime_directory_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import struct
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.core.clock import ClockOffset, Exchange, SlewedClock, SlewedRunClock
 from noack.core.core_library import core
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
@@ -182,22 +180,6 @@ def test_messages_and_ticks_of_a_controller_alternate(content: dict[str, Any]) -
         ]  # fmt: skip
 
 
-def test_users_code_is_asked(content: dict[str, Any]) -> None:
-    resolved = resolve(load(SCENARIOS / "lane_python_trigger.toml", ()))
-    draw = np.random.default_rng(1)
-    period_ns = resolved.timing.measurement_period_ns
-    given = [
-        Message(Flow.MEASUREMENT, k, k * period_ns, draw.normal(size=4)) for k in range(1, 200)
-    ]
-    with closing(Live("sensor", [resolved])) as live:
-        live.send(*given)
-        live.drive_until_accepted(len(given))
-        times_ns = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
-        sent, rows = one_by_one(live, list(zip(given, times_ns, strict=True)))
-        assert repr(live.rows.tables) == repr({SENSOR_MEASUREMENT: rows})  # with NaN
-        assert received(live.peer) == sent
-
-
 @pytest.mark.parametrize("encrypted", [False, True])
 def test_slow_users_code_leaves_time_for_datagrams_and_housekeeping(
     encrypted: bool, tmp_path: Path
@@ -291,16 +273,6 @@ def test_many_rows_are_passed_on_in_portions(content: dict[str, Any]) -> None:
     assert max(portions) < 130_000
 
 
-def test_a_controller_acknowledges_to_another_address(content: dict[str, Any]) -> None:
-    network = content["network"] | {"protocol": "ack"}
-    with closing(Live("controller", [scenario(content, network=network)])) as live:
-        live.send(Message(Flow.UPDATE, 3, 0, np.array([1.0, -1.0])))
-        live.drive_until_accepted(1)
-        answer = Message(Flow.ACKNOWLEDGEMENT, 3, 0, NO_VECTOR)
-        assert received(live.answers) == [live.encoder.encode(answer)]
-        assert live.encoder.encode(answer) not in received(live.peer)
-
-
 def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.senders[0] = -1
@@ -359,22 +331,6 @@ def test_a_signal_ends_its_sleep(content: dict[str, Any]) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
     assert seen
-
-
-def test_it_reads_another_hosts_clock(content: dict[str, Any]) -> None:
-    own_ns, offset = time.monotonic_ns(), ClockOffset()
-    offset.add(Exchange(own_ns, own_ns + HOUR_NS, own_ns + HOUR_NS, own_ns))
-    slewed = SlewedClock(offset, own_ns)
-    clock = SlewedRunClock(own_ns + HOUR_NS, 1.0, slewed)
-    with closing(Live("sensor", [scenario(content)])) as live:
-        live.clock = clock
-        live.driver.set_clock(clock)
-        live.send(*measurements(3))
-        before_ns = clock.now_ns()
-        live.drive_until_accepted(3)
-        after_ns = clock.now_ns()
-        found = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
-        assert before_ns <= found[0] <= found[1] <= found[2] <= after_ns
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
-"""Signals that end a process."""
+"""Signals that end a process, also during its imports."""
 
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -39,3 +41,40 @@ def test_sighup_ends_a_process_unless_nohup_ignores_it(ignored: bool) -> None:
             assert signals.status is (ExitStatus.OK if ignored else ExitStatus.TERMINATED)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+INTERRUPTED = """
+import os, runpy, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == imported:
+            os.kill(os.getpid(), int(number))
+
+number, module, imported, *sys.argv[1:] = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
+sys.meta_path.insert(0, Interrupt())
+runpy.run_module(module, run_name="__main__", alter_sys=True)
+"""
+
+
+INT = (signal.SIGINT, 130, "stopped by the user (SIGINT)")
+TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
+
+
+@pytest.mark.parametrize(
+    ("words", "ended"),
+    [
+        (["cosim.cli", "typer", "--version"], INT),
+        (["cosim.cli", "typer", "--version"], TERM),
+        (["netem", "netem.channel", "--help"], INT),
+        (["plant_server", "noack.runtime.run_process", "--help"], TERM),
+    ],
+)
+def test_a_signal_during_the_imports_gives_one_line(
+    words: list[str], ended: tuple[signal.Signals, int, str]
+) -> None:
+    number, status, why = ended
+    command = [sys.executable, "-c", INTERRUPTED, str(int(number)), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"noack: {why}\n")

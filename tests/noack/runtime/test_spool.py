@@ -27,12 +27,6 @@ def numbers(first: int, end: int) -> bytes:
     return np.arange(first, end, dtype="<i8").tobytes()
 
 
-def test_batches_are_read_back_unchanged(tmp_path: Path) -> None:
-    batches = [(0, b"abc"), (3, b""), (3, bytes(10_000)), (2**64 - 1, b"x")]
-    spool(tmp_path / "spool", "recorder", "plant_step", *batches)
-    assert list(read_chunks(tmp_path / "spool", "plant_step")) == batches
-
-
 def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
     path = spool(tmp_path, "recorder", "plant_step", (7, b"abc"), (8, b"de"))
     expected = struct.pack("<QQ", 7, 3) + b"abc" + struct.pack("<QQ", 8, 2) + b"de"

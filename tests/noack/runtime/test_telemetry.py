@@ -1,6 +1,9 @@
+"""Rows on their way to the recorder: batches, losses, memory, and the handing over at the end."""
+
 import json
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,10 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from noack.core.errors import NoAnswerError
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.spool import NOTICES, lines_in, notices_of
-from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer, first_row
+from noack.runtime.spool import NOTICES, kept_run_name, lines_in, notices_of
+from noack.runtime.telemetry import (
+    OwnSpool,
+    ReceivedRows,
+    TelemetryBuffer,
+    deliver_report,
+    first_row,
+)
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}
@@ -43,54 +53,6 @@ def fill(buffer: TelemetryBuffer, numbers: range) -> None:
         buffer.append(Record("one", row(number)))
         if number % 10 == 9:
             buffer.flush()
-
-
-# True appends a row to the second table, False to the first, None flushes.
-actions = st.lists(st.sampled_from([True, False, None]), max_size=30).flatmap(
-    lambda once: st.integers(1, 40).map(lambda times: once * times)
-)
-
-
-@given(actions)
-def test_batches_number_every_row_in_order(actions: list[bool | None]) -> None:
-    wire = Wire()
-    buffer = TelemetryBuffer(TABLES, wire)
-    appended = {"one": 0, "two": 0}
-    for action in actions:
-        if action is None:
-            buffer.flush()
-            continue
-        table = "two" if action else "one"
-        buffer.append(Record(table, row(appended[table])))
-        appended[table] += 1
-    buffer.flush()
-    for table, count in appended.items():
-        batches = wire.rows(table)
-        assert all(len(rows) for _, rows in batches)
-        following = 0
-        for first, rows in batches:
-            assert first == following
-            following += len(rows)
-        numbers = [number for _, rows in batches for number in rows["number"].tolist()]
-        assert numbers == list(range(count))
-        assert all((rows["x"][:, 1] == -rows["number"]).all() for _, rows in batches)
-    assert buffer.totals() == {**appended, NOTICES: 0}
-    assert [rows for _, _, rows, _ in wire.batches] == [
-        len(payload) // ROW.itemsize for *_, payload in wire.batches
-    ]
-
-
-def test_a_full_batch_publishes_all_tables() -> None:
-    """A reader that merges tables never waits for one of them."""
-    wire = Wire()
-    buffer = TelemetryBuffer(TABLES, wire)
-    buffer.append(Record("two", row(0)))
-    for number in range(BATCH):
-        assert wire.batches == []
-        buffer.append(Record("one", row(number)))
-    assert {table: rows for table, _, rows, _ in wire.batches} == {"one": BATCH, "two": 1}
-    buffer.flush()
-    assert len(wire.batches) == 2
 
 
 def test_rows_of_a_table_may_be_added_at_once() -> None:
@@ -256,3 +218,70 @@ def test_the_oldest_batch_is_stored_at_the_memory_limit(
     buffer.store_all()
     assert disk.batches == wire.batches
     assert buffer.stored() == {"one": [(0, 40)]}
+
+
+NUMBER = np.dtype([("number", "<i8")])
+
+
+class Plane:
+    """A recorder that takes each batch only with its ``takes``-th sending."""
+
+    def __init__(self, takes: int) -> None:
+        self._takes, self._sendings = takes, dict[int, int]()
+        self._rows = ReceivedRows()
+        self.reports: list[dict[str, Any]] = []
+
+    def publish_telemetry_blocking(self, _: str, header: bytes, payload: bytes) -> None:
+        first = json.loads(header)["first"]
+        self._sendings[first] = self._sendings.get(first, 0) + 1
+        if self._sendings[first] >= self._takes:
+            self._rows.add(first, first + len(payload) // NUMBER.itemsize)
+
+    def request(self, what: str, report: dict[str, Any], *, timeout_s: float) -> bytes:
+        if not self._takes:
+            raise NoAnswerError("none")
+        self.reports.append(report)
+        for first, end in report["stored"].get("one", ()):
+            self._rows.add(first, end)
+        missing = self._rows.missing(report["rows"]["one"])
+        return json.dumps({"rows": {"one": missing} if missing else {}}).encode()
+
+
+@pytest.mark.parametrize(("takes", "stored"), [(1, []), (2, []), (9, [(0, 30)]), (0, None)])
+def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
+    takes: int, stored: list[tuple[int, int]] | None
+) -> None:
+    plane, disk = Plane(takes), list[bytes]()
+    buffer = TelemetryBuffer(
+        {"one": NUMBER},
+        plane.publish_telemetry_blocking,
+        store=lambda *batch: disk.append(batch[2]),
+    )
+    for number in range(30):
+        buffer.append(Record("one", (number,)))
+        if number % 10 == 9:
+            buffer.flush()
+    report = {"rows": buffer.totals(), "stored": buffer.stored()}
+    assert deliver_report(plane, report, buffer) == (stored is not None)  # type: ignore[arg-type]
+    if stored is not None:
+        assert plane.reports[-1]["stored"].get("one", []) == stored
+        assert len(disk) == len(stored) * 3
+        assert len(buffer.stored().get("one", ())) == len(stored)
+
+
+def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> None:
+    """Runs of two recorders that began in one second, with processes on one host."""
+    header = json.dumps({"first": 0}).encode()
+    one, again, other = (
+        OwnSpool(tmp_path / "run", "sensor", writer, kept_of)
+        for writer, kept_of in [("a", "0001"), ("b", "0001"), ("c", "0002")]
+    )
+    assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
+    for spool in (one, again, other):
+        spool.append("sensor_event", header, b"rows")
+        spool._files.close()
+    assert one.folder == again.folder == tmp_path / "run"
+    assert other.folder == tmp_path / "run-0002"
+    assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
+    assert len(list((one.folder / "spool").glob("sensor_event.*"))) == 2
+    assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1

@@ -15,7 +15,6 @@ from pydantic import TypeAdapter, ValidationError
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
@@ -62,18 +61,6 @@ def test_means_determine_the_chain(loss: float, burst: float) -> None:
     p, r = GilbertElliottLoss(mean_loss=loss, mean_burst=burst).transitions
     assert 1 / r == pytest.approx(burst)
     assert p / (p + r) == pytest.approx(loss)
-
-
-def test_the_longest_delay_is_the_sum_of_the_maximum_delays() -> None:
-    settings = LinkSettings(
-        impairments=(
-            Delay(delay_s=0.1, jitter_s=0.01),
-            Delay(jitter_s=0.01, distribution="normal"),
-            Delay(delay_s=0.2, distribution="empirical", samples_s=(0.3, 0.1)),
-            Rate(rate_bps=12_000_000, queue=100),
-        )
-    )
-    assert settings.longest_delay_s == pytest.approx(0.11 + 0.04 + 0.5 + 0.1)
 
 
 def read_delay(folder: Path, **settings: Any) -> Delay:
@@ -125,11 +112,6 @@ def test_a_distribution_table_shipped_with_tc_is_read() -> None:
     assert samples_s is not None
     assert len(samples_s) == 4096
     assert all(abs(t_s * 1000 - round(t_s * 1000)) < 1e-9 for t_s in samples_s)
-
-
-def test_settings_without_files_are_unchanged(tmp_path: Path) -> None:
-    settings = LinkSettings(impairments=(Delay(delay_s=1.0), Rate(rate_bps=1000)), mansd=4)
-    assert read_files(settings, tmp_path) == settings
 
 
 @pytest.mark.parametrize(

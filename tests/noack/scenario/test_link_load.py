@@ -35,39 +35,31 @@ def scenario_of(
     return validate(content | {"loops": list(loops)}, "here")
 
 
+DEADLINE = {"policy": "deadline", "interval_s": 0.049,
+            "rule": {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "trigger",
-    [PERIODIC, {"policy": "deadline", "interval_s": 0.049,
-                "rule": {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}}],
-)  # fmt: skip
+    ("trigger", "constraints", "share"),
+    [
+        (PERIODIC, [], 1 / 3),
+        (DEADLINE, [], 1 / 3),
+        (PERIODIC, [{"kind": "at_most", "losses": 1, "window": 10}], 9 / 10),
+        (PERIODIC, [{"kind": "recovery", "deliveries": 3}], 3 / 5),
+    ],
+)
 def test_the_rate_for_what_must_pass_is_the_limit(
-    content: dict[str, Any], trigger: dict[str, Any]
+    content: dict[str, Any], trigger: dict[str, Any], constraints: list[Any], share: float
 ) -> None:
     """At 100 Hz, a deadline of 49 ms means an event every 50 ms at the latest."""
     content["plant"]["rate_hz"] = 100.0
     loops = {"name": "a", "count": 30, "trigger": trigger}
-    needed_bps = 30 * BITS / 0.05 / 3
-    require_capacity(scenario_of(content, int(needed_bps), 5, loops))
-    with pytest.raises(CallerError, match=re.escape(f"need {int(needed_bps)} bit/s")):
-        require_capacity(scenario_of(content, int(needed_bps) - 1, 5, loops))
+    needed_bps = round(30 * BITS / 0.05 * share)
+    require_capacity(scenario_of(content, needed_bps, 5, loops, constraints=constraints))
+    with pytest.raises(CallerError, match=re.escape(f"need {needed_bps} bit/s")):
+        require_capacity(scenario_of(content, needed_bps - 1, 5, loops, constraints=constraints))
     # Without the guarantee nothing must pass.
     require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
-
-
-@pytest.mark.parametrize(
-    ("constraint", "share"),
-    [({"kind": "at_most", "losses": 1, "window": 10}, 9 / 10),
-     ({"kind": "recovery", "deliveries": 3}, 3 / 5)],
-)  # fmt: skip
-def test_a_constraint_can_require_more_than_m(
-    content: dict[str, Any], constraint: dict[str, Any], share: float
-) -> None:
-    """With M − 1 = 2 alone it would be a third."""
-    loops = {"name": "a", "count": 30, "trigger": PERIODIC}
-    needed_bps = round(30 * BITS / 0.05 * share)
-    require_capacity(scenario_of(content, needed_bps, 5, loops, constraints=[constraint]))
-    with pytest.raises(CallerError, match=f"need {needed_bps} bit/s"):
-        require_capacity(scenario_of(content, needed_bps - 1, 5, loops, constraints=[constraint]))
 
 
 def test_a_change_can_require_more(content: dict[str, Any]) -> None:

@@ -97,11 +97,6 @@ def test_a_file_is_not_read_where_tables_are_validated(content: dict[str, Any]) 
         with_loops(content, {"name": "a", "scenario": "other.toml"})
 
 
-def test_only_single_loops_are_resolved(content: dict[str, Any]) -> None:
-    with pytest.raises(CallerError, match="it has 2 loops; give a scenario of one loop"):
-        resolve(with_loops(content, {"name": "a"}, {"name": "b"}))
-
-
 PARTS = ("mode", "model", "plant", "trigger", "observer", "controller")
 OTHER = {
     "name": "other",
@@ -194,14 +189,6 @@ def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_pa
     assert len(trigger.sha256) == 64
 
 
-def test_a_shipped_scenario_is_found_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
-    content["network"] = {"mansd": 4, "loss": {"model": "bernoulli", "probability": 0.8}}
-    loops = [{"name": "mass", "scenario": "double_integrator"}]
-    (loop,) = loops_of(load(write(tmp_path, "run.toml", content | {"loops": loops})))
-    assert loop.model.name == "double_integrator"
-    assert resolve(loop).plant.draw == "given"
-
-
 NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
 
 
@@ -239,9 +226,3 @@ def test_a_mistake_in_a_loops_file_is_named(
     with pytest.raises(CallerError) as refused:
         load(run)
     assert message in str(refused.value)
-
-
-def test_a_ticket_carries_the_tables(content: dict[str, Any], tmp_path: Path) -> None:
-    """A ticket has all keys, also those without a value."""
-    scenario = loaded(tmp_path, content, OTHER)
-    assert validate(scenario.model_dump(mode="json"), "ticket") == scenario

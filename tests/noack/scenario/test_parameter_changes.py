@@ -1,6 +1,5 @@
 """Changes of runtime parameters: the keys, their notation, and each machine's schedule."""
 
-import tomllib
 from typing import Any
 
 import pytest
@@ -8,7 +7,6 @@ import pytest
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
 from noack.scenario.parameter_changes import (
     ChangeSchedule,
@@ -21,7 +19,7 @@ from noack.scenario.parameter_changes import (
 from noack.scenario.resolution import resolve
 from noack.scenario.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import dumps, validate
+from noack.scenario.scenario_file import validate
 
 
 @pytest.fixture
@@ -75,15 +73,6 @@ def test_changes_are_refused_with_acknowledgements(content: dict[str, Any]) -> N
         changed(resolve(validate(content, "here")), {"network.mansd": 1})
 
 
-def test_a_scenario_with_changes_is_written_and_read_back(content: dict[str, Any]) -> None:
-    content["changes"] = [
-        {"at_s": 0.25, "set": {"network.loss.probability": 0.9}},
-        {"at_s": 0.5, "set": {"network.loss": {"model": "lossless"}, "trigger.beta": 0.1}},
-    ]
-    scenario = validate(content, "here")
-    assert validate(tomllib.loads(dumps(scenario)), "again") == scenario
-
-
 def test_short_names_refer_to_runtime_parameters(scenario: Scenario) -> None:
     names = current_parameters(scenario)
     for short in ("loss", "mansd", "beta", "alpha", "floor", "setpoint"):
@@ -119,23 +108,3 @@ def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: S
     assert schedule.next_ns is None
     caps = [one.network.mansd for one in schedule.between(0, 150)]
     assert caps == [2, 5]
-
-
-def test_a_change_announced_too_late_is_applied_late_and_reported(scenario: Scenario) -> None:
-    schedule = ChangeSchedule(scenario)
-    record, notice = schedule.announce(
-        "t", ParameterChange(0, 100, {"trigger.beta": 0.1}), 7, 350, 300
-    )
-    assert isinstance(record, Record)
-    assert isinstance(notice, Notice)
-    assert record.row[:5] == (7, 0, 100, 350, 301)
-    assert (notice.level, notice.t_ns) == ("violation", 301)
-    assert "too late" in notice.text
-
-
-def test_an_invalid_change_leaves_the_schedule_unchanged(scenario: Scenario) -> None:
-    schedule = ChangeSchedule(scenario)
-    with pytest.raises(CallerError):
-        schedule.announce("t", ParameterChange(0, 100, {"trigger.beta": -1.0}), 0, 0, -1)
-    assert schedule.next_ns is None
-    assert schedule.last is scenario

@@ -1,6 +1,7 @@
 """From a scenario to a run: draws, matrices, and set points with their equilibria."""
 
 import json
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from noack.core.errors import CallerError
 from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
@@ -92,16 +94,6 @@ def test_widening_one_interval_does_not_change_the_other_draws(box: dict[str, An
     assert after.B.tolist() == after.B_model.tolist()
 
 
-def test_a_resolved_scenario_has_no_random_values_left(box: dict[str, Any]) -> None:
-    once = resolved(box, plant=3, initial_state=4)
-    assert once.plant.draw == "given"
-    assert once.model.name is None
-    assert once.plant.initial_state_halfwidth is None
-    assert resolve(once) == once
-    other_seeds = once.model_copy(update={"seeds": resolved(box, plant=8, initial_state=8).seeds})
-    assert resolve(other_seeds).plant == once.plant
-
-
 @pytest.mark.parametrize("draw", ["nominal", "given"])
 def test_a_plant_that_is_not_drawn_is_what_the_file_says(
     content: dict[str, Any], draw: str
@@ -112,19 +104,6 @@ def test_a_plant_that_is_not_drawn_is_what_the_file_says(
     assert loop.A.tolist() == given.get("A", [[0.0, 1.0], [0.0, 0.0]])
     assert loop.B.tolist() == given.get("B", [[0.0], [1.0]])
     assert loop.A_model.tolist() == [[0.0, 1.0], [0.0, 0.0]]
-
-
-@pytest.mark.parametrize(
-    ("mode", "H"), [("model", [[0.0, 1.0], [-1.0, -1.5]]), ("zoh", [[0.0, 0.0], [0.0, 0.0]])]
-)
-def test_the_models_are_the_nominal_closed_loop_or_a_hold(
-    content: dict[str, Any], mode: str, H: list[list[float]]
-) -> None:
-    content |= {"mode": mode}
-    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
-    loop = loop_of(resolved(content))
-    assert loop.H.tolist() == H
-    assert (loop.n, loop.m) == (2, 1)
 
 
 def test_signal_names_are_the_models_or_generated(content: dict[str, Any]) -> None:
@@ -164,20 +143,6 @@ def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     assert off_B.max() <= 0.05 + 1e-14
 
 
-A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-
-
-@pytest.mark.parametrize(("stiffness", "force"), [(0.0, 0.0), (2.0, 6.0)])
-def test_the_equilibrium_input_balances_the_spring(stiffness: float, force: float) -> None:
-    A = np.array([[0.0, 1.0], [-stiffness, -0.1]])
-    assert input_at(A, B_DOUBLE, np.array([3.0, 0.0])) == pytest.approx([force])
-
-
-def test_a_set_point_that_moves_is_refused_with_the_nearest_equilibrium() -> None:
-    with pytest.raises(ValueError, match=r"dimension 1, and the nearest one is \[2, 0\]"):
-        input_at(A_DOUBLE, B_DOUBLE, np.array([2.0, 1.0]))
-
-
 def test_the_equilibrium_that_a_refusal_names_is_taken() -> None:
     A, B = np.array([[0.0, 1.0, 0.0], [0.0, -3.0, 0.7], [0.0, 0.0, 0.0]]), np.eye(3)[:, 2:]
     with pytest.raises(ValueError, match="nearest one is") as refused:
@@ -202,14 +167,27 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
 
 
-def test_the_set_point_of_a_scenario_is_used_in_its_loop(content: dict[str, Any]) -> None:
-    content["controller"] = {"setpoint": [2.0, 0.0]}
-    scenario = validate(content, "here")
-    loop = loop_of(resolve(scenario))
-    assert loop.setpoint is not None
-    assert loop.setpoint_input is not None
-    assert loop.setpoint.tolist() == [2.0, 0.0]
-    assert loop.setpoint_input.tolist() == [0.0]
-    assert "setpoint" in dumps(scenario)
-    content["controller"] = {"setpoint": [0.0, 0.0]}
-    assert loop_of(resolve(validate(content, "here"))).setpoint is None
+POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
+
+
+def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> None:
+    content["model"] = {
+        "A": [[0.0] * 4] * 4, "B": [[0.0]] * 4, "gain": [[0.0] * 4], "allow_unstable": True,
+    }  # fmt: skip
+    content["plant"] = {
+        "system": {"kind": "cart_pole"}, "initial_state": [0.0] * 4,
+        "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
+    }  # fmt: skip
+    with pytest.raises(CallerError, match=r"^file: plant.disturbances.0.at = .* a linear plant"):
+        validate(content, "file")
+
+
+def test_a_resolved_scenario_has_its_gain_and_resolves_to_itself(content: dict[str, Any]) -> None:
+    content["plant"]["measurement"] = POSITION
+    content["observer"] = {"kind": "luenberger", "poles_per_s": [[-5.0, 1.0]]}
+    once = resolve(validate(content, "file"))
+    assert once.observer is not None
+    assert once.observer.kind == "luenberger"
+    assert once.observer.gain is not None
+    again = validate(tomllib.loads(dumps(once)), "again")
+    assert again == once == resolve(again)

@@ -79,12 +79,6 @@ def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]
     return str(caught.value).replace(str(path), "FILE").split("\n")
 
 
-@pytest.mark.parametrize("text", [LANE, DOUBLE], ids=["lane", "double"])
-def test_the_scenarios_are_valid_before_mistakes_are_added(text: str, tmp_path: Path) -> None:
-    (tmp_path / "some.toml").write_text(text)
-    resolve(load(tmp_path / "some.toml"))
-
-
 _SUGGESTED = re.compile(r"(?:try|e\.g\.|% is) (\[.*\]|[\d.]+)$")
 
 
@@ -156,11 +150,6 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
     assert len(lines) == len(expected)
     for line, begins in zip(lines, expected, strict=True):
         assert line.startswith(begins), line
-
-
-def test_an_empty_file_reports_every_required_key(tmp_path: Path) -> None:
-    required = ["name", "horizon_s", "model", "plant", "trigger", "network"]
-    assert [line.split(": ")[1] for line in mistakes("", tmp_path)] == required
 
 
 def test_a_long_value_is_shortened(tmp_path: Path) -> None:
@@ -254,10 +243,6 @@ def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
         load(path, ["loops.1.name=a"])
 
 
-def test_the_last_setting_of_a_key_wins(path: Path) -> None:
-    assert load(path, ["speed=2", "speed=3"]).speed == 3
-
-
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
@@ -301,12 +286,6 @@ def test_class_is_converted_to_its_file_and_name(
     assert (loaded.plant.system.kind, loaded.plant.system.name) == ("python", "Car")
     with pytest.raises(CallerError, match=r"a value of type Car is no value of a setting$"):
         noack.load("double_integrator", {"plant.system": Car()})
-
-
-def test_the_message_quotes_only_the_name_of_the_source(content: Content) -> None:
-    content["speed"] = -1
-    with pytest.raises(CallerError, match=r"^run 7/scenario\.toml: speed = -1: "):
-        validate(content, "run 7/scenario.toml")
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

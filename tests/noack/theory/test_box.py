@@ -3,18 +3,16 @@
 The same check must detect broken copies of the bounds.
 """
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import assume, find, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.theory.bounds.box import BoxGains
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import Coefficients, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NetworkConditions, NoCertificateError, TriggerBound
 from noack.theory.certificates.solution import solve
 from tests.oracles.lossy_loops import (
@@ -24,7 +22,6 @@ from tests.oracles.lossy_loops import (
     Plants,
     System,
     Trace,
-    assert_not_smaller,
     certified_or_skipped,
     networks,
     seeds,
@@ -84,23 +81,13 @@ def cases(draw: st.DrawFn, size: float | None = None, **fixed: Any) -> Case:
     return Case(system, halfwidths[:, :n], halfwidths[:, n:])
 
 
-@settings(SEARCH, max_examples=15)
+@settings(SEARCH, max_examples=8)
 @given(cases(), seeds)
 def test_no_plant_in_the_box_exceeds_a_bound(case: Case, seed: int) -> None:
     certified = case.constants()
     assume(certified is not None)
     assert certified is not None
     assert case.simulate(seed).exceeded(case.system, certified) == []
-
-
-@settings(SEARCH, max_examples=4)
-@given(cases(0.05), st.floats(0.1, 0.9))
-def test_a_larger_box_never_has_smaller_bounds(case: Case, share: float) -> None:
-    larger = case.constants()
-    assume(larger is not None)
-    assert larger is not None
-    smaller = Case(case.system, share * case.halfwidth_A, share * case.halfwidth_B)
-    assert_not_smaller(larger, smaller.certify(), case.system)
 
 
 @settings(SEARCH, max_examples=3)
@@ -115,83 +102,6 @@ def test_an_empty_box_has_the_bounds_of_the_model(system: System) -> None:
         assume(False)
     box = Case(system, np.zeros_like(system.A), np.zeros_like(system.B)).certify()
     assert tuple(box) == pytest.approx(tuple(own), rel=1e-9, abs=1e-9)
-
-
-class NoModelErrorInSensorError(BoxGains):
-    @property
-    def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
-        return {**super().states, Output.MISMATCH: Coefficients(0.0, 0.0)}
-
-
-class NoFeedbackOfModelError(BoxGains):
-    """Ignores w that results from w."""
-
-    def _bound_of_w(self, coordinates: Vector) -> Vector:
-        return np.asarray(self._halfwidths @ coordinates)
-
-
-class NoUncertaintyOfB(BoxGains):
-    @property
-    def _halfwidths(self) -> Matrix:  # type: ignore[override]
-        halfwidths = np.array(super()._halfwidths)
-        halfwidths[:, len(self.A) :] = 0.0
-        return halfwidths
-
-
-class HalfTheBox(BoxGains):
-    @property
-    def _halfwidths(self) -> Matrix:  # type: ignore[override]
-        return np.array(0.5 * super()._halfwidths)
-
-
-class NoModelErrorInState(BoxGains):
-    @property
-    def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
-        own = PlantGains(self.error, self.A, self.B, self.start, self.alpha_per_s)
-        return {**own.states, Output.MISMATCH: super().states[Output.MISMATCH]}
-
-
-class NoStart(BoxGains):
-    """Ignores that there is no input at first."""
-
-    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
-        return super().start_up(0.0)
-
-
-INSTANT = {"sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "step_share": 0.01}
-
-MUTANTS: dict[type[BoxGains], dict[str, Any]] = {
-    NoModelErrorInSensorError: {"size": 0.2, "mansd": 0, "beta": 0.01, **INSTANT},
-    NoFeedbackOfModelError: {"size": 1.0, "n": 1, "m": 1, "mansd": 0, "beta": 1.0, **INSTANT},
-    NoUncertaintyOfB: {"size": 0.6, "n": 1, "m": 2, "beta": 0.01, "mansd": 0, **INSTANT},
-    NoStart: {"mansd": 0, "hold_steps": 4, "lag_steps": 2, "beta": 0.01, "step_share": 0.03},
-    HalfTheBox: {"size": 0.6, "n": 1, "beta": 0.01, "mansd": 0, **INSTANT},
-    NoModelErrorInState: {
-        "size": 0.3, "n": 2, "spread": 3.0, "beta": 0.01, "alpha_share": 0.5, "mansd": 0,
-        **INSTANT, "step_share": 0.03,
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
-def test_runs_exceed_a_broken_certificate_and_not_the_true_one(mutant: type[BoxGains]) -> None:
-    def is_caught(drawn: tuple[Case, int]) -> bool:
-        case, seed = drawn
-        certified = case.constants(mutant)
-        if certified is None:
-            return False
-        trace = case.simulate(seed)
-        if not trace.exceeded(case.system, certified):
-            return False
-        true = case.constants()
-        assert true is None or trace.exceeded(case.system, true) == []
-        return True
-
-    find(
-        st.tuples(cases(**MUTANTS[mutant]), seeds),
-        is_caught,
-        settings=settings(SEARCH, max_examples=150, database=None),
-    )
 
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0])

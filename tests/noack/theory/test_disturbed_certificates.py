@@ -114,15 +114,6 @@ def scheduled(name: str, *settings: str) -> ScenarioCertificate:
     return certify(resolved, allowed_conditions(resolved))
 
 
-def test_a_smaller_probability_never_has_smaller_bounds() -> None:
-    name, likely = "pendulum_observed", "certificate.exceedance_probability=0.5"
-    more, less = scheduled(name), scheduled(name, likely)
-    assert more.persistent_constants is not None
-    assert less.persistent_constants is not None
-    for key in ("state", "delta", "overshoot", "estimation_error", "input_error"):
-        assert getattr(less.persistent_constants, key) < getattr(more.persistent_constants, key)
-
-
 def test_a_box_with_an_observer_has_no_certificate_and_says_so() -> None:
     path = ROOT / "scenarios" / "pendulum_observed.toml"
     box = ["plant.uncertainty_A=[[0, 0], [0, 0.1]]"]

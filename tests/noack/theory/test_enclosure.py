@@ -19,7 +19,6 @@ from noack.theory.bounds.contraction import find_decay, spectral_norms
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     NotDecayingError,
-    factors,
     norm_bounds,
     response,
     response_until,
@@ -236,22 +235,6 @@ def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
     assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001
 
 
-@settings(max_examples=12)
-@given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
-def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
-    G = KINDS[kind](np.random.default_rng(seed), n)
-    assert find_decay(-G) is None
-    decay = find_decay(G)
-    assume(decay is not None)
-    assert decay is not None
-    assert 0 < decay.rate_per_s <= -spectral_abscissa(G) * (1 + 1e-9)
-    L = decay.factor
-    for t_s in (1e-3, 0.1, 1.0, 3.0):
-        moved = L @ expm(G * t_s / decay.rate_per_s) @ np.linalg.inv(L)
-        assert np.linalg.norm(moved, 2) <= math.exp(-t_s) + 1e-10 * decay.stretch
-        assert np.linalg.norm(expm(G * t_s), 2) <= decay.stretch * (1 + 1e-9)
-
-
 def decimals(matrix: Matrix) -> Any:
     return np.vectorize(Decimal, otypes=[object])(matrix)
 
@@ -285,22 +268,6 @@ def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condit
         exact = exactly(W, G, D, t_s)
         assert kernel.highest[node] >= exact
         assert kernel.sups(np.array([t_s]))[0] >= exact
-
-
-def test_the_rank_of_a_factor_is_detected_and_preserved() -> None:
-    rng = np.random.default_rng(3)
-    for rank in range(1, 5):
-        matrix = rng.normal(size=(5, rank)) @ rng.normal(size=(rank, 4))
-        L, R = factors(matrix)
-        assert L.shape == (5, rank)
-        assert R.shape == (rank, 4)
-        np.testing.assert_allclose(L.T @ L, np.eye(rank), atol=1e-14)
-        np.testing.assert_allclose(L @ R, matrix, atol=1e-13)
-        v = rng.normal(size=4)
-        assert np.linalg.norm(R @ v) == pytest.approx(np.linalg.norm(matrix @ v), rel=1e-12)
-    L, R = factors(np.zeros((3, 2)))
-    assert L.shape[1] == R.shape[0] == 1
-    assert not R.any()
 
 
 def test_many_states_take_little_memory_and_are_enclosed() -> None:

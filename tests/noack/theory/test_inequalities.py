@@ -41,7 +41,7 @@ def exact_solution(F: np.ndarray, g: np.ndarray) -> list[Fraction]:
 @pytest.mark.parametrize("radius", [0.3, 0.99, 1 - 1e-9])
 def test_the_bound_is_above_the_exact_solution_and_close_to_it(size: int, radius: float) -> None:
     rng = np.random.default_rng([size, int(1e9 * radius)])
-    for _ in range(200):
+    for _ in range(50):
         F = rng.uniform(size=(size, size)) * (rng.uniform(size=(size, size)) < 0.8)
         F *= radius / max(np.abs(np.linalg.eigvals(F)).max(), 0.1)
         g = rng.uniform(size=size)
@@ -105,14 +105,13 @@ def lost_ages_s(seed: int, spacing_s: float, window: LossWindow) -> np.ndarray:
 
 windows = st.sampled_from([LossWindow(*one) for one in [(1, 2), (2, 3), (1, 6), (3, 10), (5, 6)]])
 shares = st.sampled_from([0.05, 0.3, 1.0])
-NO_DELAY = {"delay_steps": 0, "hold_steps": 0}
 
 
 def spacing_of(system: System, share: float) -> float:
     return share / float(np.abs(np.linalg.eigvals(system.H)).max())
 
 
-@settings(SEARCH, max_examples=60)
+@settings(SEARCH, max_examples=25)
 @given(systems(), windows, shares, st.sampled_from([0.0, 0.4, 2.5]), st.integers(0, 2**32))
 def test_no_admissible_losses_have_a_larger_effect(
     system: System, window: LossWindow, share: float, delay: float, seed: int
@@ -137,7 +136,7 @@ def periodic(system: System, spacing_s: float, window: LossWindow) -> float:
     return max(found)
 
 
-@settings(SEARCH, max_examples=15)
+@settings(SEARCH, max_examples=6)
 @given(systems(n=1, m=1, mismatch=0.1), windows, st.sampled_from([0.3, 1.0]))
 def test_a_loop_of_one_state_nearly_reaches_the_bound(
     system: System, window: LossWindow, share: float
@@ -148,21 +147,6 @@ def test_a_loop_of_one_state_nearly_reaches_the_bound(
     bound = LossAccumulation(system.gains(), 0.0).total(Output.STATE, spacing_s, [window])
     reached = periodic(system, spacing_s, window)
     assert reached <= bound * ROUNDING <= 1.5 * reached
-
-
-@pytest.mark.parametrize("broken", [LossWindow(4, 6), LossWindow(5, 9)], ids=str)
-def test_losses_exceed_a_bound_that_counts_too_few(broken: LossWindow) -> None:
-    exceeded = []
-
-    @settings(SEARCH, max_examples=10)
-    @given(systems(n=1, m=1, mismatch=0.1, alpha_share=0.2))
-    def attempt(system: System) -> None:
-        spacing_s = spacing_of(system, 0.3)
-        bound = LossAccumulation(system.gains(), 0.0).total(Output.STATE, spacing_s, [broken])
-        exceeded.append(periodic(system, spacing_s, LossWindow(5, 6)) > bound)
-
-    attempt()
-    assert any(exceeded)
 
 
 def test_more_losses_or_fewer_deliveries_never_have_a_smaller_bound() -> None:

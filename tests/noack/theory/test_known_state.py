@@ -1,19 +1,15 @@
 """Bounds from the newest event: closed forms, an order that is proved, and random scenarios."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from scipy.linalg import expm
 
-from noack.theory.bounds.enclosure import response
 from noack.theory.bounds.gains import ErrorGains, PlantGains
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
     KnownStatePart,
-    integral_until,
 )
 from tests.oracles.lossy_loops import (
     SEARCH,
@@ -27,15 +23,6 @@ from tests.oracles.lossy_loops import (
 )
 
 ANY = 10**6
-
-
-def test_the_integral_up_to_an_age_encloses_the_closed_form() -> None:
-    kernel = response(np.array([[-2.0]]), np.array([[3.0]])).through(np.eye(1))
-    ages_s = np.concatenate([np.linspace(0.0, 3.0, 1001), [1e3]])
-    exact = 1.5 * (1 - np.exp(-2 * ages_s))
-    found = integral_until(kernel, ages_s)
-    assert (found >= exact).all()
-    np.testing.assert_allclose(found, exact, rtol=0.03)
 
 
 def scalar(**constants: float) -> KnownStateBounds:
@@ -69,21 +56,6 @@ def test_the_bounds_of_a_scalar_loop(missing: int, error: float, input_error: fl
     exact = (input_error * known + 9.9 * (whole - known)) * decay
     found = scalar().state_deviation(t_s, np.array([1.0]), count)
     assert exact <= found <= 1.03 * exact
-
-
-def test_a_floor_and_disturbances_are_added() -> None:
-    (part,) = scalar().parts
-    with_floor = replace(scalar(), parts=(replace(part, floor_share=0.5),))
-    late, ages, counts = np.array([2.0, 20.0]), np.zeros(2), np.full(2, ANY)
-    np.testing.assert_allclose(with_floor.controller_error(late, counts), 2.8 * 0.5, rtol=1e-9)
-    pushed = replace(scalar(), disturbances=np.array([[1.0, -3.0]]))
-    ages = np.array([0.5, 1e3])
-    found = pushed.state_deviation(late, ages, counts) - scalar().state_deviation(
-        late, ages, counts
-    )
-    exact = 4 / 2 * (1 - np.exp(-2 * ages))
-    assert (found >= exact).all()
-    np.testing.assert_allclose(found, exact, rtol=0.05)
 
 
 @settings(SEARCH, max_examples=15)

@@ -22,7 +22,7 @@ from noack.impairments.loss_guarantee import (
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from noack.theory.margins.loss_margin import EventTimes, LossMargin, capped, list_bursts
+from noack.theory.margins.loss_margin import LossMargin, list_bursts
 
 ROOT = Path(__file__).parents[3]
 PERIODIC = 'trigger={policy="periodic", period_s=0.0997}'
@@ -211,17 +211,6 @@ def test_times_between_two_events() -> None:
     assert intervals(f'{{policy="self_triggered", {threshold}, {times}}}') == (100, 460)
 
 
-def test_edges_are_all_times_between_two_deliveries() -> None:
-    times = EventTimes(2, 4)
-    bursts = list_bursts(LossGuarantee((LongestBurst(2),)), 1, times)
-    assert {one.steps for one in bursts} == {*range(2, 5), *range(4, 9), *range(6, 13)}
-    for one in bursts:
-        intervals = one.intervals(times)
-        assert len(intervals) == one.losses + 1
-        assert sum(intervals) == one.steps
-        assert all(2 <= interval <= 4 for interval in intervals)
-
-
 @pytest.mark.parametrize("guarantee", GUARANTEES, ids=lambda one: one.meaning)
 @pytest.mark.parametrize("slots", [1, 3])
 def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int) -> None:
@@ -242,14 +231,6 @@ def test_paths_are_the_admissible_patterns(guarantee: LossGuarantee, slots: int)
     for length in range(1, 9):
         every = product((True, False), repeat=length)
         assert patterns(0, length) == {one for one in every if one[-1] and allowed(one)}
-
-
-def test_states_of_a_guarantee_with_the_same_future_are_one_node() -> None:
-    """At most 6 in 7 is at most 6 in a row; of 2 in 5, the age of both losses matters."""
-    cap = list_bursts(LossGuarantee((LongestBurst(6),)))
-    assert list_bursts(LossGuarantee((LongestBurst(6), LossesInWindow(6, 7)))) == cap
-    assert len(cap) == 7
-    assert len({one.source for one in list_bursts(LossGuarantee((LossesInWindow(2, 5),)))}) > 1
 
 
 @pytest.mark.parametrize(
@@ -279,8 +260,3 @@ def test_growth_beyond_the_numbers_of_the_machine_is_refused(
     path.write_text(FAST.format(rate_per_s=rate_per_s, gain=-3 - rate_per_s, period_s=period_s))
     with pytest.raises(CallerError, match="grows beyond 1e308"):
         LossMargin(resolve(load(path))).stability()
-
-
-def test_capped_replaces_the_cap_alone() -> None:
-    changed = capped(LossGuarantee((LongestBurst(3), LossesInWindow(2, 5))), 7)
-    assert set(changed.rules) == {LongestBurst(7), LossesInWindow(2, 5)}

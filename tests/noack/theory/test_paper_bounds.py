@@ -35,7 +35,7 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     return loop, found
 
 
-@settings(SEARCH, max_examples=4)
+@settings(SEARCH, max_examples=3)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
@@ -65,27 +65,6 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
         assert found.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
 
 
-@settings(SEARCH, max_examples=4)
-@given(systems(weighted=False))
-def test_no_other_decay_rate_gives_a_longer_inter_event_time(system: System) -> None:
-    """c and ᾱ are free parameters: the best of a fine grid is not much better."""
-    loop, found = of(system)
-    closed, x0 = loop.A + loop.B @ loop.K, float(np.linalg.norm(system.x0))
-    slowest = -spectral_abscissa(closed)
-    t_s = np.linspace(0, 40 / slowest, 800)
-    moved = expm(closed * t_s[:, None, None])
-    BK, tilde, hat = norm(loop.B @ loop.K), found.a_tilde, found.a_hat
-    best_s = 0.0
-    for share in np.linspace(0.01, 0.99, 99):
-        bar = system.alpha + share * (slowest - system.alpha)
-        c = float((np.linalg.norm(moved, 2, (1, 2)) * np.exp(bar * t_s)).max())
-        gap, push = bar - system.alpha, system.beta * found.delta * BK
-        F = max(tilde * c * (x0 - push / gap), 0.0) / (hat + bar)
-        F += (1 + tilde * c / gap) * push / (hat + system.alpha)
-        best_s = max(best_s, math.log1p(system.beta / F) / (hat + bar))
-    assert best_s <= 1.05 * found.inter_event_s
-
-
 def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
     one = np.ones((1, 1))
     names = ("x",)
@@ -95,7 +74,7 @@ def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() 
     assert theorem_2(loop, 0.1, 0.0, 1.0) is None
 
 
-@settings(SEARCH, max_examples=6)
+@settings(SEARCH, max_examples=3)
 @given(systems(weighted=False), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
     _, found = of(system)

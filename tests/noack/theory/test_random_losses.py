@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
 from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
 from noack.scenario.resolution import resolve
@@ -16,15 +15,9 @@ from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
 from noack.theory.margins.loss_margin import LossMargin
 from noack.theory.random_losses.mean_square_growth import (
     mean_square_growth,
-    random_growth,
     sure_growth,
 )
 from noack.theory.random_losses.moments import moment_at_events, moments
-from tests.noack.theory.exact_loops import loop_of
-from tests.oracles.lossy_loops import System, random_system
-from tests.trigger_rules import decaying_rule
-
-EVENTS = 12
 
 
 def independent(p: float) -> LossProcess:
@@ -67,41 +60,6 @@ def test_too_many_losses_have_no_moments() -> None:
     plant = scalar(1.0, 3.0, 0.5)
     with pytest.raises(NoCertificateError):
         moments(plant.error, plant, NetworkConditions(0), 0.1, 0.9, 1)
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_mean_at_events_is_below_its_bound_and_above_it_with_fewer_losses(seed: int) -> None:
-    """In exact continuous time; the loops differ, and so do their runs' events."""
-    rng, p = np.random.default_rng(seed), 0.6
-    system = random_system(rng, mismatch=0.5, beta=0.01, known_start=False, spread=1.0)
-    sums, squares = np.zeros(EVENTS), np.zeros(EVENTS)
-    loop, runs = loop_of(system), 150
-    trigger = decaying_rule(system.beta, system.alpha, weight=loop.weight, n=loop.n)
-    continuous = ContinuousLoop(loop, trigger)
-    for _ in range(runs):
-        sizes = scaled_errors(system, continuous, rng.uniform(size=EVENTS + 1) < p)
-        sums[: len(sizes)] += sizes
-        squares[: len(sizes)] += sizes**2
-    mean = sums / runs
-    least = mean - 5 * np.sqrt(np.maximum(squares / runs - mean**2, 0.0) / runs)
-    error = system.gains().error
-    assert least.max() <= moment_at_events(error, independent(p), 0.0, 1)
-    assert mean.max() > moment_at_events(error, independent(0.0), 0.0, 1)
-
-
-def scaled_errors(system: System, loop: ContinuousLoop, lost: np.ndarray) -> np.ndarray:
-    """‖e_c‖_W e^{αt}/β just before the events after the first one."""
-    horizon_s = 4 / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
-    run = simulate_continuous(
-        loop,
-        horizon_s=horizon_s,
-        delivered=lambda event: event == 0 or event >= len(lost) or not lost[event],
-        known_start=False,
-    )
-    return np.array([
-        np.linalg.norm(system.weight @ one.e_c) * np.exp(system.alpha * one.t_s) / system.beta
-        for one in run.before[1:EVENTS]
-    ])  # fmt: skip
 
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_periodic.toml"
@@ -153,13 +111,13 @@ def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm() -> None
     assert exact < 1 < mean_square_growth([(between[0], np.array([[lost]]))], independent(p))
 
 
-@pytest.mark.parametrize("listed", [1, 2, 3, 5, 40])
+@pytest.mark.parametrize("listed", [1, 3, 40])
 def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
     """They are likely here: of runs of random loops, and of a scalar, none grows faster."""
     rng, p = np.random.default_rng(listed), 0.5
     between = [np.array([[0.2 * 2.0**burst]]) for burst in range(listed)]
     assert sure_growth(between, p, between[-1], np.array([[2.0]])) >= (0.2 * 2.0) ** 0.5
-    for _ in range(10):
+    for _ in range(4):
         delivered, lost = rng.normal(size=(2, 3, 3))
         delivered[:, 1:] = 0.0  # z is the first entry: what follows a delivery depends on it alone
         states = [np.linalg.matrix_power(lost, burst) @ delivered[:, :1] for burst in range(listed)]
@@ -170,19 +128,6 @@ def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
             size = float(np.linalg.norm(z))
             z, total = z / size, total + np.log(size)
         assert np.exp(total / periods) <= bound * 1.03  # of 4,000 periods
-
-
-def test_a_long_run_of_the_lane_grows_no_faster_than_its_bound() -> None:
-    margin = LossMargin(resolve(load(LANE, ())))
-    p, rng = 0.7, np.random.default_rng(5)
-    found = random_growth(margin, independent(p))
-    maps = margin.loop.period(0, True), margin.loop.period(0, False)
-    z, total, periods = np.ones(len(maps[0])), 0.0, 5000
-    for lost in (rng.uniform(size=periods) < p).tolist():
-        z = maps[lost] @ z
-        size = float(np.linalg.norm(z))
-        z, total = z / size, total + np.log(size)
-    assert np.exp(total / periods) < found.almost_sure < 1 < found.mean_square
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.1])

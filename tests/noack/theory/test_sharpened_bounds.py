@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from scipy.linalg import expm
 
@@ -17,7 +16,6 @@ from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     System,
-    certified_or_skipped,
     seeds,
     systems,
 )
@@ -35,10 +33,6 @@ def weighted(**changes: object) -> System:
         "sample_steps": 1, "delay_steps": 0, "hold_steps": 0, "lag_steps": 0,
     }  # fmt: skip
     return System(**(values | changes))  # type: ignore[arg-type]
-
-
-def certified(system: System) -> Constants:
-    return certified_or_skipped(system, NetworkConditions(system.mansd))
 
 
 def shares(system: System, found: Constants, seed: int) -> dict[str, float]:
@@ -77,23 +71,6 @@ def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() ->
     assert {name for name, share in used.items() if share < 0.6} == set()
 
 
-def test_all_bounds_are_nearly_reached_and_none_is_exceeded_where_there_are_many_events() -> None:
-    """The plant is far from its model. Bounds that were smaller by a fifth would be exceeded."""
-    largest: dict[str, float] = {}
-
-    @settings(SEARCH, max_examples=15)
-    @given(systems(n=2, mansd=4, mismatch=0.5, beta=0.01), seeds)
-    def look(system: System, seed: int) -> None:
-        for name, share in shares(system, certified(system), seed).items():
-            largest[name] = max(largest.get(name, 0.0), share)
-
-    look()
-    assert max(largest.values()) <= ROUNDING
-    assert largest["e_s"] == pytest.approx(1.0, abs=1e-9)
-    for name, least in (("e_c", 0.9), ("x", 0.95), ("p", 0.8), ("inter-event time", 0.85)):
-        assert largest[name] > least, name
-
-
 def followed(reach: Reach) -> Iterator[Matrix]:
     """z(τ) as columns, from starts that meet both conditions up to τ, for many τ.
 
@@ -112,7 +89,7 @@ def followed(reach: Reach) -> Iterator[Matrix]:
         yield z * scale
 
 
-@settings(SEARCH, max_examples=10)
+@settings(SEARCH, max_examples=4)
 @given(systems(n=2, beta=0.3, mismatch=0.5, known_start=True), seeds)
 def test_what_follows_a_delivery_is_bounded(system: System, seed: int) -> None:
     plant = system.gains()
@@ -135,7 +112,7 @@ def test_what_follows_a_delivery_is_bounded(system: System, seed: int) -> None:
             assert size <= smaller.size * ROUNDING
 
 
-@settings(SEARCH, max_examples=10)
+@settings(SEARCH, max_examples=4)
 @given(systems(n=2, beta=0.3, mismatch=0.5, known_start=True), seeds)
 def test_what_follows_lost_events_is_bounded(system: System, seed: int) -> None:
     plant, beta, lost = system.gains(), system.beta, 3
