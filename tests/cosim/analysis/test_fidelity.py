@@ -16,8 +16,7 @@ from cosim.analysis.fidelity import (
     fidelity_for_summary,
     live_run,
 )
-from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
-from cosim.output.run_tables import fidelity_rows
+from cosim.analysis.summary_model import NoFidelityPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
@@ -66,54 +65,6 @@ def test_the_difference_to_the_ideal_loop_is_explained(fidelity: Fidelity) -> No
     assert fidelity.compared_s == 4.0
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-@pytest.mark.parametrize("start", ["first_packet", "known_state"])
-def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) -> None:
-    settings = (f'mode="{mode}"', f'network.initial_sync="{start}"', "plant.measure_every=2",
-                "trigger.beta=0.02")  # fmt: skip
-    asked: list[int] = []
-
-    def network(data: bytes, now_ns: int) -> int | None:
-        asked.append(now_ns)
-        return None if len(asked) % 3 == 2 else 7_000_000 * (len(asked) % 5)
-
-    fidelity = compute_fidelity(lane(network, *settings))
-    assert fidelity.explained_relative < 1e-9
-    assert fidelity.events_live > 3
-
-
-@pytest.mark.parametrize(
-    "policy",
-    [
-        '{ policy = "relative", sigma = 0.2 }',
-        '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }',
-        '{ policy = "deadline", interval_s = 0.3, rule = { policy = "absolute", delta = 0.2 } }',
-    ],
-)
-def test_the_difference_is_explained_for_any_policy(policy: str) -> None:
-    fidelity = compute_fidelity(lane(None, f"trigger={policy}", 'mode="zoh"'))
-    assert fidelity.explained_relative < 1e-9
-    assert fidelity.events_live > 3
-
-
-def test_a_rule_without_a_continuous_time_run_gives_one_line() -> None:
-    record = lane(lambda data, now_ns: None, 'trigger={ policy = "lyapunov", rate_per_s = 0.1 }')
-    summary = fidelity_for_summary(record)
-    assert isinstance(summary, NoFidelityPart)
-    assert "accumulate" in summary.reason
-    ((_, text),) = fidelity_rows(summary)
-    assert text == f"not compared: {summary.reason}"
-
-
-def test_a_negative_share_partly_cancels_the_other_effects() -> None:
-    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "residual": 0.0}
-    numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
-    shown = dict(fidelity_rows(FidelityPart.model_construct(**numbers)))
-    assert shown["  sampling"] == "142.0 %"
-    assert shown["  delay"] == "-42.0 % (partly cancels the other effects)"
-    assert shown["  held actuation"] == "0.0 %"
-
-
 def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
     """This rule does not tolerate the losses; a deviation grows between equal events."""
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
@@ -142,17 +93,6 @@ def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
     assert held.max_event_difference_s is None
 
 
-def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
-    plant = record.scenario.plant
-    assert plant.A is not None
-    A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
-    other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
-    fidelity = compute_fidelity(changed(record, scenario=other))
-    assert fidelity.explained_relative > 0.1
-    assert not fidelity.explained
-    assert "too large" in fidelity.verdict
-
-
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
@@ -179,14 +119,6 @@ def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
     # 10 ms in flight, then 5 ms to the tick that uses it, or to the next step.
     assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
     assert {schedule.delay_steps(i) for i in beyond} == {2}
-
-
-def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
-    """A sensor that samples four times a second has fewer events than the paper's loop."""
-    fidelity = compute_fidelity(lane(None, "plant.measure_every=25", 'mode="zoh"'))
-    assert fidelity.events_ideal > fidelity.events_live
-    assert fidelity.first_different_event is not None
-    assert fidelity.explained_relative < 1e-9
 
 
 @pytest.mark.parametrize(

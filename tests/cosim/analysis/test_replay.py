@@ -19,7 +19,6 @@ from cosim.analysis.replay import Replay, replay, run_replay
 from cosim.analysis.replay.replay_result import ProcessReplay, difference
 from cosim.record.run_record import NETWORK_ROLES, RecordedRun, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.core.linear_systems import Matrix, discretise
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -205,33 +204,6 @@ def test_a_delivery_of_a_dropped_update_is_found() -> None:
     assert differences["sensor → netem"] is None
 
 
-def test_a_changed_machine_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plant's matrix differs in its last bits only."""
-
-    def changed_matrix(A: Matrix, B: Matrix, dt_ns: int) -> tuple[Matrix, Matrix]:
-        Ad, Bd = discretise(A, B, dt_ns)
-        return np.nextafter(Ad, np.inf), Bd
-
-    monkeypatch.setattr("plant_server.plant.discretise", changed_matrix)
-    found = replay(RECORD)
-    accounts = {account.process: account for account in found.processes}
-    assert accounts["plant"].difference is not None
-    assert accounts["plant"].difference.table == PLANT_STEP
-    assert accounts["sensor"].difference is None
-    assert accounts["controller"].difference is None
-
-
-def test_values_that_a_machine_refuses_are_a_difference() -> None:
-    rows = RECORD[SENSOR_MEASUREMENT].copy()
-    rows["t_ns"][20] = -(2**62)  # e^(−αt) overflows
-    found = replay(changed(RECORD, {SENSOR_MEASUREMENT: rows}))
-    sensor = next(account for account in found.processes if account.process == "sensor")
-    assert sensor.difference is not None
-    assert "cannot take this input" in sensor.difference.what
-    assert sensor.compared == 20
-    assert "sensor: replayed up to input 20" in found.gaps
-
-
 @pytest.mark.parametrize("table", [PLANT_STEP, CONTROLLER_STEP])
 def test_ticks_after_the_runs_end_are_not_made(table: str) -> None:
     """Of a period of 10¹⁸ ns, the times of ten more steps would not fit 64 bits."""
@@ -259,25 +231,6 @@ def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     assert sensor.compared == 20
 
 
-def test_an_empty_record_is_not_reported_as_exact() -> None:
-    found = replay(
-        changed(RECORD, {table: RECORD[table][:0] for table in RECORD.tables}, reports={})
-    )
-    assert found.bit_exact is None
-    assert found.inputs == 0
-
-
-def test_a_run_that_diverged_is_replayed() -> None:
-    gain = "model.gain=[[900.0,900.0,900.0,900.0],[0.0,0.0,0.0,0.0]]"
-    settings = [*SHORT, gain, "model.allow_unstable=true", "mode=zoh"]
-    path = ROOT / "scenarios" / "lane_following.toml"
-    diverged = simulate(resolve(load(path, [*settings, "horizon_s=60.0"])))
-    assert not np.isfinite(diverged[PLANT_STEP]["x"]).all()
-    found = replay(diverged)
-    assert found.bit_exact
-    assert found.gaps == []
-
-
 def test_every_bit_of_a_value_is_shown() -> None:
     for value in (0.1, math.nextafter(0.1, 1), -0.0, 5e-324):
         shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", value, 0.0)
@@ -288,21 +241,6 @@ def test_every_bit_of_a_value_is_shown() -> None:
     shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", nans[0], nans[1])
     assert shown.recorded_hex != shown.replayed_hex
     json.dumps(replay(flipped(RECORD, PLANT_STEP, 1, "x", 62)).document(), allow_nan=False)
-
-
-def test_the_document_is_json() -> None:
-    rows = RECORD[PLANT_STEP].copy()
-    rows["x"][3, 1] = math.nan
-    rows["u"][5] = math.inf
-    found = replay(changed(RECORD, {PLANT_STEP: rows}))
-    document = json.loads(json.dumps(found.document(), allow_nan=False, ensure_ascii=False))
-    assert document["bit_exact"] is False
-    first = document["first_difference"]
-    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 3, "x_2")
-    assert first["recorded"] is None
-    assert first["recorded_hex"].startswith("nan")
-    assert float.fromhex(first["replayed_hex"]) == first["replayed"]
-    assert found.verdict().model_dump(exclude={"error"}).items() <= document.items()
 
 
 @pytest.mark.parametrize("ticks", [True, False])

@@ -2,7 +2,6 @@
 
 import copy
 import io
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,11 +13,9 @@ from rich.console import Console
 import noack
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
-from cosim.live.finalize import finalize, reopen
-from cosim.live.simulated_run import simulate_run
 from cosim.output.report_page import Report, page
 from cosim.output.run_verdict import print_outcome
-from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE, changed_since, kind_of
+from cosim.record.run_directory import ENVIRONMENT_FILE, changed_since, kind_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
@@ -99,15 +96,6 @@ def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict
                 show(record, found)
                 shown += 1
     assert shown > 100  # numbers that may be missing, keys that are not shown
-
-
-def test_a_damaged_summary_is_written_again(tmp_path: Path) -> None:
-    scenario = noack.load("double_integrator", {"horizon_s": 0.2})
-    outcome = finalize(simulate_run(scenario, tmp_path), report=False, view=False)
-    path = outcome.run_dir / SUMMARY_FILE
-    path.write_text(json.dumps(outcome.summary.to_json() | {"changes": 5, "kind": [[[[]]]]}))
-    assert reopen(outcome.run_dir) == outcome
-    assert json.loads(path.read_text()) == outcome.summary.to_json()
 
 
 @pytest.mark.parametrize("content", ["[" * 100_000, "{" * 100_000, "7", '{"kind": []}'])

@@ -18,7 +18,6 @@ from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
 from cosim.record.spool_conversion import finish_record
-from noack.core.errors import MachineError
 from noack.protocol.record_tables import OWNER
 from noack.runtime.control_messages import RunProgress, parse_message
 from noack.scenario.resolution import resolve, run_tables
@@ -137,21 +136,6 @@ def test_the_terminal_reports_each_cause_once(run: RunRecord, terminal: bool) ->
             watcher.progress(RunProgress(**report, warnings=void))
     assert shown.getvalue().count("one [cause]") == 1
     assert shown.getvalue().count("another") == 1
-
-
-def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: Path) -> None:
-    plane = RecordingPlane()
-    recorder = recorder_of(run.scenario, tmp_path, plane)
-    send(plane, run, 1_200_000_000, {})
-    recorder.poll()
-    recorder.acknowledge()
-    (tmp_path / "spool" / "plant_step.recorder").unlink()
-    with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
-        recorder.acknowledge()
-    record = recorded(recorder, tmp_path)  # the rest of it is stored
-    assert not len(record["plant_step"])
-    assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
-    assert "plant_step.recorder: was deleted or moved" in str(recorder.lost)
 
 
 def test_nothing_is_reported_after_the_stop(run: RunRecord, tmp_path: Path) -> None:

@@ -1,15 +1,13 @@
 """From measured values to findings, independent of the machine."""
 
-import io
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
-from cosim.doctor.findings import FindingStatus, MachineFinding, judge, print_findings, worst
+from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
 from cosim.doctor.machine_measures import (
     Buffer,
     Disk,
@@ -81,20 +79,6 @@ def test_each_finding_has_a_verdict_and_a_remedy(
         assert found.means
         assert found.remedy or isinstance(next(iter(changed.values())), str)
         assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
-
-
-def test_the_table_names_each_finding_its_meaning_and_its_remedy() -> None:
-    findings = judge(replace(IDEAL, cores=1), WANTED)
-    console = Console(file=io.StringIO(), width=200)
-    print_findings(console, WANTED, findings)
-    text = console.file.getvalue()  # type: ignore[attr-defined]
-    for one in findings:
-        assert one.found in text
-        assert one.means in text
-        assert one.remedy in text
-    assert "this machine, for loop: ready, with the limits above" in text
-    missing = about("extra: vehicle", extras={"vehicle": False})
-    assert missing.remedy == "`pip install 'noack[vehicle]'`"
 
 
 def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:

@@ -34,9 +34,3 @@ def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]], at_on
     assert rows["input"].tolist() == present
     assert rows["value"].tolist() == [0.5 * k for k in present]
     assert rows.dtype == ROW
-
-
-def test_merging_no_batches_gives_an_empty_table() -> None:
-    rows = merge_rows([])
-    assert rows.shape == (0,)
-    assert rows.dtype == ROW

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import noack
 from cosim.cli import app
 from cosim.live.run_metrics import RunMetrics
-from cosim.live.run_watcher import Watcher, joint_watcher, later_watcher
+from cosim.live.run_watcher import Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.netem.control.test_emulator_metrics import exposed, values_of
 from tests.noack.runtime.test_json_log import objects
@@ -111,17 +111,3 @@ def test_a_wrong_address_starts_no_run(where: str, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, words)
     assert (done.exit_code, list(tmp_path.iterdir())) == (2, [])
     assert done.stderr.splitlines()[-1].startswith("noack: --metrics: expected HOST:PORT")
-
-
-def test_a_later_watcher_is_opened_once_at_its_first_callback() -> None:
-    seen: list[str] = []
-
-    def opened() -> Watcher:
-        seen.append("opened")
-        return Watcher(stopping=seen.append, notice=seen.append)
-
-    later = later_watcher(opened)
-    assert not seen
-    later.stopping("stops")
-    later.notice("a line")
-    assert seen == ["opened", "stops", "a line"]

@@ -25,7 +25,6 @@ from cosim.analysis.network_summary import (
 from cosim.analysis.summary_model import ExitPart, ReplayPart, read_summary
 from cosim.cli import app
 from cosim.live.finalize import finalize, reopen
-from cosim.output.figure_description import Heat
 from cosim.output.figure_drawing import draw
 from cosim.output.network_figures import error_map, norms_figure
 from cosim.output.run_tables import loop_row, network_rows
@@ -224,25 +223,6 @@ def test_quantiles_over_loops_ignore_what_is_unknown() -> None:
     np.testing.assert_allclose(found[:, 0], np.quantile(values[:, 0], QUANTILES))
     np.testing.assert_allclose(found[:, 5], np.quantile(values[:4, 5], QUANTILES))
     assert np.isnan(found[:, 3]).all()
-
-
-@pytest.mark.parametrize("count", [3, 11, 100])
-def test_figures_of_few_and_many_loops(count: int) -> None:
-    """The curves and the colours have the given values."""
-    values = np.random.default_rng(1).uniform(0.1, 1, (count, INTERVALS))
-    names = [f"loop-{i}" for i in range(count)]
-    over_time = LoopsOverTime(np.linspace(0, 2, INTERVALS + 1), values, 2 * values, values)
-    upper, lower = draw(norms_figure(over_time, names, np.full(count, True))).axes
-    for axes, factor in ((upper, 1), (lower, 2)):
-        drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
-        if count == 3:
-            np.testing.assert_array_equal(drawn, factor * values)
-        else:
-            np.testing.assert_allclose(drawn[0], factor * np.median(values, axis=0))
-            np.testing.assert_array_equal(drawn[1], factor * values.max(axis=0))
-    (heat,) = error_map(over_time, names, np.full(count, True)).rows[0].panels[0].items
-    assert isinstance(heat, Heat)
-    np.testing.assert_array_equal(heat.values, values)
 
 
 def test_a_loop_that_diverged_does_not_hide_the_others() -> None:

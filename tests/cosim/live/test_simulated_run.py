@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import CliRunner, Result
@@ -13,8 +12,6 @@ from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
-from cosim.output.viewer.live_viewer import opening_time_ns
-from cosim.record.align import align_tables
 from cosim.record.run_directory import write_environment
 from cosim.record.run_record import RecordedRun, load_record
 from cosim.simulation.virtual_time import Progress, simulate
@@ -88,32 +85,6 @@ def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
     assert loaded.notices == again.notices
 
 
-def test_the_summary_names_the_kind_of_run(runs: Path) -> None:
-    summary = json.loads((runs / "latest" / "summary.json").read_text())
-    assert summary["kind"] == "simulated"
-    assert summary["exit"] == {"status": 0, "reason": "horizon"}
-    (loop,) = summary["loops"]
-    assert loop["replay"] is summary["network"]["replay"] is None
-    assert summary["reached_s"] == loop["reached_s"] == 2.0
-    assert loop["lateness_us"] == loop["realtime"] == {}
-    assert loop["latency_us"] is summary["startup_s"] is None
-    shown = noack("summary", "--runs", str(runs))
-    assert shown.exit_code == 0
-    assert "simulated" in shown.stdout
-    assert "lateness" not in shown.stdout
-    assert "real-time" not in shown.stdout
-
-
-@pytest.mark.usefixtures("reported")
-def test_a_lost_summary_is_written_again_from_the_record(runs: Path) -> None:
-    summary = runs / "latest" / "summary.json"
-    content = json.loads(summary.read_text())
-    summary.unlink()
-    anew = json.loads(noack("summary", "--runs", str(runs), "--json").stdout)
-    summary.write_text(json.dumps(content))
-    assert anew | {"exit": None} == content | {"exit": None}
-
-
 def test_the_recording_of_a_simulated_run_has_no_lateness(runs: Path) -> None:
     reader = rerun.chunk.RrdReader(runs / "latest" / "recording.rrd")
     (store,) = reader.recordings()
@@ -146,16 +117,6 @@ def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path
     assert load_record(folder).kind == "live"
     write_environment(folder, "simulated")
     assert load_record(folder).kind == "simulated"
-
-
-def test_the_view_opens_at_the_largest_controller_error(runs: Path) -> None:
-    run_dir = runs / "latest"
-    record = load_record(run_dir)
-    joined = align_tables(record)
-    e_c = np.where(joined.since_delivery(record.scenario), joined.e_c_norm, -1.0)
-    summary = json.loads((run_dir / "summary.json").read_text())
-    assert summary["loops"][0]["sup_e_c_norm"] == e_c.max()
-    assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]
 
 
 def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:

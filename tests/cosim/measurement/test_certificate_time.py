@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import noack
-from cosim.measurement.certificate_time import DELAY, ORDER, certificate_time
+from cosim.measurement.certificate_time import DELAY, certificate_time
 from noack.scenario.scenario import Scenario
 from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
@@ -61,20 +61,6 @@ def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -
     if end:
         assert found.share == pytest.approx(void / end)
         assert share(found, DELAY) == pytest.approx(late / end)
-
-
-def test_losses_and_reordering_are_told_apart() -> None:
-    sent = 10 * np.arange(12)
-    delay = np.ones(12, int)
-    lost = np.zeros(12, bool)
-    lost[2:5] = True  # three in a row: one too many, from 40 to 51 ms
-    delay[7:10] = [50, 40, 30]  # 10 overtakes three
-    found = certificate_time(packet_trace(sent * MS, (sent + delay) * MS, lost), LANE)
-    assert [one.cause for one in found.causes] == ["dropouts", f"dropouts{ORDER}"]
-    assert [one.first_s for one in found.causes] == pytest.approx([0.04, 0.09])
-    assert [one.share for one in found.causes] == pytest.approx([11 / 120, 11 / 120])
-    assert [one.worst for one in found.causes] == [3, 3]
-    assert found.first_s == pytest.approx(0.04)
 
 
 def test_every_rule_of_the_guarantee_counts() -> None:

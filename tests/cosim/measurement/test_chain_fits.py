@@ -9,12 +9,10 @@ from hypothesis import strategies as st
 
 from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood
 from cosim.measurement.loss_bursts import (
-    Minimum,
     binomial_estimate,
     exponential_estimate,
     loss_bursts,
     poisson_estimate,
-    profile_interval,
 )
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from tests.cosim.measurement.chains import chain_losses
@@ -159,18 +157,3 @@ def test_binomial_and_exponential_intervals_at_their_edges() -> None:
         one = exponential_estimate(4, rng.exponential(2.0, 4).sum())
         inside.append(one is not None and one.low <= 2.0 <= one.high)
     assert abs(np.mean(inside) - 0.95) < 0.03
-
-
-def test_profile_interval_of_a_parabola_is_the_normal_one() -> None:
-    """Minus the log-likelihood of two correlated normal means."""
-    inverse = np.linalg.inv(np.array([[1.0, 0.8], [0.8, 2.0]]))
-    centre = np.array([0.3, -0.2])
-
-    def cost(x: np.ndarray) -> float:
-        return float((x - centre) @ inverse @ (x - centre) / 2)
-
-    low, high = profile_interval(cost, Minimum(centre, 0.0), 1, 50.0)
-    assert (low, high) == pytest.approx(
-        (-0.2 - 1.96 * math.sqrt(2), -0.2 + 1.96 * math.sqrt(2)), abs=0.02
-    )
-    assert profile_interval(cost, Minimum(centre, 0.0), 0, 1.0) == (-1.0, 1.0)

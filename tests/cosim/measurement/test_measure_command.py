@@ -22,13 +22,9 @@ from cosim.measurement.network_measurement import (
 from noack.scenario import toml_file
 from noack.scenario.sections import NetworkSection
 from noack.traces.packet_trace import packet_trace
-from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses, trace_of
 
 RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
-
-
-ANY_RECORD = st.tuples(st.integers(0, 10**9), st.none() | st.integers(0, 10**12))
 
 
 def measure(*words: object) -> Result:
@@ -62,17 +58,6 @@ def test_json_tables_and_page_have_the_same_numbers(tmp_path: Path) -> None:
     for text in ("616 (28.3 %)", "175 packets, 10.9 s, from 81.312 s"):
         assert text in html
         assert text in " ".join(shown.output.split())
-
-
-def test_the_written_trace_is_the_measured_one(tmp_path: Path) -> None:
-    path = tmp_path / "network.toml"
-    assert measure(RURAL, "--write", path).exit_code == 0
-    again, first = read_trace(path.with_suffix(".csv")), read_trace(RURAL)
-    assert (again.sent_ns == first.sent_ns).all()
-    assert (again.received_ns == first.received_ns).all()
-    assert toml_file.read(path)["network"]["impairments"] == [
-        {"kind": "replay", "file": "network.csv", "by": "time"}
-    ]
 
 
 def test_the_written_model_is_a_network_with_the_fitted_parameters(
@@ -176,13 +161,3 @@ def test_mistakes_are_one_line(words: list[object], message: str) -> None:
     assert result.exit_code in (1, 2)
     (line,) = result.stderr.strip().splitlines()
     assert message in line
-
-
-def test_one_packet_has_no_windows_and_shares_may_be_percentages(tmp_path: Path) -> None:
-    path = tmp_path / "one.csv"
-    path.write_text("sent_ms,received_ms\n0,5\n")
-    result = measure(path, "--share", "99%")
-    assert result.exit_code == 0
-    assert "99 %" in result.stdout
-    assert "(m, K)" not in result.stdout
-    assert "(m, K)" in measure(RURAL).stdout

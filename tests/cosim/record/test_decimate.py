@@ -38,16 +38,6 @@ def test_each_column_keeps_its_extremes_and_its_ends(
     assert keep[-1] == len(y) - 1
 
 
-def test_gaps_are_preserved() -> None:
-    t, y = np.linspace(0, 1, 10_000), np.ones(10_000)
-    y[4000:6000] = np.nan
-    keep = decimate(t, y, 100)
-    gap = np.isnan(y[keep])
-    assert gap.any()
-    assert t[keep][gap].min() < 0.41
-    assert t[keep][gap].max() > 0.59
-
-
 def test_samples_at_one_instant_are_all_one_column() -> None:
     keep = decimate(np.zeros(100), np.arange(100.0), 5)
     assert keep.tolist() == [0, 99]

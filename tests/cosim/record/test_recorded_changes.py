@@ -17,28 +17,22 @@ from cosim.record.align import align_tables
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from netem.channel import Datagram, channel_of
+from netem.channel import channel_of
 from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Notice, Record, Start
 from noack.protocol.record_tables import (
-    CONTROLLER_SETTING,
-    CONTROLLER_STEP,
     NETEM_PACKET,
     NETEM_SETTING,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-    SENSOR_SETTING,
     Fate,
 )
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed, identity_residual
 from tests.cosim.simulation.shuttle import Shuttle
 from tests.machine_parts import controller_of, sensor_of
-from tests.netem.stepped_channel import SteppedChannel
 
 MS = 1_000_000
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -106,48 +100,6 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
         ]
         assert row["consecutive_losses"] <= max(allowed)
     assert summarise(record, 0, "horizon").to_json()["assumption_violations"] == []
-
-
-def test_each_machine_applies_a_change_at_its_first_time_not_before_it() -> None:
-    at_ns = 1_003 * MS
-    record = run_with([(at_ns, {"trigger.beta": 0.5, "network.loss.probability": 0.0})])
-    assert [len(record[table]) for table in (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)]
-    (row,) = record[SENSOR_SETTING]
-    assert (row["t_ns"], row["since_ns"], row["now_ns"]) == (at_ns, at_ns, 0)
-    rows = record[SENSOR_MEASUREMENT]
-    before = rows["t_ns"] < at_ns
-    expected = np.where(before, 0.02, 0.5) * np.exp(-0.25 * rows["t_ns"] * 1e-9)
-    assert rows["threshold"] == pytest.approx(expected)
-    packets = record[NETEM_PACKET]
-    assert (packets["fate"][packets["now_ns"] < at_ns] == Fate.DROPPED).any()
-    assert (packets["fate"][packets["now_ns"] >= at_ns] == Fate.DELIVERED).all()
-
-
-def test_the_plant_and_both_models_converge_to_the_set_point() -> None:
-    record = run_with(
-        [(1_003 * MS, {"controller.setpoint": [2.0, 0.0]})], horizon_s=12.0, plant={
-            "initial_state": [1.0, 0.0], "rate_hz": 100.0,
-        },
-    )  # fmt: skip
-    assert record[PLANT_STEP]["x"][-1] == pytest.approx([2.0, 0.0], abs=1e-2)
-    steps, loop = record[CONTROLLER_STEP], record.loop
-    x_r = np.where((steps["t_ns"] < 1_003 * MS)[:, None], 0.0, [2.0, 0.0])
-    assert steps["u"] == pytest.approx((steps["x_c"] - x_r) @ loop.K.T)
-
-
-def test_a_cap_lowered_during_a_burst_delivers_the_next_datagram() -> None:
-    content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "worst_case"}}}
-    link = SteppedChannel(channel_of(resolve(validate(content, "here"))))
-    runs = []
-    for number in range(12):
-        if number == 5:  # one datagram was delivered, then four were lost
-            link.announce(ParameterChange(0, 50 * MS, {"network.mansd": 2}), 45 * MS)
-        (row,) = [one.row for one in link.handle(Datagram(0, b"x"), number * 10 * MS)
-                  if isinstance(one, Record)]  # fmt: skip
-        runs.append((int(row[5]), int(row[6])))
-    lost = [run for fate, run in runs if fate == Fate.DROPPED]
-    assert [run for _, run in runs] == [0, 1, 2, 3, 4, 0, 1, 2, 0, 1, 2, 0]
-    assert max(lost) == 4
 
 
 def test_dropouts_are_compared_with_the_cap_of_their_time() -> None:
@@ -220,20 +172,6 @@ def test_a_change_received_too_late_is_reported_and_voids_its_claims() -> None:
     joined = align_tables(record)
     between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
     assert np.nanmax(identity_residual(record)[between]) > 1e-3
-
-
-def test_a_sensor_with_an_observer_applies_a_change() -> None:
-    changes = [
-        {"at_s": 1.0, "set": {"trigger.beta": 0.01, "network.mansd": 0}},
-        {"at_s": 2.0, "set": {"controller.setpoint": [0.0, 0.0]}},
-    ]
-    scenario = load(SCENARIOS / "pendulum_observed.toml", ["horizon_s=3"])
-    content = scenario.model_dump(mode="json", exclude_none=True) | {"changes": changes}
-    record = simulate(resolve(validate(content, "here")))
-    assert len(record[SENSOR_SETTING]) == 2
-    assert replay(record).bit_exact
-    residual = identity_residual(record)
-    assert np.nanmax(residual) < 1e-12
 
 
 @pytest.mark.parametrize("machine_of", [sensor_of, channel_of, controller_of])

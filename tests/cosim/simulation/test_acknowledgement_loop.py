@@ -1,7 +1,6 @@
 """The acknowledgement baseline in the whole loop in virtual time, and in replay."""
 
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,39 +12,33 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
-from cosim.live.simulated_run import simulate_run
-from cosim.record.run_record import RunRecord, load_record, write_run
+from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
     NETEM_RELEASE,
     NO_SEQUENCE,
-    PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     UPDATES,
     Fate,
 )
-from noack.protocol.wire_format import Flow, read_header
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import dumps, load
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from tests.cosim.record.changed_records import flipped
-from tests.cosim.summaries import alone
-from tests.oracles.link import Datagram, Duplex, Link, network_of
+from tests.oracles.link import Link
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
-LOSSLESS = 'network.loss={model="lossless"}'
 MESSY = (
     "network.loss.probability=0.3",
     'network.impairments=[{kind="delay", delay_s=0.01, jitter_s=0.02},'
@@ -86,20 +79,6 @@ def fates(record: RunRecord, flow: int) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_without_losses_the_baseline_equals_the_ordinary_loop(mode: str) -> None:
-    """An acknowledgement without delay arrives before the next measurement."""
-    start = (f"mode={mode}", "network.initial_sync=known_state", LOSSLESS, "trigger.beta=0.05")
-    one = simulate(acknowledged(*start, "network.acknowledgements={}"))
-    other = simulate(plain(*start))
-    assert len(events(one)) > 3
-    np.testing.assert_array_equal(events(one)["t_ns"], events(other)["t_ns"])
-    assert one[PLANT_STEP].tobytes() == other[PLANT_STEP].tobytes()
-    assert one[CONTROLLER_DELIVERY].tobytes() == other[CONTROLLER_DELIVERY].tobytes()
-    assert one[SENSOR_MEASUREMENT]["x_s"].tobytes() == other[SENSOR_MEASUREMENT]["x_s"].tobytes()
-    assert len(one[SENSOR_ACKNOWLEDGEMENT]) == len(events(one))
-
-
 def test_the_default_timeout_covers_the_delays_of_both_directions() -> None:
     assert (
         acknowledged("network.acknowledgements={}").timing.acknowledgement_timeout_ns == 50_000_000
@@ -109,27 +88,6 @@ def test_the_default_timeout_covers_the_delays_of_both_directions() -> None:
         'network.acknowledgements={impairments=[{kind="delay", delay_s=0.04}]}',
     )
     assert acknowledged(*late).timing.acknowledgement_timeout_ns == 120_000_000
-
-
-def test_lost_acknowledgements_cause_transmissions_only_in_the_baseline() -> None:
-    """The paper's motivation; docs/scenarios.md has the numbers over 20 seeds and 20 s."""
-
-    def mean(make: Any, *overrides: str) -> float:
-        seeds = ([*overrides, f"seeds.loss={k}", f"seeds.plant={k}"] for k in range(4))
-        return float(np.mean([len(events(simulate(make(*each)))) for each in seeds]))
-
-    none = mean(plain, "network.loss.probability=0.5")
-    costs = [
-        mean(
-            acknowledged,
-            "network.loss.probability=0.5",
-            f"network.acknowledgements.loss.probability={lost}",
-        )
-        for lost in (0.0, 0.6, 0.9)
-    ]
-    assert costs[0] < 1.5 * none
-    assert all(more > 1.3 * less for less, more in pairwise(costs))
-    assert costs[-1] > 5 * none
 
 
 def test_each_direction_has_its_own_random_stream() -> None:
@@ -208,17 +166,6 @@ def test_a_flipped_bit_of_a_packet_is_found_in_its_row(
         assert column == "flow" or first.row == row
 
 
-def test_a_record_is_unchanged_by_writing_and_reading(messy: RunRecord, tmp_path: Path) -> None:
-    ending = simulate_run(load(SCENARIOS / "lane_acknowledged.toml", [*COARSE, *MESSY]), tmp_path)
-    loaded = load_record(ending.run_dir)
-    assert loaded.tables.keys() == messy.tables.keys()
-    assert all(loaded[table].tobytes() == messy[table].tobytes() for table in messy.tables)
-    write_run(alone(loaded), ending.run_dir)
-    scenario = load(ending.run_dir / "scenario.toml")
-    assert scenario == messy.scenario
-    assert 'protocol = "ack"' in dumps(scenario)
-
-
 def test_the_baseline_has_no_claims() -> None:
     record = run_of()
     (claim,) = ClaimEvaluation(record).judge()
@@ -230,30 +177,6 @@ def test_the_baseline_has_no_claims() -> None:
     for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):
         with pytest.raises(CallerError, match=r'network\.protocol = "ack": x_s is reset'):
             refuse(record.scenario)
-
-
-def test_a_run_without_acknowledgements_does_not_mention_them() -> None:
-    scenario = plain()
-    record = simulate(scenario)
-    assert SENSOR_ACKNOWLEDGEMENT not in record.tables
-    assert isinstance(network_of(scenario), Link)
-    assert set(record[NETEM_PACKET]["flow"].tolist()) == {UPDATES}
-    heads = map(read_header, (head.tobytes() for head in record[NETEM_PACKET]["head"]))
-    assert {None if head is None else head.flow for head in heads} == {Flow.UPDATE}
-    assert all("acknowledged" not in assumption.what for assumption in assumptions(scenario))
-
-
-def test_the_network_numbers_the_inputs_of_both_directions() -> None:
-    network = network_of(acknowledged())
-    assert isinstance(network, Duplex)
-    numbers = []
-    for k in range(20):
-        (*_, record) = network.handle(Datagram(k % 2, bytes(48)), k)
-        assert isinstance(record, Record)
-        numbers.append(record.row[:2])
-    assert numbers == [(k, k // 2) for k in range(20)]
-    with pytest.raises(ValueError, match="no flow 2"):
-        network.handle(Datagram(2, bytes(48)), 20)
 
 
 def test_settings_of_the_reverse_direction_need_acknowledgements() -> None:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from cosim.analysis.loop_statistics import from_controller, unintended_losses
 from cosim.analysis.replay import replay
@@ -18,12 +17,11 @@ from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.protocol.record_tables import (
     ACTUATIONS,
     NETEM_PACKET,
-    NO_SEQUENCE,
     PLANT_ACTUATION,
     PLANT_STEP,
 )
 from noack.protocol.wire_format import Flow
-from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.record.changed_records import changed, flipped
@@ -128,22 +126,6 @@ def test_a_receiver_that_may_have_ended_loses_nothing(
     assert sum(unintended_losses(late).values()) == lost
 
 
-def test_the_plant_receives_the_inputs_of_the_model(messy: RunRecord) -> None:
-    """Without an update in between, a prediction is what the controller sends later."""
-    loop, received = loop_of(messy.scenario), messy[PLANT_ACTUATION]
-    assert received["predicted"].shape[1] == 3 * loop.m
-    step = expm(loop.H * 0.02)
-    for row in received:
-        inputs = np.array([row["u"], *row["predicted"].reshape(3, -1)])
-        states = [np.linalg.matrix_power(step, j) @ row["x_c"] for j in range(4)]
-        np.testing.assert_allclose(inputs, [loop.K @ x for x in states], rtol=1e-9, atol=1e-12)
-    consecutive = np.flatnonzero(np.diff(received["sequence"]) == 1)
-    same = (received["predicted"][consecutive, : loop.m] == received["u"][consecutive + 1]).all(1)
-    assert same.any()
-    entries = messy[PLANT_STEP]["entry"]
-    assert {0, 1, 2} <= set(entries.tolist())
-
-
 def test_the_run_replays_bit_by_bit_and_a_flipped_bit_is_found(messy: RunRecord) -> None:
     result = replay(messy)
     assert result.bit_exact
@@ -153,18 +135,6 @@ def test_the_run_replays_bit_by_bit_and_a_flipped_bit_is_found(messy: RunRecord)
     assert "controller → plant" not in legs
     for table, column in ((PLANT_ACTUATION, "predicted"), (PLANT_STEP, "entry")):
         assert not replay(flipped(messy, table, 40, column, 1)).bit_exact
-
-
-def test_a_direct_path_and_a_perfect_one_over_the_network_give_the_same_loop() -> None:
-    direct = simulate(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=3"])))
-    over = simulate(
-        resolve(
-            load(SCENARIOS / "lane_following.toml", ["horizon_s=3", "network.actuation={limit=9}"])
-        )
-    )
-    for name in ("x", "u", "actuation"):
-        assert (direct[PLANT_STEP][name] == over[PLANT_STEP][name]).all()
-    assert (over[PLANT_STEP]["actuation"][1:] != NO_SEQUENCE).all()
 
 
 @pytest.mark.parametrize(
@@ -186,12 +156,6 @@ def test_mistakes_are_named(changes: list[str], says: str) -> None:
     with pytest.raises(CallerError) as error:
         load(SCENARIOS / "lane_following.toml", changes)
     assert says in str(error.value)
-
-
-def test_the_flows_of_the_network_follow_from_its_settings() -> None:
-    assert scenario("hold").network.flows == (Flow.UPDATE, Flow.ACTUATION)
-    paper = load(SCENARIOS / "lane_following.toml")
-    assert paper.network.flows == (Flow.UPDATE,)
 
 
 def test_each_loop_has_actuations_and_a_guarantee_of_its_own(tmp_path: Path) -> None:

@@ -32,7 +32,6 @@ from tests.machine_parts import sensor_of
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
 KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
 GUSTS = {"kind": "gaussian", "std": [0.5]}
-CHANGE = {"at_s": 0.4, "set": {"trigger.floor": 0.02}}
 
 
 def estimation_error(record: RunRecord) -> NDArray[np.float64]:
@@ -196,22 +195,6 @@ def test_noisy_measurements_are_used_as_x_without_an_observer(
         ("(I1)", "held"), ("certificate", "held"),
     }  # fmt: skip
     assert summarise(record, 0, "horizon").to_json()["estimation"]["observer"] is None
-
-
-def test_a_disturbed_plant_with_exact_measurements_keeps_the_papers_error_bound(
-    observed: dict[str, Any],
-) -> None:
-    del observed["observer"]
-    del observed["plant"]["measurement"]
-    record = run(observed)
-    assert record.scenario.coverage.knows_state
-    sources = [claim.source for claim in ClaimEvaluation(record).judge()]
-    assert set(sources) == {"(I1)", "eq:LossEv3", "certificate"}
-    summary = summarise(record, 0, "horizon").to_json()
-    assert summary["estimation"] is None
-    (pushed,) = summary["disturbances"]
-    assert (pushed["at"], pushed["kinds"]) == ("input", ["gaussian"])
-    assert pushed["rms"] == pytest.approx(np.sqrt((record[PLANT_STEP]["d"] ** 2).mean()))
 
 
 def test_the_summary_contains_the_estimation_error(observed: dict[str, Any]) -> None:

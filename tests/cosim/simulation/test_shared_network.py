@@ -14,7 +14,7 @@ from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import loops_of, phases_ns
+from noack.scenario.scenario import phases_ns
 from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
@@ -64,21 +64,6 @@ def test_the_first_loop_is_the_run_without_loops(
     assert (only.notices, only.reports) == (alone.notices, alone.reports)
     if protocol == "none":  # the flow of an acknowledgement has another number among four loops
         same(run(short, {"name": "a", "count": 4}).loops[0], alone)
-
-
-def test_a_loop_on_a_network_without_losses_is_the_same_loop_alone(short: Content) -> None:
-    """In its own time: every loop has another phase, and another seed of each kind."""
-    short["network"]["loss"] = {"model": "lossless"}
-    short["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.003}]
-    scenario = validate(short | {"loops": [{"name": "a", "count": 5}]}, "here")
-    shared = simulate_loops(scenario)
-    assert len(set(phases_ns(scenario))) == 5
-    for loop, record in zip(loops_of(scenario), shared.loops, strict=True):
-        alone = simulate(resolve(loop))
-        same(record, alone)
-        assert record.reports == alone.reports
-    packets = shared.network[NETEM_PACKET]
-    assert np.bincount(packets["flow"]).tolist() == [len(one[NETEM_PACKET]) for one in shared.loops]
 
 
 @pytest.fixture

@@ -34,14 +34,6 @@ def test_json_contains_all_results() -> None:
     assert document["certificate"]["conditions"]["sampling_s"] == 0
 
 
-def test_the_text_output_shows_the_patterns_of_one_objective() -> None:
-    status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8")
-    assert status == ExitStatus.OK
-    assert "not all patterns searched" in stdout
-    assert "DLLLL" in stdout
-    assert "cost" not in stdout
-
-
 def test_a_policy_is_searched_in_the_sampled_loop() -> None:
     """Without losses x_c differs from x by more than δ only where a test comes too late."""
     trigger = 'trigger={policy="absolute", delta=0.1}'
@@ -56,14 +48,6 @@ def test_a_policy_is_searched_in_the_sampled_loop() -> None:
     assert worst["runs"] == 1
     assert 0.1 < worst["value"] < 0.105
     assert "‖e_c‖, scaled" in run(*arguments)[1]
-
-
-def test_settings_replace_values_of_the_scenario() -> None:
-    status, stdout, _ = run(
-        "--objective", "error", "--set", "network.mansd=0", "--json", "--trigger", "continuous"
-    )
-    assert status == ExitStatus.OK
-    assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
 
 
 def test_an_error_in_the_arguments_gives_one_line() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cosim.analysis.adversary import Objective, Worst
 from cosim.analysis.adversary.loop_flows import evaluate
-from cosim.analysis.adversary.pattern_search import Nodes, PatternSearch, search_beam, search_tree
+from cosim.analysis.adversary.pattern_search import Nodes, PatternSearch, search_tree
 from cosim.analysis.adversary.worst_pattern_search import cost_ceiling
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
@@ -115,17 +115,6 @@ def lane(*settings: str) -> Scenario:
     return resolve(load(LANE, settings))
 
 
-@pytest.mark.parametrize("objective", Objective)
-def test_a_beam_of_32_runs_comes_within_one_percent_of_all_patterns(objective: Objective) -> None:
-    flow = flow_of(lane("horizon_s=16"), objective)
-    every, beam = PatternSearch(flow, CAP), PatternSearch(flow, CAP)
-    assert search_tree(every, 10**4)
-    search_beam(beam, 32, window_s=0.8)
-    assert every.value - 0.01 * abs(every.value) <= beam.value
-    assert beam.value <= every.value + 1e-9 * abs(every.value)
-    assert beam.nodes < 0.4 * every.nodes
-
-
 def test_the_search_stops_at_its_budget_and_reports_it() -> None:
     resolved = lane("horizon_s=6")
     search = PatternSearch(flow_of(resolved, Objective.ERROR), CAP)
@@ -145,14 +134,6 @@ def test_a_diverging_loop_has_an_infinite_objective(content: dict[str, Any]) -> 
     assert worst.diverges
     assert worst.exact
     assert worst.to_json()["value"] is None
-
-
-def test_without_dropouts_there_is_one_pattern() -> None:
-    worst = find_worst(lane("horizon_s=12", "network.mansd=0"), Objective.ERROR)
-    assert worst.exact
-    assert len(worst.pattern) == 3
-    assert all(worst.pattern)
-    assert worst.value == worst.lossless
 
 
 @given(resolved=scenarios(8))

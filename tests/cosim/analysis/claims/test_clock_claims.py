@@ -10,7 +10,6 @@ from cosim.analysis.claims.condition_reader import (
     read_conditions,
 )
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
-from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows, RunRecord
@@ -139,22 +138,6 @@ def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:
     early = changed(with_errors(clocked, {("sensor_clock", 50): LOST_NS}), reports=reports)
     (one,) = RunClaims(early).violations()
     assert one.cause == "sensor clock lost"
-
-
-def test_a_part_of_a_run_has_its_own_clock_rows(make: Make) -> None:
-    change = {"at_s": 3.0, "set": {"controller.setpoint": [0.1, 0.0]}}
-    record = simulate(make(clocks={}, changes=[change], horizon_s=6.0))
-    rows = {table: clock_rows(record, table) for table in CLOCK_TABLES}
-    record = changed(record, rows)
-    assert RunClaims(record).violations() == []
-    (one,) = RunClaims(with_errors(record, {("netem_clock", 110): LOST_NS})).violations()
-    assert (one.t_s, one.cause) == (pytest.approx(5.45), "netem clock lost")
-
-
-def test_the_replay_is_bit_exact_beside_clock_rows(clocked: RunRecord) -> None:
-    found = replay(clocked)
-    assert found.bit_exact
-    assert all(one.whole for one in found.processes)
 
 
 def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:

@@ -14,17 +14,14 @@ from scipy.optimize import brentq
 from cosim.simulation.continuous import (
     ContinuousLoop,
     ContinuousRun,
-    LoopState,
     TooManyEventsError,
-    reset,
     simulate_continuous,
 )
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.scenario.resolution import LoopMatrices
 from noack.trigger.trigger_rule import TriggerRule
-from tests.cosim.simulation.continuous.next_event import next_event
-from tests.trigger_rules import decaying_rule
+from tests.trigger_rules import decaying_rule, quadratic_rule
 
 
 def loop_with(
@@ -135,6 +132,27 @@ def test_a_scalar_loop_has_closed_form_events(floored: bool, lost: tuple[bool, .
     np.testing.assert_allclose([s.x[0] for s in run.before], [x for _, x in expected], rtol=1e-11)
 
 
+def test_periodic_event_triggering_agrees_with_the_sampled_rule() -> None:
+    """By powers of matrices, sample by sample."""
+    A, B, K = np.array([[0.01, 0.97], [-1.95, 3.02]]), np.array([[0.0], [1.0]]), [[1.0, -4.0]]
+    form, period_ns = np.diag([-0.02, -0.02, 1.0, 1.0]), 50_000_000
+    loop = loop_with(A, B, np.array(K), np.zeros((2, 2)), np.array([10.0, 0.0]))
+    rule = quadratic_rule(form, period_ns, heartbeat=7)
+    run = Case(loop, rule, [True, False], True, horizon_s=6.0).run()
+    transition = expm(run.system.generator * 0.05)
+    z, since, expected, number = np.concatenate(run.start[1:]), 0, [], 0
+    for k in range(1, 121):
+        z, since = transition @ z, since + 1
+        if z[:4] @ form @ z[:4] > 1e-12 or since == 7:
+            expected.append(k * 0.05)
+            z[2:4] = 0.0
+            if number % 2 == 1:
+                z[4:] = 0.0
+            number, since = number + 1, 0
+    assert len(expected) > 10
+    np.testing.assert_allclose(run.event_s, expected, rtol=1e-9)
+
+
 def turning(depth: float, omega: float, floored: bool) -> Case:
     """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it exceeds 1 briefly around t = π/ω.
 
@@ -205,61 +223,16 @@ def test_the_highest_of_many_near_misses_is_found() -> None:
     assert Case(loop, missed, [False], True, horizon_s).run().event_s.size == 0
 
 
-def scalar_system(trigger: TriggerRule) -> ContinuousLoop:
-    """e_s grows like −x, x = e^t: ẋ = x, ẋ_s = 0."""
-    one = np.ones((1, 1))
-    return ContinuousLoop(loop_with(one, one, 0 * one, 0 * one, np.ones(1)), trigger)
-
-
-def next_event_s(system: ContinuousLoop, state: LoopState, until_s: float) -> float | None:
-    found = next_event(system, state, until_s)
-    return None if found is None else found.t_s
-
-
-def test_an_error_from_the_threshold_on_exceeds_it_at_once() -> None:
-    system = scalar_system(decaying_rule(1e-3, 1.0, 0.5, n=1))
-    out = LoopState(1.0, np.array([1.0]), np.array([-0.5]), np.zeros(1))
-    assert next_event_s(system, out, 9.0) == 1.0
-    back = out._replace(e_s=np.array([0.4]))  # e_s = 1.4 − e^{t−1}: −½ when e^{t−1} = 1.9
-    assert next_event_s(system, back, 9.0) == pytest.approx(1 + math.log(1.9), rel=1e-14)
-    assert next_event_s(system, out._replace(e_s=np.array([0.7])), 9.0) == 1.0
-
-
 def test_the_floor_applies_from_where_it_meets_the_decaying_threshold() -> None:
-    """|e_s| = x₀(e^t − 1) reaches 1·e^{−t} first or the floor first, depending on x₀."""
-    system = scalar_system(decaying_rule(1.0, 1.0, 0.5, n=1))
+    """ẋ = x, ẋ_s = 0: |e_s| = x₀(e^t − 1) reaches 1·e^{−t} or the floor first, depending on x₀."""
+    one = np.ones((1, 1))
     for x0 in (2.0, 0.6, 0.5, 0.4, 1e-6):
-        state = LoopState(0.0, np.array([x0]), np.zeros(1), np.zeros(1))
         decaying = math.log((1 + math.sqrt(1 + 4 / x0)) / 2)
-        expected = min(decaying, math.inf) if decaying < math.log(2.0) else math.log1p(0.5 / x0)
-        assert next_event_s(system, state, 99.0) == pytest.approx(expected, rel=1e-13)
-
-
-def test_an_event_at_the_horizon_counts_and_a_later_one_does_not() -> None:
-    system = scalar_system(decaying_rule(1e-3, 1.0, 0.5, n=1))
-    state = LoopState(0.0, np.ones(1), np.zeros(1), np.zeros(1))
-    at_s = math.log1p(0.5)
-    assert next_event_s(system, state, at_s * (1 - 1e-12)) is None
-    assert next_event_s(system, state, at_s * (1 + 1e-12)) is not None
-    assert next_event_s(system, state, 0.0) is None
-
-
-@given(cases(), st.lists(st.floats(0, 2), min_size=1, max_size=20))
-@settings(max_examples=12)
-def test_states_between_events_are_the_matrix_exponentials(case: Case, t_s: list[float]) -> None:
-    system = ContinuousLoop(case.loop, case.trigger)
-    n = case.loop.n
-    rng = np.random.default_rng(n)
-    z = rng.uniform(-1, 1, 3 * n)
-    state = LoopState(0.5, z[:n], z[n : 2 * n], z[2 * n :])
-    samples = system.sample(state, 0.5 + np.array(sorted(t_s)))
-    for i, dt_s in enumerate(sorted(t_s)):
-        expected = expm(system.generator * dt_s) @ z
-        one = np.concatenate(system.sample(state, np.array([0.5 + dt_s]))[1:], axis=None)
-        many = np.concatenate([samples.x[i], samples.e_s[i], samples.e_c[i]])
-        scale = float(np.linalg.norm(expm(system.generator * dt_s), 2)) * 3 * n
-        np.testing.assert_allclose(one, expected, rtol=0, atol=1e-14 * scale)
-        np.testing.assert_allclose(many, expected, rtol=0, atol=1e-14 * scale)
+        expected = decaying if decaying < math.log(2.0) else math.log1p(0.5 / x0)
+        loop = loop_with(one, one, 0 * one, 0 * one, np.array([x0]))
+        rule = decaying_rule(1.0, 1.0, 0.5, n=1)
+        run = Case(loop, rule, [False], True, 1.001 * expected).run()
+        assert run.event_s[0] == pytest.approx(expected, rel=1e-13)
 
 
 def test_a_small_mismatch_keeps_its_relative_accuracy() -> None:
@@ -293,15 +266,6 @@ def test_dense_output_is_right_continuous() -> None:
         run.at([1e-3, 0.0])
 
 
-def test_an_unknown_start_is_sent_at_time_zero() -> None:
-    case = turning(0.3, 7.0, False)._replace(known=False, lost=[True])
-    run = case.run()
-    assert run.event_s[0] == 0.0
-    np.testing.assert_array_equal(run.before[0].e_c, -case.loop.x0)
-    assert not run.after[0].e_c.any()
-    assert run.delivered.tolist() == [True] + [False] * (len(run.before) - 1)
-
-
 def test_a_diverging_loop_without_events_reports_the_time() -> None:
     """ẋ = 100 x, equal to the model: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
     one = np.ones((1, 1))
@@ -329,10 +293,3 @@ def test_a_threshold_that_vanishes_is_an_error() -> None:
         Case(loop, decaying_rule(0.5, 1.0, n=1), [False], True, 1e4).run()
     floored = Case(loop, decaying_rule(0.5, 1.0, 1e-9, n=1), [False], True, 1e4)
     assert floored.run().event_s.size == 0
-
-
-def test_a_reset_keeps_the_undelivered_jumps() -> None:
-    state = LoopState(1.0, np.ones(2), np.ones(2), np.ones(2))
-    assert reset(state, True).e_c.tolist() == [0, 0]
-    assert reset(state, False).e_c.tolist() == [1, 1]
-    assert reset(state, False).e_s.tolist() == [0, 0]

@@ -53,31 +53,7 @@ def test_the_json_document_agrees_with_the_run(resolved: Scenario) -> None:
     np.testing.assert_allclose(np.linalg.norm(errors, axis=1), samples["e_c_norm"], atol=1e-12)
 
 
-def test_the_command_prints_a_table_or_json() -> None:
-    arguments = ("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous")
-    done = noack(*arguments)
-    assert done.exit_code == 0, done.output
-    completed, transmissions, *_ = done.stdout.splitlines()
-    assert completed == "completed 20 s"
-    assert transmissions == "20 transmissions, 7 delivered"
-    document = json.loads(noack(*arguments, "--json").stdout)
-    assert document["summary"]["kind"] == "continuous"
-    assert document["summary"]["exit"]["status"] == 0
-
-
 def test_long_lists_of_events_are_shortened() -> None:
     done = noack("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous",
                  "--set", 'mode="zoh"')  # fmt: skip
     assert "more events: --json" in done.stdout
-
-
-def test_a_loop_that_diverges_fails() -> None:
-    """The model equals the unstable loop: no event, and unlimited growth."""
-    done = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
-                 "--set", 'plant.draw="nominal"', "--set", "model.gain=[[20.0, 20.0]]",
-                 "--set", "model.allow_unstable=true",
-                 "--set", "horizon_s=1000", "--json")  # fmt: skip
-    assert done.exit_code == 1
-    summary = json.loads(done.stdout)["summary"]
-    assert summary["diverged_at_s"] == summary["reached_s"] < 1000
-    assert "diverged" in summary["exit"]["reason"]

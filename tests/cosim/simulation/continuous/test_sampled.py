@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from cosim.analysis.fidelity import live_run
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import ContinuousLoop, simulate_continuous
+from cosim.simulation.continuous import ContinuousLoop
 from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
 from noack.core.linear_systems import Matrix
@@ -128,42 +128,6 @@ def test_it_is_what_one_exponential_after_another_gives(delay: bool, case: Case)
     assert events == expected_events
     # 200 products on one side, each with an error of about 1e-16 of the state, which may grow.
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-
-
-def test_fast_sampling_converges_to_the_continuous_loop() -> None:
-    """An event is at most one period late, so half the period gives half the difference."""
-    content = {
-        "name": "pendulum",
-        "horizon_s": 4.0,
-        "model": {"A": [[0.0, 1.0], [9.81, -0.1]], "B": [[0.0], [1.0]], "gain": [[-15.0, -5.0]]},
-        "plant": {
-            "initial_state": [0.2, 0.0],
-            "draw": "given",
-            "A": [[0.0, 1.0], [9.7, -0.1]],
-            "B": [[0.0], [1.0]],
-        },
-        "trigger": {"beta": 0.02, "alpha_per_s": 0.3},
-        "network": {"mansd": 0, "loss": {"model": "lossless"}},
-    }
-    record = simulate(resolve(validate(content, "test")))
-    system = ContinuousLoop(record.loop, decaying_rule(0.02, 0.3))
-    ideal = simulate_continuous(system, horizon_s=4.0, delivered=[], known_start=False)
-    differences = []
-    for period_ns in (4_000_000, 2_000_000, 1_000_000, 500_000):
-        steps = 4_000_000_000 // period_ns
-        schedule = StepSchedule(
-            period_ns, np.ones(steps + 1, np.bool_), lambda _: True, lambda _: 0, lambda _: 0,
-            np.zeros(steps + 1, np.int64),
-        )  # fmt: skip
-        run = PlantGridLoop(system, schedule, known_start=False).run(delay=False, hold=False)
-        assert len(run.event_steps) == len(ideal.event_s)
-        late_s = run.event_steps * period_ns * 1e-9 - ideal.event_s
-        assert late_s[1] >= 0  # the loops have diverged from each other by the later events
-        x = ideal.at(np.arange(steps + 1) * (period_ns * 1e-9)).x
-        differences.append(float(np.abs(run.x - x).max()))
-    ratios = [after / before for before, after in itertools.pairwise(differences)]
-    assert differences[-1] < 0.3 * differences[0]
-    assert np.prod(ratios) < 0.25, ratios
 
 
 def policies(n: int) -> list[dict[str, Any]]:

@@ -27,7 +27,3 @@ def test_the_share_of_runs_is_compared_with_the_probability_for_the_most_packets
     assert (found.longer, found.runs, found.packets) == (2, 4, 5)
     assert found.predicted == pytest.approx(1 - 0.7**4)  # the first packet is delivered
     assert found.low < 0.5 < found.high
-
-
-def test_an_enforced_guarantee_is_not_compared() -> None:
-    assert burst_frequency(scenario(), {}) is None

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cosim.simulation.continuous import run_continuous
-from cosim.simulation.exact_simulation import run_batch
 from cosim.studies.campaign.random_draws import box_of, drawn_scenario
 from noack.impairments.kinds.replay import Replay
 from noack.impairments.loss_models.lossless import NoLoss
@@ -82,14 +81,6 @@ def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
             assert row["deliveries"] == run.delivered.sum()
             end = run.at([alone.horizon_s]).x[0]
             assert row["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
-
-
-def test_chunks_do_not_change_the_measures(campaign: Few) -> None:
-    work = campaign[1][2].work
-    whole = work.run(range(6))
-    parts = np.concatenate([work.run(range(4, 6)), work.run(range(4))])
-    assert whole.tobytes() == np.roll(parts, -2).tobytes()
-    assert len(run_batch(work.setting, work.box.population(0, range(0)))) == 0
 
 
 def test_each_draw_has_its_own_window_of_a_trace() -> None:

@@ -14,7 +14,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline
 from cosim.output.result_tables import ResultTable
 from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
@@ -22,7 +21,6 @@ from cosim.studies.campaign import campaign_grid
 from cosim.studies.campaign.campaign_figures import (
     curve_figure,
     distribution_figure,
-    figures,
     heat_map_figure,
     pareto_figure,
     undominated,
@@ -31,8 +29,7 @@ from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import base_of
 from cosim.studies.campaign.campaign_report import split_table, write_report, written
 from cosim.studies.campaign.campaign_summary import summarise
-from cosim.studies.campaign.campaign_workers import alone
-from cosim.studies.campaign.chunk_store import Store, run_campaign
+from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.metrics import METRICS, certified_error, estimate, measured
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -40,7 +37,7 @@ from noack.scenario.scenario_file import load as load_scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
+from tests.cosim.studies.campaign.conftest import Command, Few, Write
 
 ROOT = Path(__file__).parents[4]
 HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
@@ -100,25 +97,6 @@ def test_metrics_without_a_value_and_of_failed_runs_are_infinite(failure: int) -
     assert found["settling_s"].tolist() == [1.5, math.inf, math.inf]
     assert found["certificate_used"].tolist() == [0.25, 0.125, math.inf]
     assert "certificate_used" not in measured(columns, None)
-
-
-def test_a_curve_has_gaps_where_a_metric_is_unknown(
-    write: Write, plan: dict[str, Any], tmp_path: Path
-) -> None:
-    """Each of the two models has a certificate for other values of α."""
-    plan["axes"] = [
-        {"name": "gain", "variants": {"weak": {"model.gain": [[-1.0, -2.0]]},
-                                      "strong": {"model.gain": [[-9.0, -6.0]]}}},
-        {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
-    ]  # fmt: skip
-    curve = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
-    campaign, points = few_of(write(plan, compare=None, figures=[curve], draws=2))
-    store = Store(tmp_path / "out", points, 2, 3)
-    run_campaign(store, alone)
-    (figure,) = figures(summarise(campaign, store), store)
-    lines = [np.asarray(line.get_xydata()) for line in draw(figure).axes[0].lines]
-    assert [line[:, 0].tolist() for line in lines] == 2 * [[0.25, 2.0]]
-    assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
 
 def test_a_summary_covers_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
@@ -230,15 +208,6 @@ def test_figures_accept_infinite_single_and_many_values() -> None:
         assert inline(figure).startswith("<svg")
 
 
-def test_a_distribution_ends_at_the_share_of_finite_values() -> None:
-    values = np.concatenate([np.linspace(1.0, 2.0, 75), np.full(25, math.inf)])
-    figure = distribution_figure({"a": values}, "settling_s")
-    (line,) = draw(figure).axes[0].lines
-    x, y = (np.asarray(data, dtype=float) for data in line.get_data())
-    assert y.max() == pytest.approx(0.75)
-    assert np.interp(0.4, y, x) == pytest.approx(np.quantile(values, 0.4, method="inverted_cdf"))
-
-
 def test_numbers_are_written_with_their_interval() -> None:
     assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
     assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
@@ -282,16 +251,3 @@ def test_the_tables_fit_narrow_terminals(width: int) -> None:
         assert all(any(word in line for line in lines) for word in heading.split())
     assert all(len(line) <= width for line in lines)
     assert (len(found) == 1) == (width > 88)
-
-
-def test_a_long_axis_name_does_not_push_a_column_out() -> None:
-    headings = ["cost", "cost of the worst loop", "share of loops that diverged"]
-    rows = [["model_based", "30", "7.849e+11 ± 1.7e+10", "1.897e+12 ± 4.1e+10", "1"]]
-    console = Console(width=80, file=StringIO(), record=True)
-    whole = ResultTable("all", "all", ["policy", "number of loops", *headings], rows)
-    for table in split_table(whole, 2, 80):
-        console.print(table)
-    text = console.export_text()
-    assert all(word in text for heading in headings for word in heading.split())
-    assert "…" not in text
-    assert text.count(" 1 ") == 1

@@ -19,7 +19,6 @@ from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load as load_scenario
-from tests.cosim.studies.campaign.conftest import Write, few_of
 
 SHIPPED = Path(__file__).parents[4] / "scenarios"
 COARSE = ("horizon_s=4.0", "plant.rate_hz=50.0", "controller.rate_hz=50.0")
@@ -130,23 +129,3 @@ def test_a_failed_run_has_the_status_of_its_failure() -> None:
     assert np.isnan(row["cost"])
     (row,) = work("mode=zoh", most_events=2).run(range(1))
     assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
-
-
-def test_the_watchdog_policy_does_not_change_a_run_in_virtual_time() -> None:
-    """Actuations never stop in virtual time, so the watchdog does not trip."""
-    rows = [work(f"plant.watchdog.policy={policy}").run(range(2)) for policy in ("hold", "model")]
-    assert rows[0].tobytes() == rows[1].tobytes()
-    assert (rows[0]["status"] == OK).all()
-
-
-def test_delays_and_acknowledgements_are_permitted_in_sampled_campaigns(
-    write: Write, plan: dict[str, Any]
-) -> None:
-    variants = {
-        "late": {"network.impairments": [{"kind": "delay", "delay_s": 0.01}]},
-        "ack": {"network.protocol": "ack"},
-    }
-    axis = {"name": "network", "variants": variants}
-    _, points = few_of(write(plan, time="sampled", axes=[axis], compare=None, figures=[]))
-    assert [point.certified_error for point in points] == [None, None]
-    assert all(isinstance(point.work, SampledWork) for point in points)

@@ -11,14 +11,13 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.output.figure_description import Line, Rule
 from cosim.studies.campaign.campaign_grid import Point, grid
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
 from cosim.studies.campaign.sampled_draws import used_up
 from cosim.studies.capacity import capacity_plan as plans
-from cosim.studies.capacity.capacity_page import CapacityResult, comparisons, figures, mixtures
+from cosim.studies.capacity.capacity_page import CapacityResult, mixtures
 from cosim.studies.capacity.capacity_plan import kinds_of, policies_of, smallest_mixture
 from cosim.studies.capacity.capacity_result import (
     PolicyCapacity,
@@ -147,21 +146,6 @@ def test_a_long_queue_delays_what_it_does_not_drop(tmp_path: Path) -> None:
     found, limits = limits_of(study(tmp_path, queue=100))
     assert found.any_limit.median == limits["deadline"] == 6
     assert limits["guarantee"] == np.inf
-
-
-def test_a_figure_shows_the_means_of_the_summary(tmp_path: Path) -> None:
-    result = study(tmp_path, queue=100)
-    described = {figure.name: figure for figure in figures(result)}
-    assert [*described] == ["guarantee-own", "deadline-own", "cost-own"]
-    ((panel,),) = (row.panels for row in described["deadline-own"].rows)
-    means = [one.estimates["updates_late"].mean for one in result.summary.found]
-    (curve,) = (item for item in panel.items if isinstance(item, Line))
-    (fitting,) = (item for item in panel.items if isinstance(item, Rule))
-    assert curve.y.tolist() == means
-    assert means[:2] == [0.0, 0.0]
-    assert means[2] > 0.5
-    assert fitting.at == pytest.approx(6.0, rel=1e-6)
-    assert list(comparisons(result)) == []
 
 
 def test_a_draw_carries_the_loops_before_the_first_limit() -> None:

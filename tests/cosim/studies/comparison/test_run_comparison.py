@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.legend import Legend
 from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
-from cosim.record.run_directory import write_environment
 from cosim.studies.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
 
@@ -64,35 +62,12 @@ def test_the_distance_is_over_the_common_times(found: RunComparison) -> None:
     assert largest.values[2] == pytest.approx(apart.max())
 
 
-def test_a_run_has_distance_zero_to_itself(runs: list[Path]) -> None:
-    same = compare_runs([runs[0], runs[0]])
-    assert number(same, "distance in x to A, maximum").values == (None, 0.0)
-    assert same.settings == {}
-    assert all(not apart for one in same.numbers for apart in one.differences)
-
-
 def test_only_settings_that_differ_are_named(found: RunComparison) -> None:
     assert found.settings["mode"] == ("model", "zoh", "model")
     assert found.settings["network.mansd"] == ("4", "4", "1")
     assert found.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
     assert "trigger.beta" not in found.settings
     assert not any(key.startswith("ports") for key in found.settings)
-
-
-def test_the_overlay_shows_every_run_in_every_panel(found: RunComparison) -> None:
-    figure = found.plot()
-    *states, sensor, controller, transmissions = figure.axes
-    assert len(states) == 4
-    for axes in (*states, controller):
-        assert len(axes.lines) == 3
-    assert len(sensor.lines) == 6  # each with its threshold
-    colours = [line.get_color() for line in states[0].lines]
-    assert len(set(colours)) == 3
-    assert [line.get_color() for line in controller.lines] == colours
-    assert [tick.get_text() for tick in transmissions.get_yticklabels()] == ["A", "B", "C"]
-    legends = [part for part in states[0].get_children() if isinstance(part, Legend)]
-    texts = [text.get_text()[:3] for legend in legends for text in legend.get_texts()]
-    assert texts == ["A: ", "B: ", "C: "]
 
 
 def test_the_command_prints_the_table_and_writes_an_escaped_page(
@@ -110,16 +85,6 @@ def test_the_command_prints_the_table_and_writes_an_escaped_page(
     assert html.count("<svg") == 1
     assert "<script" not in html
     assert "zero-order hold" in html
-
-
-def test_live_and_simulated_runs_can_be_compared(runs: list[Path]) -> None:
-    """Records of both kinds have the same tables."""
-    before = (runs[1] / "environment.json").read_bytes()
-    try:
-        write_environment(runs[1], "live")
-        assert compare_runs(runs[:2]).runs[1].record.kind == "live"
-    finally:
-        (runs[1] / "environment.json").write_bytes(before)
 
 
 def test_the_json_document_contains_the_comparison(runs: list[Path], tmp_path: Path) -> None:

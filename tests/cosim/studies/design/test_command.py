@@ -140,17 +140,6 @@ def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design)
     assert "no certified bound of sup‖x‖" in result.stdout
 
 
-def test_no_number_is_cut_off_in_80_columns(
-    mass: Path, run_design: Design, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    result = run_design(mass, "--quantile", "0.7", "--gain", "lqr")
-    table = result.stdout.splitlines()[:10]
-    assert any("lqr R × 0.1" in line for line in table)
-    assert "…" not in result.stdout
-    assert max(map(len, table)) <= 80
-
-
 UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"]
 
 

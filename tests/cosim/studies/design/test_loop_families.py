@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from cosim.simulation.continuous import run_continuous
-from cosim.simulation.exact_simulation import run_batch, setting_of
-from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import DesignLimits, certificate_of, design
 from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
@@ -20,30 +18,6 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from tests.cosim.studies.design.conftest import designed
 from tests.cosim.studies.design.test_command import ONE
-
-
-def largest_errors(scenario: Scenario, seeds: range) -> list[float]:
-    """sup‖e_c‖ over 2,000 times of exact runs, with the scenario's own plants and losses."""
-    found = []
-    for seed in seeds:
-        drawn = scenario.seeds.model_copy(update={"plant": seed, "loss": seed})
-        exact = run_continuous(resolve(scenario.model_copy(update={"seeds": drawn})))
-        samples = exact.at(np.linspace(0.0, 10.0, 2000))
-        found.append(float(np.linalg.norm(samples.e_c, axis=1).max()))
-    return found
-
-
-def test_a_hold_is_designed_like_a_model(mass: Path) -> None:
-    limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.3})
-    scenario = load(mass, ['mode="zoh"'])
-    found = design(families_of(scenario, ("identity",), None), limits, draws=60, seed=3)
-    assert found.feasible
-    assert found.bounds is not None
-    assert found.scenario.mode == "zoh"
-    setting = replace(setting_of(resolve(found.scenario)), settle=0.02)
-    rows = run_batch(setting, box_of(scenario).population(99, range(400)))
-    assert np.mean(rows["settling_s"] <= 9.0) >= 0.8
-    assert max(largest_errors(found.scenario, range(5))) <= found.bounds["error"] <= 0.3
 
 
 def test_a_bound_under_the_schedule_is_that_of_the_scheduled_certificate(

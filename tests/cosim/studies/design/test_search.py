@@ -53,14 +53,6 @@ def test_the_chosen_design_is_certified_as_required(found: DesignResult, tmp_pat
     assert found.bounds["error"] == pytest.approx(bound)
 
 
-def test_a_tighter_limit_costs_transmissions(found: DesignResult, scenario: Scenario) -> None:
-    free = designed(scenario, replace(LIMITS, bounds={}))
-    assert free.feasible
-    assert free.bounds is not None
-    assert free.bounds["error"] > LIMITS.bounds["error"]
-    assert free.best.measured.transmissions < found.best.measured.transmissions
-
-
 def test_no_candidate_meets_the_limits_with_fewer_transmissions(found: DesignResult) -> None:
     best = found.best.measured
     assert found.best.full
