@@ -14,7 +14,6 @@ from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
     NETEM_RELEASE,
-    PACKET_HEAD_BYTES,
     Fate,
     tables,
 )
@@ -164,81 +163,6 @@ def test_neither_payload_nor_size_changes_the_losses() -> None:
 # The fate of a datagram.
 
 
-@given(st.lists(st.binary(max_size=100), min_size=1, max_size=20))
-def test_survivors_leave_unchanged_and_all_datagrams_are_recorded(data: list[bytes]) -> None:
-    link = new_link("loss 60% mansd 1")
-    for k, payload in enumerate(data):
-        message = Datagram(7, payload)
-        outputs = link.handle(message, 1000 + k)
-        (row,) = rows_of(outputs)
-        dropped = row["fate"] == Fate.DROPPED
-        assert sent(outputs) == ([] if dropped else [message])
-        assert (row["input"], row["sequence"], row["flow"]) == (k, k, 7)
-        assert (row["t_ns"], row["now_ns"]) == (1000 + k, 1000 + k)
-        assert row["release_ns"] == (-1 if dropped else 1000 + k)
-        assert (row["copy_ns"], row["bit"], row["size_bytes"]) == (-1, -1, len(payload))
-        head = payload[:PACKET_HEAD_BYTES]
-        assert row["head"].tobytes() == head + bytes(PACKET_HEAD_BYTES - len(head))
-    assert link.next_deadline_ns() is None
-
-
-def test_packets_are_numbered_by_flow_and_losses_counted_by_flow() -> None:
-    link = new_link("loss worst mansd 2 first")
-    found = [rows_of(link.handle(Datagram(flow, b""), 0))[0] for flow in (0, 0, 1, 0, 1, 1, 0)]
-    assert [row["input"] for row in found] == list(range(7))
-    assert [row["sequence"] for row in found] == [0, 1, 0, 2, 1, 2, 3]
-    assert [row["consecutive_losses"] for row in found] == [0, 1, 0, 2, 1, 2, 0]
-    forced = [row["fate"] == Fate.FORCED for row in found]
-    assert forced == [True, False, True, False, False, False, True]
-
-
-def test_a_delayed_datagram_leaves_when_it_is_due_and_is_recorded_again() -> None:
-    link = new_link("delay 10ms")
-    message = Datagram(3, b"abc")
-    (row,) = rows_of(link.handle(message, 5 * MS))
-    assert (row["release_ns"], row["fate"]) == (15 * MS, Fate.DELIVERED)
-    assert link.next_deadline_ns() == 15 * MS
-    outputs = link.on_timer(17 * MS)
-    assert sent(outputs) == [message]
-    (release,) = rows_of(outputs, NETEM_RELEASE)
-    assert release.tolist() == (1, 0, 15 * MS, 17 * MS, 3, 0, 0)
-    assert link.next_deadline_ns() is None
-    assert link.counters.forwarded == 1
-
-
-@given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from([0, 1, MS, 7 * MS])), max_size=40))
-def test_datagrams_in_flight_leave_in_the_order_of_time_and_then_of_arrival(
-    steps: list[tuple[int, int]],
-) -> None:
-    """Each datagram and each copy leaves exactly once, at the decided time."""
-    link = new_link("duplicate 50% delay 0 samples 1ms,1ms,5ms,5ms reorder 30% mansd 3")
-    now_ns, expected, found = 0, [], []
-    for number, (flow, gap_ns) in enumerate(steps):
-        now_ns += gap_ns
-        while (due := link.next_deadline_ns()) is not None and due <= now_ns:
-            (datagram,) = sent(link.on_timer(now_ns))
-            found.append((due, datagram.data))
-        data = str(number).encode()
-        outputs = link.handle(Datagram(flow, data), now_ns)
-        (row,) = rows_of(outputs)
-        times_ns = (row["release_ns"], row["copy_ns"])
-        expected += [(release_ns, data) for release_ns in times_ns if release_ns >= 0]
-        found += [(now_ns, datagram.data) for datagram in sent(outputs)]
-    found += [(due, sent(outputs)[0].data) for due, outputs in drain(link)]
-    assert found == sorted(
-        expected, key=lambda leaving: leaving[0]
-    )  # stable: ties in order of arrival
-    assert link.in_flight == 0
-
-
-def test_an_overdue_datagram_leaves_before_a_later_one() -> None:
-    link = new_link("delay 10ms gap 2 mansd 3")
-    first, second = Datagram(0, b"first"), Datagram(0, b"second")
-    assert sent(link.handle(first, 0)) == []
-    assert sent(link.handle(second, 11 * MS)) == []  # the first was due at 10 ms
-    assert [sent(outputs) for _, outputs in drain(link)] == [[first], [second]]
-
-
 def test_a_stale_datagram_is_recorded_as_such() -> None:
     link = new_link("delay 10ms gap 2 mansd 3")
     link.handle(Datagram(0, b"first"), 0)
@@ -247,29 +171,6 @@ def test_a_stale_datagram_is_recorded_as_such() -> None:
     (row,) = rows_of(outputs, NETEM_RELEASE)
     assert (due, row["stale"]) == (10 * MS, 1)
     assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
-
-
-def test_a_copy_leaves_and_is_recorded_as_a_copy() -> None:
-    link = new_link("duplicate 100% delay 10ms")
-    (row,) = rows_of(link.handle(Datagram(0, b"x"), 0))
-    assert (row["release_ns"], row["copy_ns"]) == (10 * MS, 10 * MS)
-    leaving = [rows_of(outputs, NETEM_RELEASE)[0] for _, outputs in drain(link)]
-    assert [row["copy"] for row in leaving] == [0, 1]
-    assert [row["stale"] for row in leaving] == [0, 0]
-    assert link.counters.duplicated == 1
-    at_once = new_link("duplicate 100%").handle(Datagram(0, b"x"), 0)
-    assert sent(at_once) == [Datagram(0, b"x")] * 2
-
-
-@given(st.binary(min_size=1, max_size=50))
-def test_a_corrupted_datagram_has_one_bit_flipped_and_the_bit_is_recorded(data: bytes) -> None:
-    link = new_link("corrupt 100%")
-    outputs = link.handle(Datagram(0, data), 0)
-    (row,), (changed,) = rows_of(outputs), sent(outputs)
-    assert row["fate"] == Fate.CORRUPTED
-    difference = int.from_bytes(changed.data, "little") ^ int.from_bytes(data, "little")
-    assert difference == 1 << int(row["bit"])
-    assert row["head"].tobytes()[: len(data)] == data[:PACKET_HEAD_BYTES]  # as received
 
 
 @pytest.mark.parametrize("copies", [False, True])
@@ -325,12 +226,3 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
     link = update_link_of(resolve(validate(content, "here")))
     found = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
     assert found == expected
-
-
-def test_losses_depend_on_the_scenarios_loss_seed_only(content: dict[str, Any]) -> None:
-    def found(**seeds: int) -> list[Fate]:
-        content["seeds"] = seeds
-        return fates(update_link_of(resolve(validate(content, "here"))), 0, 100)
-
-    assert found(loss=1) == found(loss=1, plant=9, initial_state=9)
-    assert found(loss=1) != found(loss=2)

@@ -34,7 +34,7 @@ def outcomes_of(decide: Any, words: str) -> Any:
 @pytest.mark.parametrize(("m", "k"), PAIRS)
 def test_exactly_the_allowed_sequences_occur(decide: Any, m: int, k: int) -> None:
     """For each pair (m, K) with K ≤ 8: alone, with a cap, with recovery, and with both."""
-    for cap, recovery in itertools.product(["", "mansd 1", "mansd 3"], ["", *range(2, 6)]):
+    for cap, recovery in itertools.product(["", "mansd 2"], ["", 3]):
         words = f"atmost {m} in {k} {cap} {f'recover {recovery}' if recovery else ''}"
         occurred, allowed = outcomes_of(decide, words), allowed_rows(WISHES, settings_of(words))
         assert allowed_rows(occurred, settings_of(words)).all()

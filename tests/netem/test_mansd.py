@@ -123,7 +123,7 @@ def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: An
 
 
 @pytest.mark.parametrize("change", ["no", "with the same guarantee", "with another guarantee"])
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(
     st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32),
     st.sampled_from([0.0, 0.3, 0.9]),
@@ -272,7 +272,7 @@ def settle(link: LinkState, packet: int, release_ns: int | None) -> Any:
     return decision
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(
     st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4),
     any_settings.constraints,

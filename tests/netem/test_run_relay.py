@@ -1,6 +1,5 @@
 """The channel of a run's emulator accepts the peers' datagrams only, and counts the others."""
 
-import itertools
 import socket
 import time
 from contextlib import closing
@@ -80,41 +79,6 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
     counts = {table: sum(len(rows) for one, rows in published if one == table) for table in tables}
     for table in (NETEM_PACKET, NETEM_RELEASE):
         assert counts[table] == (EARLY + LATER) * tables[table].itemsize
-
-
-def test_a_datagram_of_no_loop_of_the_run_is_counted_and_not_relayed() -> None:
-    sent = [update(k, loop) for k, loop in itertools.product(range(5), (0, 1, 2, 65_534))]
-    tables = {table: dtype for table, dtype in tables_of(SCENARIO).items()
-              if OWNER[table] == "netem"}  # fmt: skip
-    flows: list[int] = []
-
-    def publish(table: str, _: bytes, rows: bytes) -> None:
-        if table == NETEM_PACKET:
-            flows.extend(np.frombuffer(rows, tables[table])["flow"].tolist())
-
-    telemetry = TelemetryBuffer(tables, publish)
-    with (
-        endpoints(*["127.0.0.1"] * 2) as (sensor, controller),
-        closing(bind(0, "test")) as endpoint,
-    ):
-        clock = RunClock(time.monotonic_ns(), SCENARIO.speed)
-        machine, shell = opened(endpoint, controller, sensor, clock, loops=2)
-        for data in (*sent, b"short"):
-            sensor.sendto(data, endpoint.getsockname())
-        received: Received = []
-
-        def stop() -> bool:
-            received.extend(drain(controller))
-            return clock.now_ns() > PATIENCE_S * 1e9 or len(received) == 10
-
-        with closing(shell):
-            run_loop(machine, shell, clock, telemetry, end_ns=None, stop=stop)
-            shell.finish(clock.now_ns(), telemetry)
-            telemetry.flush()
-            report = shell.report()
-    assert sorted(data for data, _ in received) == sorted(d for d in sent if d[6] < 2 and d[7] == 0)
-    assert report["rejected"] == {"loop": 11}
-    assert sorted(flows) == [0] * 5 + [1] * 5
 
 
 def opened(

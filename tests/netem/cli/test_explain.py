@@ -84,21 +84,6 @@ def test_words_are_explained(explain: Explain) -> None:
     assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out
 
 
-def test_the_exclusions_of_the_prediction_are_shown(explain: Explain) -> None:
-    out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
-    assert (
-        "33.33% (without the guarantee 50%), not counting packets delivered out of order (stale)"
-        in out
-    )
-    assert "negative delays become 0 (25% of the draws)" in out
-
-
-def test_links_without_a_tc_equivalent_are_named(explain: Explain) -> None:
-    out = one_line(explain("loss worst mansd 2"))
-    assert "not possible with tc, which lacks: loss worst (a worst case), mansd 2 (" in out
-    assert "tc qdisc" not in out
-
-
 @pytest.mark.parametrize(
     ("arguments", "titles"),
     [
@@ -124,16 +109,6 @@ def test_a_trace_is_shown_by_its_name(explain: Explain) -> None:
     assert "2178 packets in 129.6 s" in " ".join(out.split())
     assert 'file = "rural_n8_10kmh", offset_s = 2.0, delay_share = 0.5' in out
     assert len(out) < 2000
-
-
-def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) -> None:
-    out = explain("--links", str(links_file))
-    uplink, video = out.split("\n\nvideo: 127.0.0.1:9002 → 127.0.0.1:9003\n")
-    assert uplink.startswith("uplink: 127.0.0.1:9000 → [::1]:9001, seed 7\n")
-    assert "loses 50%" in uplink
-    assert "delays each packet by 10ms" in uplink
-    assert "loses 20%" in video
-    assert video.endswith("reverse: not relayed; the server's answers are discarded\n")
 
 
 @pytest.mark.parametrize("columns", [120, 60])

@@ -62,15 +62,6 @@ def test_addresses(listen: str, to: str, addresses: tuple[Any, Any]) -> None:
     assert (link.listen, link.to) == addresses
 
 
-def test_files_in_words_lie_in_the_working_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "lost.txt").write_text("010")
-    monkeypatch.chdir(tmp_path)
-    (link,) = specs(f"{ADDRESSES} --reverse loss trace lost.txt")
-    assert link.reverse == settings_of("loss script 1 every 3")
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -145,14 +136,6 @@ def test_the_examples_of_the_help_are_valid(
     for line in examples:
         assert line.startswith("  noack netem ")
         assert specs(line.removeprefix("  noack netem "))
-
-
-@pytest.mark.parametrize("columns", [120, 80, 60])
-def test_the_help_fits_into_a_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
-    monkeypatch.setenv("COLUMNS", str(columns))
-    text = parser().format_help()
-    assert max(map(len, text.splitlines())) <= columns
-    assert "%%" not in text
 
 
 def test_the_help_has_every_word() -> None:

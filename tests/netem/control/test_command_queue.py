@@ -5,7 +5,6 @@ import pytest
 from netem.control.emulator_statistics import CommandQueue
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, PeerError
-from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import FakeRelay
 
 
@@ -16,19 +15,6 @@ def test_the_relay_is_accessed_from_its_own_thread_only(
     commands.change("up", ["forward"], settings_of("loss 50%"))
     (thread,) = relay.threads
     assert thread != threading.get_ident()
-
-
-def test_a_change_returns_the_time_from_which_it_applies(
-    relay: FakeRelay, commands: CommandQueue
-) -> None:
-    relay.counters["up", "reverse"] = Counters(received=17)
-    commands.change("up", ["reverse"], settings_of("loss 50% mansd 1"))
-    relay.counters["up", "reverse"].received = 20
-    in_force = commands.snapshot().in_force
-    assert in_force["up", "reverse"].since.received == 17
-    assert in_force["up", "reverse"].words == "loss 50% mansd 1"
-    assert in_force["up", "forward"].since == Counters()
-    assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
 
 
 def test_an_error_of_a_command_is_raised_at_its_caller(commands: CommandQueue) -> None:

@@ -15,10 +15,6 @@ from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay, options
 
 
-def test_a_file_alone_gets_a_line_each_second() -> None:
-    assert options("--stats-file", "x").stats == 1.0
-
-
 @pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "0.001"])
 def test_an_invalid_period_is_refused(period: str) -> None:
     with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):

@@ -1,6 +1,5 @@
 """Control of a running emulator over real zenoh on loopback."""
 
-import json
 import threading
 from typing import Any
 
@@ -11,26 +10,17 @@ from netem.control import control_server
 from netem.control.control_server import EMULATORS, ControlServer, find, running
 from netem.control.emulator_commands import Client
 from netem.control.emulator_statistics import CommandQueue
-from netem.relay_links import DIRECTIONS
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import Counters, LinkSettings
 from noack.runtime.control_plane import open_session
 from noack.runtime.private_folder import private_folder
-from tests.netem.control.relays import SETTINGS, FakeRelay
+from tests.netem.control.relays import FakeRelay
 
 
 @pytest.fixture
 def client(server: ControlServer) -> Any:
     with Client(find("lab")) as client:
         yield client
-
-
-def test_statistics_can_be_queried(relay: FakeRelay, client: Client) -> None:
-    relay.counters["down", "reverse"] = Counters(received=12, delivered=12)
-    document = client.ask("report")
-    assert [link["name"] for link in document["links"]] == ["up", "down"]
-    assert document["links"][1]["reverse"]["received"] == 12
 
 
 def test_statistics_are_published(
@@ -49,46 +39,12 @@ def test_statistics_are_published(
         assert recent["seconds"] > 0
 
 
-def test_settings_are_reported_in_words_and_as_an_object(client: Client) -> None:
-    up, down = client.ask("settings")["links"]
-    assert (up["name"], down["name"]) == ("up", "down")
-    assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
-    assert LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"])) == SETTINGS
-    assert up["reverse"]["words"] == ""
-
-
-@pytest.mark.parametrize(
-    ("direction", "changed"),
-    [("forward", ["forward"]), ("reverse", ["reverse"]), ("both", ["forward", "reverse"])],
-)
-def test_a_direction_is_changed(
-    relay: FakeRelay, client: Client, direction: str, changed: list[str]
-) -> None:
-    before = dict(relay.settings)
-    answer = client.ask("change", link="down", direction=direction, words="loss 100% mansd 2")
-    for (link, name), settings in relay.settings.items():
-        is_changed = link == "down" and name in changed
-        expected = settings_of("loss 100% mansd 2") if is_changed else before[link, name]
-        assert settings == expected
-    down = answer["links"][1]
-    assert [name for name in DIRECTIONS if "loss 100%" in down[name]["words"]] == changed
-
-
 def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
     client.ask("change", link="up", direction="reverse", words=["loss", "5%"])
     assert relay.settings["up", "reverse"] == settings_of("loss 5%")
     table = settings_of("delay 1ms mansd 3").model_dump(mode="json")
     client.ask("change", link="up", direction="reverse", settings=table)
     assert relay.settings["up", "reverse"] == settings_of("delay 1ms mansd 3")
-
-
-def test_the_link_may_be_left_out_if_there_is_one() -> None:
-    from tests.netem.control.relays import running as run
-
-    relay = FakeRelay("only")
-    with run(relay) as commands, ControlServer("lab", commands), Client(find(None)) as client:
-        client.ask("change", words="loss 5%")
-    assert relay.settings["only", "forward"] == settings_of("loss 5%")
 
 
 MISTAKES = [
@@ -159,11 +115,3 @@ def test_a_client_that_blocks_the_server_does_not_block_the_relay(
             commands.snapshot()  # runs in the relay's thread
     finally:
         free.set()
-
-
-def test_the_server_leaves_nothing_behind_at_its_end(commands: CommandQueue) -> None:
-    with ControlServer("lab", commands):
-        folder = private_folder() / "netem"
-        assert len([*folder.iterdir()]) == 3
-    assert running() == []
-    assert [*folder.iterdir()] == []

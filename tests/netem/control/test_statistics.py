@@ -11,7 +11,6 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.relay_links import FlowReport
-from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
 from tests.netem.control.relays import FakeRelay, times
@@ -99,29 +98,9 @@ def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) ->
     assert (found["received_before"], found["received"]) == (100, 300)
 
 
-def test_the_prediction_uses_the_settings_in_force(relay: FakeRelay) -> None:
-    """Bernoulli p, at most m consecutive losses: p(1 − p^m)/(1 − p^(m+1))."""
-    found = forward(statistics(look(relay, 1)))
-    assert found["loss"]["predicted"] == pytest.approx(0.1 * (1 - 0.1**2) / (1 - 0.1**3))
-
-
 def test_late_stale_packets_do_not_raise_the_loss_above_one(relay: FakeRelay) -> None:
     before = look(relay, 1)
     relay.counters["up", "forward"] = Counters(received=1, delivered=1, delivered_out_of_order=5)
     recent = forward(statistics(look(relay, 2), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1
-
-
-def test_values_without_data_are_null(relay: FakeRelay) -> None:
-    found = forward(statistics(look(relay, 1)))
-    assert found["loss"]["realised"] is None
-    assert set(found["delay_ns"].values()) == {None}
-
-
-def test_long_words_are_cut(relay: FakeRelay) -> None:
-    relay.settings["up", "forward"] = settings_of("loss script " + ",".join(map(str, range(99))))
-    found = forward(statistics(look(relay, 1)))["words"]
-    assert len(found) == 200
-    assert found.startswith("loss script 0,1,2,")
-    assert found.endswith("…")

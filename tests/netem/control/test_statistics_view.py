@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from netem.control.emulator_statistics import CommandQueue, Statistics, statistics
-from netem.control.statistics_view import History, picture_of, plain_lines, render
+from netem.control.statistics_view import History, plain_lines, render
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
@@ -77,27 +77,6 @@ def test_a_link_is_shown_with_both_directions() -> None:
     assert float(p99.split(" ms")[0]) == pytest.approx(20, rel=0.03)
 
 
-def test_the_last_minute_is_drawn() -> None:
-    lines = text_of(FakeRelay("up"), seconds=61)
-    chart = lines[[line.startswith("│ received ") for line in lines].index(True) + 1]
-    forward = chart[12:44]
-    assert forward == "".join(sorted(forward))  # monotonically increasing
-    assert forward.startswith("▁")
-    assert forward.endswith("█")
-
-
-def test_totals_are_counts_without_charts() -> None:
-    relay, file = FakeRelay("up"), io.StringIO()
-    relay.counters["up", "forward"].duplicated = 12
-    Console(file=file, width=80).print(picture_of(documents(relay, 1)[0], "totals", 80))
-    lines = file.getvalue().splitlines()
-    assert lines[0].split() == ["totals", "0:01"]
-    assert "1 client (3 ever)" in lines[1]
-    assert line_of(lines, "received") == "received 0 0"
-    assert any(line.strip("│ ") == "12 duplicated" for line in lines)
-    assert not any(line.strip("│ ") == "" for line in lines)
-
-
 def test_unintended_losses_stand_out() -> None:
     relay = FakeRelay("up")
     relay.unintended["lost_in_kernel"] = 1234
@@ -110,16 +89,6 @@ def test_unintended_losses_stand_out() -> None:
         render(history, "lab", 80, 30)
     )
     assert "\x1b[1;37;41munintended losses" in file.getvalue()
-
-
-def test_more_links_than_fit_are_a_table() -> None:
-    lines = text_of(FakeRelay(*(f"link{k}" for k in range(30))), height=24)
-    assert len(lines) <= 24
-    assert all(len(line) <= 80 for line in lines)
-    assert lines[2].split()[:9] == [
-        "→", "link0", "2,000/s", "1,600/s", "20.0", "%", "9.91", "%", "2/2",
-    ]  # fmt: skip
-    assert lines[-1].split() == ["…", "and", "9", "more"]
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 120])
@@ -149,12 +118,6 @@ def test_long_words_and_names_with_brackets_are_shown_correctly() -> None:
     assert "[bold]up  [::1]:5000 → [::1]:6000" in lines[1]
     assert len(lines) <= 24
     assert " → [bold]up" in "\n".join(text_of(relay, height=5))
-
-
-def test_the_view_without_statistics_is_almost_empty() -> None:
-    file = io.StringIO()
-    Console(file=file, width=80).print(render(History(), "lab", 80, 24))
-    assert file.getvalue() == "lab: waiting for statistics\n"
 
 
 def test_a_pipe_gets_one_line_per_direction_in_use() -> None:

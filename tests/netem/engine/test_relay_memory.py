@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.relay import Relay
@@ -30,7 +30,6 @@ def test_socket_addresses_survive_encoding_and_decoding(host: str) -> None:
     assert socket_name(unpacked_address(packed), "test") == name
 
 
-@settings(max_examples=80)
 @given(st.lists(st.tuples(st.booleans(), addresses, st.integers(0, 1)), max_size=200))
 def test_the_table_of_clients_is_a_dictionary(
     steps: list[tuple[bool, tuple[str, int], int]],

@@ -131,25 +131,6 @@ def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
     assert (report.clients, counters.received, counters.dropped) == (700, 2100, 700)
 
 
-def test_the_same_port_of_two_addresses_is_two_flows_with_a_path_each() -> None:
-    with endpoints(V4, "127.0.0.2") as (server, first), ExitStack() as stack:
-        second = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        second.bind(("127.0.0.3", name_of(first)[1]))
-        second.setblocking(False)
-        clients = {name_of(client): client for client in (first, second)}
-        with running([link(name_of(server))]) as one:
-            for client in clients.values():
-                client.sendto(str(name_of(client)).encode(), one.address())
-            questions = one.receive(server, 2)
-            for data, path in questions:
-                server.sendto(data, path)
-            for name, client in clients.items():
-                assert [data for data, _ in one.receive(client)] == [str(name).encode()]
-            flows = one.report().forward.flows
-    assert {flow.client for flow in flows} == set(clients)
-    assert len({path for _, path in questions}) == 2
-
-
 def test_only_answers_of_the_server_reach_the_client() -> None:
     with (
         endpoints(V4, V4, V4) as (server, client, stranger),

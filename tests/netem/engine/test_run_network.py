@@ -134,7 +134,7 @@ CROSSING = st.sampled_from([
 """What crosses the network."""
 
 
-@settings(max_examples=150)
+@settings(max_examples=30)
 @given(
     any_settings.harsh, any_settings.harsh, CROSSING, arrivals,
     st.integers(0, 2),
@@ -160,7 +160,7 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
     assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
 
 
-@settings(max_examples=100)
+@settings(max_examples=15)
 @given(
     any_settings.harsh, CROSSING, st.sampled_from([1, 2, 3, 200]),
     st.lists(
@@ -206,7 +206,7 @@ def test_at_equal_times_updates_leave_before_actuations() -> None:
 
 @pytest.mark.parametrize("scenario", [DELAYING, BOTH_WAYS])
 @pytest.mark.parametrize("generation", [0, 1])
-@settings(max_examples=60)
+@settings(max_examples=10)
 @given(
     st.lists(
         st.tuples(

@@ -49,7 +49,7 @@ def replayed(
     return left
 
 
-@settings(max_examples=60)
+@settings(max_examples=15)
 @given(
     forward=any_settings.harsh,
     reverse=any_settings.harsh,

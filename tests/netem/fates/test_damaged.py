@@ -84,10 +84,3 @@ def test_another_format_is_refused(tmp_path: Path) -> None:
 def test_a_missing_value_is_refused(tmp_path: Path) -> None:
     table = with_values("delay_ns", lambda values: [*values[:-1], None])
     assert "an incomplete trace cannot be replayed" in refused(write(tmp_path / "a", table))
-
-
-def test_a_truncated_file_gets_one_line(tmp_path: Path) -> None:
-    whole = write(tmp_path / "a", TABLE).read_bytes()
-    for size in range(0, len(whole), 500):
-        (tmp_path / "b").write_bytes(whole[:size])
-        refused(tmp_path / "b")

@@ -10,8 +10,6 @@ from netem.tc_words import settings_of
 from noack.impairments.loss_prediction import read_files
 from tests.oracles.link import Link
 
-NS = 10**9
-
 
 @given(st.sets(st.integers(0, 50), min_size=2), st.none() | st.integers(0, 30))
 def test_every_packet_is_lost_from_begin_until_just_before_end(
@@ -30,18 +28,6 @@ def test_every_packet_is_lost_from_begin_until_just_before_end(
         place = t_ns if period is None else t_ns % (1000 * period)
         expected = any(1000 * a <= place < 1000 * b for a, b in intervals)
         assert link.decide(0, 1, t_ns).fate == (5 if expected else 0)
-
-
-def test_only_packets_that_must_pass_are_delivered(decide: Any) -> None:
-    words = "blackout 100ms-300ms every 500ms"
-    arrivals = np.arange(1000) * NS // 1000
-    in_blackout = (arrivals % (NS // 2) >= NS // 10) & (arrivals % (NS // 2) < 3 * NS // 10)
-    freely = decide(words, 1000, arrivals_ns=arrivals)
-    np.testing.assert_array_equal(freely.fates, np.where(in_blackout, 5, 0))
-    capped = decide(f"{words} mansd 3", 1000, arrivals_ns=arrivals).fates
-    np.testing.assert_array_equal(capped != 0, in_blackout)
-    for begin in (100, 600):  # 200 consecutive packets
-        assert capped[begin : begin + 200].tolist() == [5, 5, 5, 2] * 50
 
 
 @given(st.lists(st.integers(1, 9), min_size=2, max_size=40), st.integers(0, 400))

@@ -147,8 +147,3 @@ def test_large_packet_numbers_can_be_scripted() -> None:
     last = 2**40 - 1
     packets = [0, 1, last - 1, last, last + 1]
     assert lost_packets(f"loss script 0,{last}", packets) == [k in (0, last) for k in packets]
-
-
-def test_each_flow_has_its_own_packet_count(decide: Any) -> None:
-    decided = decide("loss script 0,2", 8, flows=[0, 1, 1, 0, 1, 0, 0, 1])
-    assert ((decided.fates == 1) == np.isin(decided.decisions["packet"], (0, 2))).all()

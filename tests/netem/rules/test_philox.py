@@ -1,33 +1,21 @@
 """Known answers of Philox, and statistical tests of the random numbers that netem uses."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
-from scipy import stats
 
 from noack.core.core_library import core, ffi
 from noack.core.random_streams import uniform_pair
 
 ONES = 0xFFFFFFFF
 WORDS = st.integers(0, ONES)
-DRAWS = 2**16
 
 
 def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, ...]:
     words = ffi.new("int64_t[4]")
     core.noack_philox([c0, c1, c2, c3], [k0, k1], words)
     return tuple(words)
-
-
-def drawn(**places: Any) -> NDArray[np.float64]:
-    """Return two uniform numbers per (key0, key1, flow, packet, block), (n, 2)."""
-    names = ("key0", "key1", "flow", "packet", "block")
-    columns = np.broadcast_arrays(*(np.atleast_1d(places.get(name, 0)) for name in names))
-    return np.array([uniform_pair(*row) for row in np.stack(columns, axis=1).tolist()])
 
 
 @pytest.mark.parametrize(
@@ -62,27 +50,3 @@ def test_uniform_numbers_are_the_words_of_the_counter(
     for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):
         assert divmod(int(u * 2**53), 2**26) == (x >> 5, y >> 6)
     assert np.allclose(found, expected, rtol=0, atol=2**-27)
-
-
-VARIED = {
-    "packets": {"packet": np.arange(DRAWS)},
-    "late packets": {"packet": 2**32 - DRAWS // 2 + np.arange(DRAWS)},
-    "flows": {"flow": np.arange(DRAWS)},
-    "blocks": {"block": np.arange(DRAWS)},
-    "low keys": {"key0": np.arange(DRAWS)},
-    "high keys": {"key1": np.arange(DRAWS)},
-}
-
-
-@pytest.mark.parametrize("places", VARIED.values(), ids=VARIED.keys())
-def test_random_numbers_are_uniform_and_independent(places: dict[str, Any]) -> None:
-    """χ² over 256 cells, and over 32 × 32 cells for pairs and successive numbers; lags 1 to 8."""
-    pair = drawn(**places)
-    for u in pair.T:
-        assert stats.chisquare(np.histogram(u, 256, (0, 1))[0]).pvalue > 1e-6
-        z = (u - 0.5) * np.sqrt(12)
-        for lag in range(1, 9):
-            assert abs(np.mean(z[lag:] * z[:-lag])) < 5.5 / np.sqrt(DRAWS - lag)
-    for one, other in ((pair[:, 0], pair[:, 1]), (pair[1:, 0], pair[:-1, 0])):
-        cells = np.histogram2d(one, other, 32, ((0, 1), (0, 1)))[0].ravel()
-        assert stats.chisquare(cells).pvalue > 1e-6

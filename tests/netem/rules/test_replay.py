@@ -125,14 +125,14 @@ def test_recorded_reordering_is_kept_as_far_as_the_guarantee_allows() -> None:
 def test_a_random_place_is_drawn_by_the_seed_for_all_flows_uniformly() -> None:
     steps = [(0 if k == 0 else MS, k * MS) for k in range(10)]
     first = []
-    for seed in range(2000):
+    for seed in range(600):
         link = link_of(replay(steps, offset_s="random"), seed=seed)
         begins = {outcomes(link, [0, 0], flow)[0] for flow in range(3)}
         assert len(begins) == 1
         first += begins
     counts = np.bincount(np.array(first) // MS, minlength=10)
-    assert counts.sum() == 2000
-    assert counts.min() > 130  # of 200 expected, five standard deviations
+    assert counts.sum() == 600
+    assert counts.min() > 23  # of 60 expected, five standard deviations
     by_time = link_of(replay(steps, offset_s="random", by="time"), seed=3)
     assert outcomes(by_time, [0]) != outcomes(
         link_of(replay(steps, offset_s="random", by="time"), seed=4), [0]
@@ -161,16 +161,3 @@ def by_time(one: Replay) -> Replay:
 def bursts(received: np.ndarray[Any, Any]) -> list[int]:
     """Return the lengths of the loss bursts of packets that keep their order."""
     return [len(list(group)) for lost, group in groupby(received < 0) if lost]
-
-
-def test_the_guarantee_cuts_recorded_bursts(decide: Any) -> None:
-    rng = np.random.default_rng(1)
-    steps = [(0 if k == 0 else MS, -1 if rng.random() < 0.5 else MS) for k in range(5000)]
-    one = replay(steps)
-    free = decide(LinkSettings(impairments=(one,)), 5000, arrivals_ns=np.arange(5000) * MS)
-    source = np.array([delay for _, delay in steps])
-    assert bursts(free.decisions["release_ns"]) == bursts(source)
-    capped = decide(
-        LinkSettings(impairments=(one,), mansd=2), 5000, arrivals_ns=np.arange(5000) * MS
-    )
-    assert max(bursts(capped.decisions["release_ns"])) == 2

@@ -47,7 +47,10 @@ def tc(tmp_path_factory: pytest.TempPathFactory) -> Tc:
         "corrupt 0.1%", "corrupt 0.1% 10%", "delay 10ms reorder 25% 50%",
         "delay 10ms reorder 25% 50% gap 5", "delay 10ms reorder 25%", "rate 1mbit 0",
         "rate 5kbit 20 100 5", "rate 100kbps 0", "rate 1Mibit -14", "rate 80 0", "rate 1.5MBps 4",
-        "limit 50 delay 1ms", "loss 1% delay 10ms 1ms duplicate 2% rate 1gbit 0 limit 77",
+        "delay 3usec", "delay 3usecs", "delay 3msec", "delay 2secs", "delay .5ms", "delay 1e1ms",
+        "rate 8bit 0", "rate 1kibit 0", "rate 1gibit 0", "rate 1tbit 0", "rate 1bps 0",
+        "rate 1KiBps 0", "rate 1gbps 0", "limit 50 delay 1ms",
+        "loss 1% delay 10ms 1ms duplicate 2% rate 1gbit 0 limit 77",
     ],
 )  # fmt: skip
 def test_words_of_tc_have_the_same_meaning_here(tc: Tc, words: str) -> None:

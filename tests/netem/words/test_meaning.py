@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.emulator_options import settings_meaning
 from netem.tc_words import settings_of
 
 DRAWS = 20_000
@@ -33,25 +32,3 @@ def test_the_share_of_delays_cut_at_zero_is_shown(decide: Any, words: str) -> No
     cut = np.mean(decide(words, DRAWS, flows=np.arange(DRAWS)).delays_ns == 0)
     error = np.sqrt(share * (1 - share) / DRAWS)
     assert cut == pytest.approx(share, abs=5 * error + 0.05 * share)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "delay 10ms",
-        "delay 10ms 10ms",
-        "delay 40ms 10ms distribution normal",
-        "delay 6ms 10ms distribution pareto",
-        "delay 5ms samples -5ms,3ms",
-    ],
-)
-def test_a_delay_that_is_hardly_cut_at_zero_has_no_note(words: str) -> None:
-    (delay,) = settings_of(words).impairments
-    assert "negative" not in delay.meaning()
-
-
-def test_the_word_first_is_not_explained_as_a_cap() -> None:
-    (first,) = settings_meaning(settings_of("loss 5% first"))
-    assert first[0] == "first"
-    ((word, cap),) = settings_meaning(settings_of("loss 5% mansd 3"))
-    assert (word, cap.partition(":")[0]) == ("mansd 3", "the cap (M − 1)")

@@ -5,12 +5,10 @@ from typing import Any
 
 import pytest
 from hypothesis import assume, given
-from hypothesis import strategies as st
 
 from netem.tc_words import parse, settings_of, text_of
 from noack.core.errors import CallerError
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.words import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percent_text, time_text
 from tests.netem.any_settings import settings, words_can_say
 
 Given = dict[str, Any]
@@ -136,41 +134,6 @@ def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> 
     text = text_of(settings)
     assert settings_of(text) == settings
     assert "'" in text or settings_of(text.split()) == settings
-
-
-@given(st.floats(-3600, 3600))
-def test_a_time_is_written_so_that_it_is_read_back(time_s: float) -> None:
-    assert OWN_TIME_S.read(time_text(time_s)) == time_s
-
-
-@given(st.floats(0, 1))
-def test_a_percentage_is_written_so_that_it_is_read_back(share: float) -> None:
-    assert PERCENT.read(percent_text(share)) == share
-
-
-@pytest.mark.parametrize(
-    ("text", "time_s"),
-    [
-        ("1", 1e-6), ("1.5", 1.5e-6), ("1s", 1.0), ("1sec", 1.0), ("2secs", 2.0), ("1MS", 1e-3),
-        ("3msec", 3e-3), ("3msecs", 3e-3), ("3us", 3e-6), ("3usec", 3e-6), ("3usecs", 3e-6),
-        ("3ns", 3e-9), ("3nsecs", 3e-9), (".5ms", 5e-4), ("1e1ms", 1e-2), ("0", 0.0),
-    ],
-)  # fmt: skip
-def test_times_are_read_as_tc_reads_them(text: str, time_s: float) -> None:
-    assert TIME_S.read(text) == time_s
-
-
-@pytest.mark.parametrize(
-    ("text", "rate_bps"),
-    [
-        ("8", 8), ("8bit", 8), ("1kbit", 1000), ("1Kbit", 1000), ("1kibit", 1024),
-        ("1mbit", 10**6), ("1mibit", 2**20), ("1gbit", 10**9), ("1gibit", 2**30), ("1tbit", 10**12),
-        ("1bps", 8), ("1kbps", 8000), ("1KiBps", 8192), ("1mbps", 8 * 10**6), ("1.5mbit", 1500000),
-        ("1gbps", 8 * 10**9),
-    ],
-)  # fmt: skip
-def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
-    assert RATE_BPS.read(text) == rate_bps
 
 
 @pytest.mark.parametrize(
