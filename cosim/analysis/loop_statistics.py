@@ -366,6 +366,7 @@ class Signals(TypedDict):
 
     initial_state_norm: float | None
     final_state_norm: float | None
+    sup_state_norm: float | None
     sup_e_s_norm: float | None
     sup_e_c_norm: float | None
     sup_e_c_at_s: float | None
