@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +30,8 @@ from cosim.analysis.summary_model import (
     RunSummary,
     read_summary,
 )
-from cosim.live.process_pool import process_starts, processes
+from cosim.live.end_helpers import EndHelpers
+from cosim.live.process_pool import process_starts
 from cosim.live.progress import work_bar
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -51,16 +53,15 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
+from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
 _LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
 """Loops that are judged together, and rows of one of their tables."""
-_MANY_STEPS = 50_000
-"""Loops with fewer steps of the plant, all together, are judged in less time than processes
-start."""
 
 
 @np.errstate(all="ignore")
@@ -80,7 +81,9 @@ def finalize(
         MachineError: record or summary cannot be written.
     """
     run_dir = ending.run_dir
-    with _with_reason(ending), finished_run(run_dir):
+    with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
+        if ending.helpers is not None:
+            stack.enter_context(closing(ending.helpers))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
@@ -134,6 +137,10 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
+_Certificates = Sequence[ScenarioCertificate] | None
+"""Those of a loop; None if they are not known."""
+
+
 class _Judged(NamedTuple):
     """What the end of a run finds out about a loop."""
 
@@ -149,14 +156,16 @@ def _judged(
     loops, replayed = len(run.loops), None
     blocks = deque(_blocks(run))
     found: dict[range, list[_Judged]] = {}
-    with _helpers(run) as pool, work_bar(f"claims of {loops} loops") as show:
+    helpers = ending.helpers or EndHelpers(run.scenario)
+    with closing(helpers), work_bar(f"claims of {loops} loops") as show:
+        pool = helpers.start()
 
-        def judge_next(judge: Callable[[range], list[_Judged]]) -> None:
+        def judge_next(judge: Callable[[range, Sequence[_Certificates]], list[_Judged]]) -> None:
             """Judge blocks of loops until none is left."""
             with suppress(IndexError):
                 while True:
                     block = blocks.popleft()
-                    found[block] = judge(block)
+                    found[block] = judge(block, [*map(helpers.certificates.get, block)])
                     show(sum(map(len, found)) / loops)
 
         beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
@@ -207,24 +216,17 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
         first += width
 
 
-@contextmanager
-def _helpers(run: RecordedRun) -> Iterator[ProcessPoolExecutor | None]:
-    """Start processes that help with the end of a long run, on all cores but this process's."""
-    if cores() < 2 or len(run.loops) * _steps(run) < _MANY_STEPS:
-        yield None
-        return
-    with processes(cores() - 1) as pool:
-        yield pool
-
-
-def _judged_by(pool: ProcessPoolExecutor, ending: RunEnding, block: range) -> list[_Judged]:
+def _judged_by(
+    pool: ProcessPoolExecutor, ending: RunEnding, block: range, known: Sequence[_Certificates]
+) -> list[_Judged]:
     """Let a process of a pool judge loops; do it here if the process is killed."""
+    ending = replace(ending, helpers=None)
     try:
         with process_starts():
-            judged = pool.submit(_judged_stored, ending, block)
+            judged = pool.submit(_judged_stored, ending, block, known)
         return judged.result()
     except BrokenProcessPool:
-        return _judged_stored(ending, block)
+        return _judged_stored(ending, block, known)
 
 
 @cache
@@ -236,16 +238,22 @@ def _stored_run(run_dir: Path) -> RecordedRun:
 
 
 @np.errstate(all="ignore")
-def _judged_stored(ending: RunEnding, block: range) -> list[_Judged]:
-    return _judged_loops(_stored_run(ending.run_dir), ending, None, block)
+def _judged_stored(
+    ending: RunEnding, block: range, known: Sequence[_Certificates]
+) -> list[_Judged]:
+    return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
 
 
 def _judged_loops(
-    run: RecordedRun, ending: RunEnding, beside: "ReplayBeside | None", block: range
+    run: RecordedRun,
+    ending: RunEnding,
+    beside: "ReplayBeside | None",
+    block: range,
+    known: Sequence[_Certificates],
 ) -> list[_Judged]:
-    """Judge some loops; ``beside`` replays the only one."""
+    """Judge some loops, of which certificates may be known; ``beside`` replays the only one."""
     records = run.together(block)
-    certificates = _certificates([record.scenario for record in records])
+    certificates = _certificates([record.scenario for record in records], known)
     shared = SharedMachines(records if len(block) > 1 else ())
     judged = []
     for record, own in zip(records, certificates, strict=True):
@@ -258,12 +266,26 @@ def _judged_loops(
     return judged
 
 
-def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
+def certificates_of(run_dir: Path, block: range) -> Sequence[_Certificates]:
+    """Return the certificates of some loops of a run that may still go on."""
+    loops = _stored_loops(run_dir)[block.start : block.stop]
+    return _certificates(loops, [None] * len(loops))
+
+
+@cache
+def _stored_loops(run_dir: Path) -> Sequence[Scenario]:
+    return resolved_loops(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+
+
+def _certificates(
+    scenarios: Sequence[Scenario], known: Sequence[_Certificates]
+) -> Sequence[_Certificates]:
     """Return the certificates of loops; None if they fail, which the claims then report."""
-    try:
-        return certificates_together(scenarios)
-    except Exception:
-        return [None] * len(scenarios)
+    missing = [place for place, own in enumerate(known) if own is None]
+    found = dict(enumerate(known))
+    with suppress(Exception):
+        found |= zip(missing, certificates_together([scenarios[i] for i in missing]), strict=True)
+    return [*found.values()]
 
 
 class ReplayBeside:
@@ -285,7 +307,7 @@ def _with_results(
     run: RecordedRun,
     record: RunRecord,
     summary: LoopSummary,
-    certificates: Sequence[ScenarioCertificate] | None,
+    certificates: _Certificates,
     shared: SharedMachines,
     beside: ReplayBeside | None,
 ) -> _Judged:
@@ -312,7 +334,7 @@ def _with_results(
 def _claim_results(
     record: RunRecord,
     summary: LoopSummary,
-    certificates: Sequence[ScenarioCertificate] | None,
+    certificates: _Certificates,
 ) -> dict[str, Any]:
     claims = claims_of(record)
     claims.certificates = certificates

@@ -19,6 +19,7 @@ from queue import SimpleQueue
 from cosim.lazy_modules import lazy_modules
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
+from cosim.live.end_helpers import EndHelpers
 from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.run_watcher import Watcher, joint_watcher
 from cosim.record.run_directory import (
@@ -97,7 +98,7 @@ def launch(
     began_ns = time.monotonic_ns()
     if listening is not None:
         scenario = remote_access.with_clocks(scenario)
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as on_error, contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         resolved = _prepare(scenario, runs, spawn)
         signals = stack.enter_context(Signals().handled())
@@ -110,7 +111,9 @@ def launch(
         away = {} if listening is None else listening.hosts
         coordinator = Coordinator(ticket, [role for role in spawn if role not in away])
         stack.callback(coordinator.close)
-        watcher = joint_watcher([] if watcher is None else [watcher])
+        helpers = EndHelpers(resolved)
+        on_error.callback(helpers.close)
+        watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
         with _no_directory_if_refused(run_dir):
             opened = _open_to_others(stack, ticket, session, listening, coordinator)
         remote = None
@@ -126,7 +129,8 @@ def launch(
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
+        on_error.pop_all()  # they help with the end of the run
+    return RunEnding(run_dir, ticket.run_id, status, reason, startup_s, helpers)
 
 
 def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:

@@ -6,10 +6,12 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
+from typing import Any
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(
@@ -79,3 +81,17 @@ def process_starts() -> Iterator[None]:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             sys.modules["__main__"] = main
+
+
+def at_idle_priority(module: str, function: str, *arguments: Any) -> Any:
+    """Import a module and call its function on a core that nothing else needs.
+
+    A thread does both: without permission of the system, it could not leave that priority again.
+    """
+    with ThreadPoolExecutor(1, initializer=_be_idle) as thread:
+        return thread.submit(lambda: getattr(import_module(module), function)(*arguments)).result()
+
+
+def _be_idle() -> None:
+    if sys.platform == "linux":
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.live import finalize
+from cosim.live import end_helpers, finalize
 from cosim.live.finalize import ReplayBeside
 from cosim.record.run_directory import SUMMARY_FILE, RunEnding, write_environment, write_scenario
 from cosim.record.run_record import load_record, write_run
@@ -28,8 +28,8 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
     write_run(alone(record), tmp_path)
-    monkeypatch.setattr(finalize, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize, "cores", lambda: 2)
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
     return tmp_path
 
 
