@@ -19,7 +19,7 @@ from noack.core.process_limits import cores
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
-    from noack.theory.certificates.certified_bounds import ScenarioCertificate
+    from cosim.live.finalize import Expectations
 
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
@@ -42,8 +42,7 @@ class EndHelpers:
         self._stack, self._threads = ExitStack(), list[Thread]()
         self._blocks: deque[range] = deque()
         self._pool: ProcessPoolExecutor | None = None
-        self.certificates: dict[int, Sequence[ScenarioCertificate] | None] = {}
-        """Those that are known already, by the number of the loop."""
+        self._found: dict[int, Expectations] = {}
 
     def prepare(self, run_dir: Path) -> None:
         """Compute the certificates of many loops from now on."""
@@ -60,14 +59,19 @@ class EndHelpers:
         try:
             while self._blocks:
                 block = self._blocks.popleft()
-                function = "cosim.live.finalize", "certificates_of"
+                function = "cosim.live.finalize", "expectations_of"
                 with process_starts():
                     found = pool.submit(at_idle_priority, *function, run_dir, block)
-                self.certificates |= zip(block, found.result(), strict=True)
-        except IndexError:  # another thread has taken the last block
-            pass
+                self._found |= zip(block, found.result(), strict=True)
         except BrokenProcessPool:  # a process was killed
             self._pool = None
+        except Exception:  # the end of the run reports it; or another thread took the last block
+            self._blocks.clear()
+
+    def expectations(self, loops: range) -> "Sequence[Expectations] | None":
+        """Return what to expect of some loops, if it is known of all of them."""
+        found = [self._found[number] for number in loops if number in self._found]
+        return found if len(found) == len(loops) else None
 
     def start(self) -> ProcessPoolExecutor | None:
         """Return the processes, all of which are free now; None if there are none."""

@@ -56,6 +56,7 @@ from noack.runtime.spool import SPOOL
 from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
+from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
@@ -137,8 +138,12 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
-_Certificates = Sequence[ScenarioCertificate] | None
-"""Those of a loop; None if they are not known."""
+class Expectations(NamedTuple):
+    """What follows from the scenario of a loop alone."""
+
+    assumptions: Sequence[Assumption]
+    certificates: Sequence[ScenarioCertificate] | None
+    """None if they cannot be computed, which the claims then report."""
 
 
 class _Judged(NamedTuple):
@@ -160,12 +165,14 @@ def _judged(
     with closing(helpers), work_bar(f"claims of {loops} loops") as show:
         pool = helpers.start()
 
-        def judge_next(judge: Callable[[range, Sequence[_Certificates]], list[_Judged]]) -> None:
+        def judge_next(
+            judge: Callable[[range, Sequence[Expectations] | None], list[_Judged]],
+        ) -> None:
             """Judge blocks of loops until none is left."""
             with suppress(IndexError):
                 while True:
                     block = blocks.popleft()
-                    found[block] = judge(block, [*map(helpers.certificates.get, block)])
+                    found[block] = judge(block, helpers.expectations(block))
                     show(sum(map(len, found)) / loops)
 
         beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
@@ -217,7 +224,7 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
 
 
 def _judged_by(
-    pool: ProcessPoolExecutor, ending: RunEnding, block: range, known: Sequence[_Certificates]
+    pool: ProcessPoolExecutor, ending: RunEnding, block: range, known: Sequence[Expectations] | None
 ) -> list[_Judged]:
     """Let a process of a pool judge loops; do it here if the process is killed."""
     ending = replace(ending, helpers=None)
@@ -239,7 +246,7 @@ def _stored_run(run_dir: Path) -> RecordedRun:
 
 @np.errstate(all="ignore")
 def _judged_stored(
-    ending: RunEnding, block: range, known: Sequence[_Certificates]
+    ending: RunEnding, block: range, known: Sequence[Expectations] | None
 ) -> list[_Judged]:
     return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
 
@@ -249,27 +256,27 @@ def _judged_loops(
     ending: RunEnding,
     beside: "ReplayBeside | None",
     block: range,
-    known: Sequence[_Certificates],
+    known: Sequence[Expectations] | None,
 ) -> list[_Judged]:
-    """Judge some loops, of which certificates may be known; ``beside`` replays the only one."""
+    """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
-    certificates = _certificates([record.scenario for record in records], known)
+    expected = known or _expectations([one.scenario for one in records])
     shared = SharedMachines(records if len(block) > 1 else ())
     judged = []
-    for record, own in zip(records, certificates, strict=True):
+    for record, own in zip(records, expected, strict=True):
         phase_ns = run.phases_ns[record.number]
-        summary = summarise(record, int(ending.status), ending.reason, phase_ns)
+        status, reason = int(ending.status), ending.reason
+        summary = summarise(record, status, reason, phase_ns, own.assumptions)
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, record, summary, own, shared, beside))
+        judged.append(_with_results(run, record, summary, own.certificates, shared, beside))
     return judged
 
 
-def certificates_of(run_dir: Path, block: range) -> Sequence[_Certificates]:
-    """Return the certificates of some loops of a run that may still go on."""
-    loops = _stored_loops(run_dir)[block.start : block.stop]
-    return _certificates(loops, [None] * len(loops))
+def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
+    """Return what to expect of some loops of a run that may still go on."""
+    return _expectations(_stored_loops(run_dir)[block.start : block.stop])
 
 
 @cache
@@ -277,15 +284,11 @@ def _stored_loops(run_dir: Path) -> Sequence[Scenario]:
     return resolved_loops(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
 
 
-def _certificates(
-    scenarios: Sequence[Scenario], known: Sequence[_Certificates]
-) -> Sequence[_Certificates]:
-    """Return the certificates of loops; None if they fail, which the claims then report."""
-    missing = [place for place, own in enumerate(known) if own is None]
-    found = dict(enumerate(known))
+def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
+    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(scenarios)
     with suppress(Exception):
-        found |= zip(missing, certificates_together([scenarios[i] for i in missing]), strict=True)
-    return [*found.values()]
+        certificates = certificates_together(scenarios)
+    return [*map(Expectations, map(assumptions, scenarios), certificates)]
 
 
 class ReplayBeside:
@@ -307,7 +310,7 @@ def _with_results(
     run: RecordedRun,
     record: RunRecord,
     summary: LoopSummary,
-    certificates: _Certificates,
+    certificates: Sequence[ScenarioCertificate] | None,
     shared: SharedMachines,
     beside: ReplayBeside | None,
 ) -> _Judged:
@@ -334,7 +337,7 @@ def _with_results(
 def _claim_results(
     record: RunRecord,
     summary: LoopSummary,
-    certificates: _Certificates,
+    certificates: Sequence[ScenarioCertificate] | None,
 ) -> dict[str, Any]:
     claims = claims_of(record)
     claims.certificates = certificates
