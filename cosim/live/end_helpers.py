@@ -1,18 +1,19 @@
 """Processes that help with the end of a long run, and prepare it while the run goes on.
 
-The certificates of the loops depend on the scenario alone. The helpers compute them at idle
-priority: a process of the run that wakes up takes the core at once. What is not computed when the
-run ends, or is lost with a helper, is computed then.
+What follows from the scenario alone is computed at idle priority: a process of the run that wakes
+up takes the core at once. What is not computed when the run ends, or is lost with a helper, is
+computed then.
 """
 
 from collections import deque
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cosim.live.process_pool import at_idle_priority, process_starts, processes
 from noack.core.process_limits import cores
@@ -21,68 +22,88 @@ from noack.scenario.scenario import Scenario, loop_names
 if TYPE_CHECKING:
     from cosim.live.finalize import Expectations
 
+Result = TypeVar("Result")
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
 _LOOPS_AT_ONCE = 16
-"""The end of a run waits for the certificates of so many loops at most."""
+"""The end of a run waits for the preparation of so many loops at most."""
 
 
 class EndHelpers:
-    """Processes on all cores but one; there are none if the end of the run takes no time.
+    """Processes on all cores but one; none if the end of the run takes no time.
 
     Args:
         scenario: the scenario of the run.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        timing, self._loops = scenario.timing, len(loop_names(scenario))
-        steps = self._loops * (timing.horizon_ns // timing.plant_period_ns)
-        self._count = cores() - 1 if steps >= _MANY_STEPS else 0
+        timing, self._loops = scenario.timing, range(len(loop_names(scenario)))
+        steps = len(self._loops) * (timing.horizon_ns // timing.plant_period_ns)
+        self.count = cores() - 1 if steps >= _MANY_STEPS else 0
         self._stack, self._threads = ExitStack(), list[Thread]()
-        self._blocks: deque[range] = deque()
         self._pool: ProcessPoolExecutor | None = None
+        self._due: deque[Callable[[], None]] = deque()
+        """What is still to be prepared."""
         self._found: dict[int, Expectations] = {}
 
     def prepare(self, run_dir: Path) -> None:
-        """Compute the certificates of many loops from now on."""
-        loops = range(self._loops)
-        if len(loops) <= _LOOPS_AT_ONCE or (pool := self.start()) is None:
+        """Prepare the end of a run of many loops from now on."""
+        if len(self._loops) <= _LOOPS_AT_ONCE:
             return
-        self._blocks.extend(loops[first:][:_LOOPS_AT_ONCE] for first in loops[::_LOOPS_AT_ONCE])
-        for _ in range(self._count):
-            thread = Thread(target=self._prepare, args=(pool, run_dir), daemon=True)
-            thread.start()
-            self._threads.append(thread)
+        self.start()
+        for first in self._loops[::_LOOPS_AT_ONCE]:
+            block = self._loops[first:][:_LOOPS_AT_ONCE]
+            self._due.append(partial(self._prepare_loops, run_dir, block))
+        self._due.append(lambda: self._idle("import_viewer"))
+        for _ in range(self.count):
+            self._threads.append(Thread(target=self._prepare_all, daemon=True))
+            self._threads[-1].start()
 
-    def _prepare(self, pool: ProcessPoolExecutor, run_dir: Path) -> None:
+    def _prepare_all(self) -> None:
         try:
-            while self._blocks:
-                block = self._blocks.popleft()
-                function = "cosim.live.finalize", "expectations_of"
-                with process_starts():
-                    found = pool.submit(at_idle_priority, *function, run_dir, block)
-                self._found |= zip(block, found.result(), strict=True)
+            while True:
+                self._due.popleft()()
         except BrokenProcessPool:  # a process was killed
             self._pool = None
-        except Exception:  # the end of the run reports it; or another thread took the last block
-            self._blocks.clear()
+        except Exception:  # the end of the run reports an error; IndexError: all is prepared
+            pass
+
+    def _prepare_loops(self, run_dir: Path, block: range) -> None:
+        found = self._idle("expectations_of", run_dir, block)
+        self._found |= zip(block, found, strict=True)
+
+    def _idle(self, function: str, *arguments: Any) -> Any:
+        """Let a process call a function of the end of the run at idle priority."""
+        return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
 
     def expectations(self, loops: range) -> "Sequence[Expectations] | None":
-        """Return what to expect of some loops, if it is known of all of them."""
+        """Return what to expect of some loops, if all of them are prepared."""
         found = [self._found[number] for number in loops if number in self._found]
         return found if len(found) == len(loops) else None
 
-    def start(self) -> ProcessPoolExecutor | None:
-        """Return the processes, all of which are free now; None if there are none."""
-        self._blocks.clear()
+    def start(self) -> None:
+        """Have processes that are free; prepare no more."""
+        self._due.clear()
         for thread in self._threads:
             thread.join()
-        if self._pool is None and self._count:
-            self._pool = self._stack.enter_context(processes(self._count))
-        return self._pool
+        if self._pool is None and self.count:
+            self._pool = self._stack.enter_context(processes(self.count))
+
+    def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Let a process call a function."""
+        assert self._pool is not None
+        with process_starts():
+            return self._pool.submit(function, *arguments)
+
+    def call(self, function: Callable[..., Result], *arguments: Any) -> Result:
+        """Return the result of a function in a process; call it here if the process is killed."""
+        try:
+            return self.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            return function(*arguments)
 
     def close(self) -> None:
         """End the processes."""
-        self._blocks.clear()
+        self._due.clear()
         self._stack.close()

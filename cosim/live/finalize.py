@@ -4,8 +4,7 @@ import gc
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -31,7 +30,6 @@ from cosim.analysis.summary_model import (
     read_summary,
 )
 from cosim.live.end_helpers import EndHelpers
-from cosim.live.process_pool import process_starts
 from cosim.live.progress import work_bar
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -93,14 +91,18 @@ def finalize(
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         with work_bar("the record of the run") as show:
             run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
-        summary, over_time = _judged(run, ending)
+        helpers = stack.enter_context(closing(ending.helpers or EndHelpers(run.scenario)))
+        summary, over_time = _judged(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
             # That of an earlier attempt may be complete: it stays if there is no space for another.
             quiet = (MachineError,) if is_shown else ()
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
-                _write_recording(run, summary, run_dir, None, over_time)
+                if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
+                    helpers.call(_record_stored, run_dir, summary, over_time)
+                else:
+                    _write_recording(run, summary, run_dir, None, over_time)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
             for name in (*names, None):
@@ -155,15 +157,14 @@ class _Judged(NamedTuple):
 
 
 def _judged(
-    run: RecordedRun, ending: RunEnding
+    run: RecordedRun, ending: RunEnding, helpers: EndHelpers
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
     blocks = deque(_blocks(run))
     found: dict[range, list[_Judged]] = {}
-    helpers = ending.helpers or EndHelpers(run.scenario)
-    with closing(helpers), work_bar(f"claims of {loops} loops") as show:
-        pool = helpers.start()
+    helpers.start()
+    with work_bar(f"claims of {loops} loops") as show:
 
         def judge_next(
             judge: Callable[[range, Sequence[Expectations] | None], list[_Judged]],
@@ -175,9 +176,9 @@ def _judged(
                     found[block] = judge(block, helpers.expectations(block))
                     show(sum(map(len, found)) / loops)
 
-        beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
-        others = [] if pool is None or loops == 1 else [partial(_judged_by, pool, ending)]
-        others *= cores() - 1
+        beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
+        judge_stored = partial(helpers.call, _judged_stored, replace(ending, helpers=None))
+        others = [judge_stored] * helpers.count if loops > 1 else []
         gc.freeze()  # what is there stays: it need not be searched again and again
         with ThreadPoolExecutor(max(len(others), 1)) as threads:
             waiting = [threads.submit(judge_next, judge) for judge in others]
@@ -223,19 +224,6 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
         first += width
 
 
-def _judged_by(
-    pool: ProcessPoolExecutor, ending: RunEnding, block: range, known: Sequence[Expectations] | None
-) -> list[_Judged]:
-    """Let a process of a pool judge loops; do it here if the process is killed."""
-    ending = replace(ending, helpers=None)
-    try:
-        with process_starts():
-            judged = pool.submit(_judged_stored, ending, block, known)
-        return judged.result()
-    except BrokenProcessPool:
-        return _judged_stored(ending, block, known)
-
-
 @cache
 def _stored_run(run_dir: Path) -> RecordedRun:
     """Return the run of a helper, whose objects then live as long as the process."""
@@ -249,6 +237,12 @@ def _judged_stored(
     ending: RunEnding, block: range, known: Sequence[Expectations] | None
 ) -> list[_Judged]:
     return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
+
+
+def _record_stored(
+    run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None
+) -> None:
+    _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
 
 
 def _judged_loops(
@@ -294,9 +288,8 @@ def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
 class ReplayBeside:
     """The replay of the only loop of a run by another process."""
 
-    def __init__(self, pool: ProcessPoolExecutor, run_dir: Path) -> None:
-        with process_starts():
-            self._verdict = pool.submit(stored_verdict, run_dir)
+    def __init__(self, helpers: EndHelpers, run_dir: Path) -> None:
+        self._verdict = helpers.submit(stored_verdict, run_dir)
 
     def part(self) -> ReplayPart | None:
         """Wait for the result; None if the process could not replay the run."""
@@ -429,6 +422,11 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name
     _write_recording(run, outcome.summary, run_dir, loop)
+
+
+def import_viewer() -> None:
+    """Import what writing a recording needs."""
+    import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
 
 
 def _write_recording(
