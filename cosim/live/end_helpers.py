@@ -6,10 +6,10 @@ computed then.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from threading import Thread
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cosim.live.finalize import Expectations
 
 Result = TypeVar("Result")
+Item = TypeVar("Item", bound=Hashable)
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
@@ -55,7 +56,7 @@ class EndHelpers:
         for first in self._loops[::_LOOPS_AT_ONCE]:
             block = self._loops[first:][:_LOOPS_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))
-        self._due.append(lambda: self._idle("import_viewer"))
+        self._due.append(lambda: self._idle("import_libraries"))
         for _ in range(self.count):
             self._threads.append(Thread(target=self._prepare_all, daemon=True))
             self._threads[-1].start()
@@ -102,6 +103,49 @@ class EndHelpers:
             return self.submit(function, *arguments).result()
         except BrokenProcessPool:
             return function(*arguments)
+
+    def each(
+        self,
+        function: Callable[[Item], Result],
+        work: Iterable[Item],
+        show: Callable[[float], None],
+    ) -> Iterable[Result]:
+        """Call a function for each item, here and in the processes; return its results."""
+        with self.shared(work, partial(self.call, function), show) as take:
+            found = take(function)
+        return found.values()
+
+    @contextmanager
+    def shared(
+        self, work: Iterable[Item], there: Callable[[Item], Result], show: Callable[[float], None]
+    ) -> Iterator[Callable[[Callable[[Item], Result]], Mapping[Item, Result]]]:
+        """Let threads do work ``there``, item by item, while this one does it with what is yielded.
+
+        This returns the results, all of which are there at the end of the context. ``show`` is
+        called with the completed share.
+        """
+        waiting, found = deque(work), dict[Item, Result]()
+        count = len(waiting)
+
+        def left() -> Iterator[Item]:
+            with suppress(IndexError):
+                while True:
+                    yield waiting.popleft()
+
+        def work_on(function: Callable[[Item], Result]) -> Mapping[Item, Result]:
+            for item in left():
+                found[item] = function(item)
+                show(len(found) / count)
+            return found
+
+        with ThreadPoolExecutor(max(self.count, 1)) as threads:
+            others = [threads.submit(work_on, there) for _ in range(min(self.count, count - 1))]
+            try:
+                yield work_on
+            finally:
+                waiting.clear()  # an interrupted run waits for one item at most
+        for other in others:
+            other.result()
 
     def close(self) -> None:
         """End the processes."""

@@ -2,9 +2,7 @@
 
 import gc
 import sys
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -89,9 +87,12 @@ def finalize(
         # A recorder that completed its recording writes the reports afterwards.
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
+        scenario = load(scenario_file, most_bytes=MOST_RECORDED_BYTES)
+        helpers = stack.enter_context(closing(ending.helpers or EndHelpers(scenario)))
+        helpers.start()
         with work_bar("the record of the run") as show:
-            run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
-        helpers = stack.enter_context(closing(ending.helpers or EndHelpers(run.scenario)))
+            each = partial(helpers.each, show=show)
+            run = finish_record(run_dir, each) if unfinished else load_run(run_dir)
         summary, over_time = _judged(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
@@ -161,36 +162,24 @@ def _judged(
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
-    blocks = deque(_blocks(run))
-    found: dict[range, list[_Judged]] = {}
-    helpers.start()
+    beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
+
+    def here(block: range) -> list[_Judged]:
+        return _judged_loops(run, ending, beside, block, helpers.expectations(block))
+
+    def there(block: range) -> list[_Judged]:
+        given = replace(ending, helpers=None), block, helpers.expectations(block)
+        return helpers.call(_judged_stored, *given)
+
     with work_bar(f"claims of {loops} loops") as show:
-
-        def judge_next(
-            judge: Callable[[range, Sequence[Expectations] | None], list[_Judged]],
-        ) -> None:
-            """Judge blocks of loops until none is left."""
-            with suppress(IndexError):
-                while True:
-                    block = blocks.popleft()
-                    found[block] = judge(block, helpers.expectations(block))
-                    show(sum(map(len, found)) / loops)
-
-        beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
-        judge_stored = partial(helpers.call, _judged_stored, replace(ending, helpers=None))
-        others = [judge_stored] * helpers.count if loops > 1 else []
         gc.freeze()  # what is there stays: it need not be searched again and again
-        with ThreadPoolExecutor(max(len(others), 1)) as threads:
-            waiting = [threads.submit(judge_next, judge) for judge in others]
-            try:
+        try:
+            with helpers.shared(_blocks(run), there, show) as judge:
                 if run.kind == "live" and loops > 1:
                     replayed = _replay(run.network)
-                judge_next(partial(_judged_loops, run, ending, beside))
-            finally:
-                blocks.clear()  # an interrupted run waits for one block at most
-                gc.unfreeze()
-        for helper in waiting:
-            helper.result()
+                found = judge(here)
+        finally:
+            gc.unfreeze()
     judged = [loop for block in sorted(found, key=min) for loop in found[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:
@@ -424,9 +413,10 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
     _write_recording(run, outcome.summary, run_dir, loop)
 
 
-def import_viewer() -> None:
-    """Import what writing a recording needs."""
-    import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
+def import_libraries() -> None:
+    """Import what writing record and recording needs."""
+    import cosim.output.viewer.run_recording  # imports rerun
+    import cosim.record.table_files  # noqa: F401  # imports pyarrow
 
 
 def _write_recording(

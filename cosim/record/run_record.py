@@ -6,6 +6,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -444,6 +445,8 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     Raises:
         OSError, NoackError: they cannot be written.
     """
+    from cosim.record.table_files import write_table  # imports pyarrow
+
     types = run_tables(run.scenario)
 
     def rows(table: str) -> Iterator[Rows]:
@@ -467,8 +470,14 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
     reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
     write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
-    tables = ((table, rows(table)) for table in types)
-    write_tables(run_dir / RECORD, tables, types, vector_names(run.scenario), notices)
+    folder, names = run_dir / RECORD, vector_names(run.scenario)
+    with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
+        written = [
+            threads.submit(write_table, folder / f"{table}.parquet", rows(table), dtype, names)
+            for table, dtype in types.items()
+        ]
+        for one in written:
+            one.result()
 
 
 def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
@@ -481,26 +490,13 @@ def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
     return {"state_names": states, "input_names": inputs}
 
 
-def write_tables(
-    folder: Path,
-    tables: Iterable[tuple[str, Iterable[Rows]]],
-    types: Mapping[str, np.dtype[np.void]],
-    names: Mapping[str, Sequence[str]],
-    notices: Iterable[Notice],
-) -> None:
-    """Write tables, with the names of states and inputs, and the run's log."""
-    from cosim.record.table_files import write_table
-
+@contextmanager
+def record_folder(folder: Path, notices: Iterable[Notice]) -> Iterator[None]:
+    """Have a folder for the tables that are written within the context, and for the run's log."""
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
-    with ThreadPoolExecutor(cores()) as threads:  # most of the work is done without the lock
-        written = [
-            threads.submit(write_table, folder / f"{table}.parquet", batches, types[table], names)
-            for table, batches in tables
-        ]
-    for one in written:
-        one.result()
+    yield
     with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 
