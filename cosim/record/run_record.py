@@ -365,6 +365,10 @@ class StoredLoops(Sequence[RunRecord]):
             loops = [record.number for record in having]
             for place, rows in self._stored.of_loops(table, loops, types):
                 having[place].source.keep(table, rows)
+        for table, dtype in network_tables().items():
+            parts = zip(*self._shared.of_loops(table, numbers), strict=True)
+            for record, own in zip(records, parts, strict=False):  # none if there are no rows
+                record.source.keep(table, joined(own, dtype))
         return records
 
     def _record_of(self, number: int) -> RunRecord:
