@@ -92,13 +92,16 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
 def summarise(
-    record: RunRecord, exit_status: int, reason: str, phase_ns: int = 0,
-    assumed: Sequence[Assumption] | None = None,
-) -> LoopSummary:  # fmt: skip
+    record: RunRecord,
+    exit_status: int,
+    reason: str,
+    phase_ns: int = 0,
+    assumed: Sequence[Assumption] = (),
+) -> LoopSummary:
     """Return the summary of a loop, without the results of replay, fidelity and claims.
 
-    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless.
-    ``assumed`` are the assumptions of its scenario, if they are known.
+    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
+    assumptions of its scenario may be known: ``assumed``.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)

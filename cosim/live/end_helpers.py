@@ -10,12 +10,14 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from cosim.live.process_pool import at_idle_priority, process_starts, processes
+from cosim.record.run_directory import RunEnding
 from noack.core.process_limits import cores
 from noack.scenario.scenario import Scenario, loop_names
 
@@ -44,7 +46,7 @@ class EndHelpers:
         self.count = cores() - 1 if steps >= _MANY_STEPS else 0
         self._stack, self._threads = ExitStack(), list[Thread]()
         self._pool: ProcessPoolExecutor | None = None
-        self._due: deque[Callable[[], None]] = deque()
+        self._due: deque[Callable[[], object]] = deque()
         """What is still to be prepared."""
         self._found: dict[int, Expectations] = {}
 
@@ -71,10 +73,10 @@ class EndHelpers:
             pass
 
     def _prepare_loops(self, run_dir: Path, block: range) -> None:
-        found = self._idle("expectations_of", run_dir, block)
+        found = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
         self._found |= zip(block, found, strict=True)
 
-    def _idle(self, function: str, *arguments: Any) -> Any:
+    def _idle(self, function: str, *arguments: object) -> object:
         """Let a process call a function of the end of the run at idle priority."""
         return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
 
@@ -91,13 +93,13 @@ class EndHelpers:
         if self._pool is None and self.count:
             self._pool = self._stack.enter_context(processes(self.count))
 
-    def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+    def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
         """Let a process call a function."""
         assert self._pool is not None
         with process_starts():
             return self._pool.submit(function, *arguments)
 
-    def call(self, function: Callable[..., Result], *arguments: Any) -> Result:
+    def call(self, function: Callable[..., Result], *arguments: object) -> Result:
         """Return the result of a function in a process; call it here if the process is killed."""
         try:
             return self.submit(function, *arguments).result()
@@ -151,3 +153,21 @@ class EndHelpers:
         """End the processes."""
         self._due.clear()
         self._stack.close()
+
+
+@contextmanager
+def lasting_helpers(scenario: Scenario) -> Iterator[EndHelpers]:
+    """Have helpers during a run and, unless an error ends it, for its end."""
+    helpers = EndHelpers(scenario)
+    try:
+        yield helpers
+    except BaseException:
+        helpers.close()
+        raise
+
+
+@dataclass(frozen=True)
+class PreparedEnding(RunEnding):
+    """How a run ended whose end was prepared."""
+
+    helpers: EndHelpers | None = None

@@ -4,7 +4,6 @@ import gc
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from cosim.analysis.summary_model import (
     RunSummary,
     read_summary,
 )
-from cosim.live.end_helpers import EndHelpers
+from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.progress import work_bar
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -79,8 +78,9 @@ def finalize(
     """
     run_dir = ending.run_dir
     with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
-        if ending.helpers is not None:
-            stack.enter_context(closing(ending.helpers))
+        prepared = ending.helpers if isinstance(ending, PreparedEnding) else None
+        if prepared is not None:
+            stack.enter_context(closing(prepared))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
@@ -88,7 +88,7 @@ def finalize(
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
         scenario = load(scenario_file, most_bytes=MOST_RECORDED_BYTES)
-        helpers = stack.enter_context(closing(ending.helpers or EndHelpers(scenario)))
+        helpers = stack.enter_context(closing(prepared or EndHelpers(scenario)))
         helpers.start()
         with work_bar("the record of the run") as show:
             each = partial(helpers.each, show=show)
@@ -168,8 +168,8 @@ def _judged(
         return _judged_loops(run, ending, beside, block, helpers.expectations(block))
 
     def there(block: range) -> list[_Judged]:
-        given = replace(ending, helpers=None), block, helpers.expectations(block)
-        return helpers.call(_judged_stored, *given)
+        own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
+        return helpers.call(_judged_stored, own, block, helpers.expectations(block))
 
     with work_bar(f"claims of {loops} loops") as show:
         gc.freeze()  # what is there stays: it need not be searched again and again

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
-from typing import Any
 
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(
@@ -83,7 +82,7 @@ def process_starts() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def at_idle_priority(module: str, function: str, *arguments: Any) -> Any:
+def at_idle_priority(module: str, function: str, *arguments: object) -> object:
     """Import a module and call its function on a core that nothing else needs.
 
     A thread does both: without permission of the system, it could not leave that priority again.

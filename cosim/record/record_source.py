@@ -274,6 +274,10 @@ class NetworkRows:
         """Return the number of rows of a loop in a table."""
         return len(self._places[table][number])
 
+    def of_loop(self, table: str, number: int) -> Iterator[Rows]:
+        """Yield the rows of a loop in order."""
+        return (rows for (rows,) in self.of_loops(table, [number]))
+
     def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
         """Yield the next rows of each of some loops, in order; the table is read once."""
         every = [[places[number] for places in self._places.values()] for number in numbers]
@@ -358,7 +362,7 @@ class LoopTables(RecordSource):
 
     def _read(self, table: str, columns: Sequence[str]) -> Iterator[Rows]:
         if is_of_network(table):
-            yield from (rows for (rows,) in self._network.of_loops(table, [self._number]))
+            yield from self._network.of_loop(table, self._number)
             return
         dtype = with_columns(self.types[table], columns)
         for rows in self._stored.of_loop(table, self._number, dtype):

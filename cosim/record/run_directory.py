@@ -13,7 +13,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +28,6 @@ with lazy_modules():
     from importlib import metadata
 
 if TYPE_CHECKING:
-    from cosim.live.end_helpers import EndHelpers
     from noack.scenario.scenario import Scenario
     from noack.settings.user_files import FileSettings
 
@@ -260,8 +259,6 @@ class RunEnding:
     reason: str
     startup_s: float | None = None
     """Wall time from the launch to simulated time 0; None if unknown."""
-    helpers: "EndHelpers | None" = field(default=None, compare=False)
-    """Processes that prepared the end of the run."""
 
 
 class EndingFile:
