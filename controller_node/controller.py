@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
 from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import core
-from noack.core.core_memory import CoreMemory, Structure, reals_at
+from noack.core.core_library import CData, core
+from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee, LossHistory, LossRule
 from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
@@ -199,7 +199,7 @@ class Controller:
         """The sizes of the rows."""
         return RecordShape(len(self.H), self.inputs)
 
-    def fill(self, controller: Structure, memory: CoreMemory) -> None:
+    def fill(self, controller: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_controller`` at its start."""
         n, m, start, period_ns = len(self.H), self.inputs, self.start, self.period_ns
         self._memory = memory
@@ -228,13 +228,13 @@ class Controller:
         })  # fmt: skip
         self._set_point(controller, self.setpoint)
 
-    def redraw(self, controller: Structure, memory: CoreMemory) -> None:
+    def redraw(self, controller: CData, memory: CoreMemory) -> None:
         """Set what x(0) determines."""
         self._memory = memory
         if self.x0 is not None:
             reals_at(controller.x_c, controller.machine.n)[:] = self.x0
 
-    def answer(self, question: int, controller: Structure) -> Sequence[Notice]:
+    def answer(self, question: int, controller: CData) -> Sequence[Notice]:
         """Apply changes, or call the user's control law."""
         n, t_ns = controller.machine.n, controller.asked_ns
         if question == core.NOACK_ASK_CHANGE:
@@ -260,12 +260,12 @@ class Controller:
             notices += self._losses.add(sequence, newest, losses, t_ns, now_ns)
         return notices
 
-    def note(self, controller: Structure, note: Structure) -> Notice:
+    def note(self, controller: CData, note: CData) -> Notice:
         """Raise ValueError: the core's controller writes no notes."""
         raise ValueError("a controller writes no notes")
 
     def _call(
-        self, controller: Structure, method: Callable[[ControlLaw], Vector | None]
+        self, controller: CData, method: Callable[[ControlLaw], Vector | None]
     ) -> Sequence[Notice]:
         """Call the control law; after its first failure, the input is the safe input."""
         m = controller.machine.m
@@ -280,7 +280,7 @@ class Controller:
         reals_at(controller.u, m)[:] = safe if u is None else u
         return notices
 
-    def _change(self, controller: Structure, since_ns: int, setpoint: Setpoint | None) -> None:
+    def _change(self, controller: CData, since_ns: int, setpoint: Setpoint | None) -> None:
         """Use another set point; x_c follows it from ``since_ns`` on."""
         self.setpoint = setpoint
         point = setpoint and setpoint[0]
@@ -294,7 +294,7 @@ class Controller:
             )
         self._set_point(controller, setpoint)
 
-    def _set_point(self, controller: Structure, setpoint: Setpoint | None) -> None:
+    def _set_point(self, controller: CData, setpoint: Setpoint | None) -> None:
         x_r, u_r = (None, None) if setpoint is None else setpoint
         self._memory.fill(controller, {"has_point": setpoint is not None, "x_r": x_r, "u_r": u_r})
 

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import core
-from noack.core.core_memory import CoreMemory, Structure, reals_at
+from noack.core.core_library import CData, core
+from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.core.random_streams import normals, uniforms
 from noack.disturbances.disturbance_settings import Place, SignalSource
@@ -116,7 +116,7 @@ class Watchdog:
         """Whether actuations carry the controller's model state."""
         return self.policy == "model"
 
-    def fill(self, plant: Structure, memory: CoreMemory, period_ns: int) -> None:
+    def fill(self, plant: CData, memory: CoreMemory, period_ns: int) -> None:
         """Fill the watchdog of a ``noack_plant`` with this step."""
         memory.fill(plant, {
             "watchdog": _POLICIES[self.policy], "timeout_ns": self.timeout_ns,
@@ -132,7 +132,7 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
     return t_ns - newest_ns > timeout_ns
 
 
-def watchdog_notice(watchdog: Watchdog, note: Structure) -> Notice:
+def watchdog_notice(watchdog: Watchdog, note: CData) -> Notice:
     """Return the line for the log of a ``noack_note``."""
     t_ns, since_ns, newest_ns = (int(note[name]) for name in ("t_ns", "since_ns", "newest_ns"))
     if since_ns >= 0:
@@ -194,7 +194,7 @@ class Plant:
             disturbed_input=d > 0, disturbed_state=w > 0,
         )  # fmt: skip
 
-    def fill(self, plant: Structure, memory: CoreMemory) -> None:
+    def fill(self, plant: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_plant`` at time 0."""
         n, m, shape = len(self.system.x), self.inputs, self.shape
         set_machine(
@@ -232,7 +232,7 @@ class Plant:
             signal.width, signal.rows, signal.first = width, BLOCK, -BLOCK
             signal.values = memory.zeros(BLOCK * width)
 
-    def redraw(self, plant: Structure, memory: CoreMemory) -> None:
+    def redraw(self, plant: CData, memory: CoreMemory) -> None:
         """Set the state, and the matrices of a linear system."""
         n, system = plant.machine.n, self.system
         reals_at(plant.x, n)[:], reals_at(plant.z, plant.internal)[:] = system.x, system.z
@@ -240,7 +240,7 @@ class Plant:
             Ad, Bd = discretise(system.A, system.B, self.period_ns)
             reals_at(plant.Ad, n, n)[:], reals_at(plant.Bd, n, plant.sources)[:] = Ad, Bd
 
-    def answer(self, question: int, plant: Structure) -> Sequence[Notice]:
+    def answer(self, question: int, plant: CData) -> Sequence[Notice]:
         """Compute the disturbances and the noise of the next steps, or advance the system."""
         if question == core.NOACK_ASK_SIGNALS:
             self._set_signals(plant)
@@ -264,11 +264,11 @@ class Plant:
         """Received actuations need no line in the log."""
         return ()
 
-    def note(self, plant: Structure, note: Structure) -> Notice:
+    def note(self, plant: CData, note: CData) -> Notice:
         """Return the line about actuations that are missing, or arrive again."""
         return watchdog_notice(self.watchdog, note)
 
-    def _set_signals(self, plant: Structure) -> None:
+    def _set_signals(self, plant: CData) -> None:
         step = plant.machine.step
         first = step - step % BLOCK
         if self.disturbance is not None:

@@ -22,8 +22,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, Structure, reals_at
+from noack.core.core_library import CData, core, ffi
+from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.machines.loop_machines import LoopMachines, Role, alike_parts, set_machine, take_changes
 from noack.observers.observer_settings import EstimationModel, ObserverSettings
@@ -75,7 +75,7 @@ class Observer:
         """Number of measured outputs."""
         return len(self.model.C)
 
-    def fill(self, sensor: Structure, memory: CoreMemory) -> None:
+    def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill the ``noack_observer`` of a sensor."""
         self.settings.fill(sensor.observer, self.model, self.x, memory)
         sensor.observer.t_ns = 0 if self.knows_start else -1
@@ -146,7 +146,7 @@ class Sensor:
             outputs=observed[0], inputs_reported=observed[1],
         )  # fmt: skip
 
-    def fill(self, sensor: Structure, memory: CoreMemory) -> None:
+    def fill(self, sensor: CData, memory: CoreMemory) -> None:
         """Fill a ``noack_sensor`` at its start."""
         n, own, steps_ns = len(self.H), self.observer, (self.period_ns or 0,)
         self._memory = memory
@@ -173,7 +173,7 @@ class Sensor:
         if self.x0 is not None:
             self._start(sensor, 0, self.x0)
 
-    def redraw(self, sensor: Structure, memory: CoreMemory) -> None:
+    def redraw(self, sensor: CData, memory: CoreMemory) -> None:
         """Set what x(0) determines."""
         self._memory = memory
         if self.observer is not None:
@@ -182,7 +182,7 @@ class Sensor:
             reals_at(sensor.x_s, sensor.machine.n)[:] = self.x0
             self._start(sensor, 0, self.x0)
 
-    def answer(self, question: int, sensor: Structure) -> Sequence[Notice]:
+    def answer(self, question: int, sensor: CData) -> Sequence[Notice]:
         """Apply changes, let the user's trigger decide, or make room for sent updates."""
         if question == core.NOACK_ASK_CHANGE:
             for due in take_changes(self.schedule, sensor.machine):
@@ -207,11 +207,11 @@ class Sensor:
             return ()
         return self.observer.first_notice(int(rows["t_ns"][0]))
 
-    def note(self, sensor: Structure, note: Structure) -> Notice:
+    def note(self, sensor: CData, note: CData) -> Notice:
         """Raise ValueError: the core's sensor writes no notes."""
         raise ValueError("a sensor writes no notes")
 
-    def _decide(self, sensor: Structure) -> None:
+    def _decide(self, sensor: CData) -> None:
         """Ask the user's trigger about a measurement."""
         trigger, n = self._trigger, sensor.machine.n
         assert trigger is not None
@@ -225,7 +225,7 @@ class Sensor:
         sensor.event, sensor.left, sensor.right = decision
         sensor.machine.answered = 1
 
-    def _start(self, sensor: Structure, t_ns: int, x: Vector) -> None:
+    def _start(self, sensor: CData, t_ns: int, x: Vector) -> None:
         """Restart the trigger's condition at an event at x, (n,)."""
         if self._trigger is not None:
             self._trigger.start(t_ns, x)
@@ -237,7 +237,7 @@ class Sensor:
             sensor.scratch,
         )  # fmt: skip
 
-    def _set_policy(self, sensor: Structure, policy: Policy) -> None:
+    def _set_policy(self, sensor: CData, policy: Policy) -> None:
         """Set a policy as if it had been set at the last event."""
         n, memory = sensor.machine.n, self._memory
         if isinstance(policy, CodedPolicy):
@@ -252,7 +252,7 @@ class Sensor:
                 sensor.trigger.event_ns, sensor.event_x, sensor.scratch,
             )  # fmt: skip
 
-    def _set_point(self, sensor: Structure, since_ns: int, setpoint: Vector | None) -> None:
+    def _set_point(self, sensor: CData, since_ns: int, setpoint: Vector | None) -> None:
         """Move x_r from ``since_ns`` on."""
         if not np.array_equal(_or_zero(self._points[-1]), _or_zero(setpoint)):
             self._points.append(setpoint)
@@ -261,7 +261,7 @@ class Sensor:
                 sensor.model, sensor.model.transitions, self._since_ns, self._points
             )
 
-    def _make_room(self, sensor: Structure, places: int) -> None:
+    def _make_room(self, sensor: CData, places: int) -> None:
         """Provide room for updates that wait for their acknowledgement."""
         n, count = sensor.machine.n, sensor.sent_count
         sent = self._memory.integers(np.zeros(places, np.int64))

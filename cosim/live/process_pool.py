@@ -73,13 +73,13 @@ def process_starts() -> Iterator[None]:
     have an ``if __name__ == "__main__"``.
     """
     with _STARTS:
-        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             yield
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
             sys.modules["__main__"] = main
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def at_idle_priority(module: str, function: str, *arguments: object) -> object:

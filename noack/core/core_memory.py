@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from noack.core.core_library import Array, CData, core, ffi, pointer_to
 from noack.core.linear_systems import SCRATCH_MATRICES, Matrix, Vector
 
-Structure = Any
-"""A structure of the core, or a pointer to one, as cffi returns it."""
 _MOST_PLACES, _MOST_NUMBERS = 1024, 2**20
 
 

@@ -11,8 +11,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from noack.core.core_library import core, ffi
-from noack.core.core_memory import CoreMemory, Structure, reals_at
+from noack.core.core_library import CData, core, ffi
+from noack.core.core_memory import CoreMemory, reals_at
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import EstimationModel, NoiseVariances, ObserverSettings
 from noack.settings.section import Deviations, Rows, require_length, require_shape
@@ -116,7 +116,7 @@ class KalmanSettings(ObserverSettings):
                 core.noack_observer_predict(observer, n, m, nothing)
 
     def fill(
-        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
     ) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {

@@ -11,8 +11,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import FiniteFloat, model_validator
 
-from noack.core.core_library import core
-from noack.core.core_memory import CoreMemory, Structure
+from noack.core.core_library import CData, core
+from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.observers.observer_settings import (
@@ -92,7 +92,7 @@ class LuenbergerSettings(ObserverSettings):
         return repeat(np.array(self.gain))
 
     def fill(
-        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
     ) -> None:
         super().fill(observer, assumed, x, memory)
         memory.fill(observer, {"kind": core.NOACK_LUENBERGER, "gain": np.array(self.gain)})

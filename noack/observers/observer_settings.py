@@ -11,7 +11,8 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from noack.core.core_memory import CoreMemory, Structure
+from noack.core.core_library import CData
+from noack.core.core_memory import CoreMemory
 from noack.core.linear_systems import Matrix, Vector
 from noack.settings.section import Row, ScenarioSection, Table, require_length
 
@@ -97,7 +98,7 @@ class ObserverSettings(ScenarioSection):
         """Yield L of every measurement, (n, p), without end."""
 
     def fill(
-        self, observer: Structure, assumed: EstimationModel, x: Vector, memory: CoreMemory
+        self, observer: CData, assumed: EstimationModel, x: Vector, memory: CoreMemory
     ) -> None:
         """Fill all of a ``noack_observer`` but its kind, with x̂ before the first measurement."""
         (n, n), p = assumed.Ad.shape, len(assumed.C)

@@ -21,7 +21,8 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.core.core_memory import CoreMemory, Structure
+from noack.core.core_library import CData
+from noack.core.core_memory import CoreMemory
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 
@@ -208,7 +209,7 @@ _NEVER_NS = 2**60
 """The core's longest time; no run is as long."""
 
 
-def fill_rule(structure: Structure, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
+def fill_rule(structure: CData, rule: TriggerRule, n: int, memory: CoreMemory) -> None:
     """Fill a ``noack_trigger_rule`` for n states; its matrices live in ``memory``.
 
     Raises:

@@ -314,3 +314,20 @@ def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: 
     assert path.read_text() == "as it was"
     assert CliRunner().invoke(app, ["report", str(dead_run), "--again"]).exit_code == 0
     assert Page(path.read_text(encoding="utf-8")).text == parsed.text
+
+
+def test_the_command_reports_what_is_wrong(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert ran.exit_code == 2
+    assert ran.stderr == f"noack: {tmp_path}: not a run directory (no scenario.toml)\n"
+
+
+@pytest.mark.parametrize(
+    ("exit_", "message"),
+    [
+        ({"status": 0, "reason": "horizon"}, "completed 1 s"),
+        ({"status": 1, "reason": "plant died"}, "failed after 1 s of 1 s: plant died"),
+    ],
+)
+def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], message: str) -> None:
+    assert message in shown(record, exit=exit_).partition("Key numbers")[0]

@@ -205,3 +205,17 @@ def test_the_documented_command_works(tmp_path: Path) -> None:
         "40002\t1\t1000000000\t-4,0.5",
         "40002\t4\t4000000000\t-1,0.5",
     ]
+
+
+def test_packets_can_be_filtered_by_field(tshark: Tshark, tmp_path: Path) -> None:
+    payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0]) for i in range(12)]
+    path = capture_of(tmp_path, *payloads)
+
+    def found(condition: str) -> list[int]:
+        columns = ("-Y", condition, "-T", "fields", "-e", "noack.sequence")
+        return [int(n) for n in tshark(path, "-X", f"lua_script:{SCRIPT}", *columns).split()]
+
+    assert found("noack.flow == 2") == [1, 4, 7, 10]
+    assert found('noack.flow == "update" and noack.sequence > 4') == [7, 10]
+    times = "noack.t_ns >= 3000000000 and noack.t_ns < 5000000000"
+    assert found(f"noack.run_id == {RUN:#x} and ({times} or noack.vector < -3.5)") == [0, 1, 3, 4]

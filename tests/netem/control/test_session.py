@@ -1,4 +1,5 @@
 import stat
+from pathlib import Path
 
 import pytest
 
@@ -41,3 +42,20 @@ def test_an_unknown_name_gets_the_running_names() -> None:
             find(None)
         with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
             find("lba")
+
+
+def test_a_folder_open_to_others_is_refused() -> None:
+    with published(LAB) as path:
+        pass
+    path.parent.chmod(0o755)
+    for use in (running, lambda: published(LAB).__enter__()):
+        with pytest.raises(CallerError, match="closed to others"):
+            use()
+
+
+def test_a_file_replaced_by_another_emulator_is_not_removed(runtime_dir: Path) -> None:
+    with published(LAB) as path:
+        other = path.with_name("other")
+        other.write_text("mine")
+        other.replace(path)
+    assert path.read_text() == "mine"

@@ -198,3 +198,11 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
     with pytest.raises(CallerError, match=r"pip install 'noack\[mcap\]'"):
         run.export(tmp_path / "run.mcap")
+
+
+def test_a_mat_file_has_the_certificates(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1}))
+    found = loadmat(run.export(tmp_path / "run.mat")[0], simplify_cells=True)["certificates"]
+    document = noack.certify(run.scenario).to_json()
+    for one, other in zip(found["certificates"], document["certificates"], strict=True):
+        assert one["constants"]["state"] == other["constants"]["state"]

@@ -25,6 +25,7 @@ from cosim.output.viewer.live_viewer import (
     RECORDING,
     LiveView,
     RecordingServer,
+    has_display,
     view_recording,
 )
 from cosim.output.viewer.pictures.picture import TIMELINE, Frames
@@ -38,6 +39,8 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.output.test_approved import compare
 from tests.integration.conftest import wait_for
+
+ROOT = Path(__file__).parents[4]
 
 Floats = NDArray[np.float64]
 
@@ -549,3 +552,56 @@ def test_a_picture_has_a_maximum_frame_rate_across_batches(tmp_path: Path) -> No
     assert (np.diff(places[:, 1]) < 0).all()
     shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
     assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
+
+
+def test_a_dead_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
+    path = tmp_path / "recording.rrd"
+    view = new_view(path, live=live)
+    assert live.pid is not None
+    os.killpg(live.pid, signal.SIGKILL)
+    add_samples(view, 5)
+    view.close()
+    live.close()
+    assert rows_of(path) == 5 * K
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="there is always a display")
+@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY", None])
+def test_a_display_is_detected_from_the_environment(
+    monkeypatch: pytest.MonkeyPatch, variable: str | None
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if variable is not None:
+        monkeypatch.setenv(variable, ":0")
+    assert has_display() is (variable is not None)
+
+
+def test_a_browser_is_served_with_a_display_if_no_window_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On loopback only."""
+    pretend_window(tmp_path, monkeypatch, opens=True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    with subprocess.Popen(
+        [sys.executable, "-m", "cosim.cli", "view", str(path), "--web"],
+        stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+    ) as child:  # fmt: skip
+        try:
+            assert child.stdout is not None
+            page = next(word for word in child.stdout.readline().split() if "http" in word)
+            assert get(page + RECORDING) == (200, path.read_bytes())
+            processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
+            listening = [
+                address.laddr.ip
+                for process in processes
+                for address in process.net_connections("inet")
+                if address.status == psutil.CONN_LISTEN
+            ]
+            assert len(listening) == 2  # the page with the recording, and rerun's own files
+            assert set(listening) == {"127.0.0.1"}
+        finally:
+            child.send_signal(signal.SIGTERM)
+            assert child.wait() == ExitStatus.TERMINATED
