@@ -5,7 +5,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsFloat, TypedDict
@@ -56,7 +56,7 @@ from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of
 from noack.scenario.runtime_parameters import text_of
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.assumptions import assumptions
+from noack.theory.certificates.assumptions import Assumption, assumptions
 from plant_server.plant import system_of
 
 
@@ -91,10 +91,17 @@ def outcome_of_loop(outcome: Outcome, loop: str | None) -> Outcome:
 
 
 @np.errstate(all="ignore")  # a diverging run overflows and has a summary all the same
-def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 0) -> LoopSummary:
+def summarise(
+    record: RunRecord,
+    exit_status: int,
+    reason: str,
+    phase_ns: int = 0,
+    assumed: Sequence[Assumption] = (),
+) -> LoopSummary:
     """Return the summary of a loop, without the results of replay, fidelity and claims.
 
-    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless.
+    ``exit_status`` and ``reason`` are those of the run; the loop may have failed nevertheless. The
+    assumptions of its scenario may be known: ``assumed``.
     """
     scenario, live = record.scenario, record.kind == "live"
     missing, lost, diverged = missing_rows(record), unintended_losses(record), _divergence(record)
@@ -113,7 +120,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str, phase_ns: int = 
         actuations=from_controller(record, Flow.ACTUATION),
         **signals.for_summary(),
         assumption_violations=reported_violations(record),
-        assumptions=[AssumptionPart(**one._asdict()) for one in assumptions(scenario)],
+        assumptions=[AssumptionPart(**one._asdict()) for one in assumed or assumptions(scenario)],
         restarts=_restarts(record),
         changes=change_parts(record),
         missing_samples=sum(missing.values()),

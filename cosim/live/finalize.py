@@ -2,11 +2,8 @@
 
 import gc
 import sys
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +27,7 @@ from cosim.analysis.summary_model import (
     SchedulePart,
     read_summary,
 )
-from cosim.live.process_pool import process_starts, processes
+from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.progress import work_bar
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -52,17 +49,17 @@ from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
+from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 from noack.theory.bounds.terms import NetworkConditions
+from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 
 _FEW_LOOPS = 4
 """The reports of up to so many loops are written at the end of the run."""
 _LOOPS_AT_ONCE, _LEAST_LOOPS, _ROWS_AT_ONCE = 64, 8, 2**18
 """Loops that are judged together, and rows of one of their tables."""
-_MANY_STEPS = 50_000
-"""Loops with fewer steps of the plant, all together, are judged in less time than processes
-start."""
 
 
 @np.errstate(all="ignore")
@@ -82,23 +79,33 @@ def finalize(
         MachineError: record or summary cannot be written.
     """
     run_dir = ending.run_dir
-    with _with_reason(ending), finished_run(run_dir):
+    with _with_reason(ending), finished_run(run_dir), ExitStack() as stack:
+        prepared = ending.helpers if isinstance(ending, PreparedEnding) else None
+        if prepared is not None:
+            stack.enter_context(closing(prepared))
         if not (scenario_file := run_dir / SCENARIO_FILE).exists():
             raise MachineError(f"{scenario_file}: no such file")  # the run directory was replaced
         unfinished = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
         # A recorder that completed its recording writes the reports afterwards.
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
+        scenario = load(scenario_file, most_bytes=MOST_RECORDED_BYTES)
+        helpers = stack.enter_context(closing(prepared or EndHelpers(scenario)))
+        helpers.start()
         with work_bar("the record of the run") as show:
-            run = finish_record(run_dir, show) if unfinished else load_run(run_dir)
-        summary, over_time = _judged(run, ending)
+            each = partial(helpers.each, show=show)
+            run = finish_record(run_dir, each) if unfinished else load_run(run_dir)
+        summary, over_time = _judged(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
         if view and (again or not is_shown):
             # That of an earlier attempt may be complete: it stays if there is no space for another.
             quiet = (MachineError,) if is_shown else ()
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
-                _write_recording(run, summary, run_dir, None, over_time)
+                if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
+                    helpers.call(_record_stored, run_dir, summary, over_time)
+                else:
+                    _write_recording(run, summary, run_dir, None, over_time)
         if report:
             names = run.names if 1 < len(run.names) <= _FEW_LOOPS else []
             for name in (*names, None):
@@ -136,6 +143,14 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         raise MachineError(f"{error}; try `noack summary {run_dir}` later") from None
 
 
+class Expectations(NamedTuple):
+    """What follows from the scenario of a loop alone."""
+
+    assumptions: Sequence[Assumption]
+    certificates: Sequence[ScenarioCertificate] | None
+    """None if they cannot be computed, which the claims then report."""
+
+
 class _Judged(NamedTuple):
     """What the end of a run finds out about a loop."""
 
@@ -145,37 +160,28 @@ class _Judged(NamedTuple):
 
 
 def _judged(
-    run: RecordedRun, ending: RunEnding
+    run: RecordedRun, ending: RunEnding, helpers: EndHelpers
 ) -> tuple[RunSummary, Sequence[LoopOverTime] | None]:
     """Judge every loop and the network; return the summary of the run, and how each loop went."""
     loops, replayed = len(run.loops), None
-    blocks = deque(_blocks(run))
-    found: dict[range, list[_Judged]] = {}
-    with _helpers(run) as pool, work_bar(f"claims of {loops} loops") as show:
+    beside = ReplayBeside(helpers, ending.run_dir) if helpers.count and loops == 1 else None
 
-        def judge_next(judge: Callable[[range], list[_Judged]]) -> None:
-            """Judge blocks of loops until none is left."""
-            with suppress(IndexError):
-                while True:
-                    block = blocks.popleft()
-                    found[block] = judge(block)
-                    show(sum(map(len, found)) / loops)
+    def here(block: range) -> list[_Judged]:
+        return _judged_loops(run, ending, beside, block, helpers.expectations(block))
 
-        beside = None if pool is None or loops > 1 else ReplayBeside(pool, ending.run_dir)
-        others = [] if pool is None or loops == 1 else [partial(_judged_by, pool, ending)]
-        others *= cores() - 1
+    def there(block: range) -> list[_Judged]:
+        own = RunEnding(ending.run_dir, ending.run_id, ending.status, ending.reason)
+        return helpers.call(_judged_stored, own, block, helpers.expectations(block))
+
+    with work_bar(f"claims of {loops} loops") as show:
         gc.freeze()  # what is there stays: it need not be searched again and again
-        with ThreadPoolExecutor(max(len(others), 1)) as threads:
-            waiting = [threads.submit(judge_next, judge) for judge in others]
-            try:
+        try:
+            with helpers.shared(_blocks(run), there, show) as judge:
                 if run.kind == "live" and loops > 1:
                     replayed = _replay(run.network)
-                judge_next(partial(_judged_loops, run, ending, beside))
-            finally:
-                blocks.clear()  # an interrupted run waits for one block at most
-                gc.unfreeze()
-        for helper in waiting:
-            helper.result()
+                found = judge(here)
+        finally:
+            gc.unfreeze()
     judged = [loop for block in sorted(found, key=min) for loop in found[block]]
     summary = _summary(run, ending, [loop.summary for loop in judged])
     if replayed is not None:
@@ -209,26 +215,6 @@ def _blocks(run: RecordedRun) -> Iterator[range]:
         first += width
 
 
-@contextmanager
-def _helpers(run: RecordedRun) -> Iterator[ProcessPoolExecutor | None]:
-    """Start processes that help with the end of a long run, on all cores but this process's."""
-    if cores() < 2 or len(run.loops) * _steps(run) < _MANY_STEPS:
-        yield None
-        return
-    with processes(cores() - 1) as pool:
-        yield pool
-
-
-def _judged_by(pool: ProcessPoolExecutor, ending: RunEnding, block: range) -> list[_Judged]:
-    """Let a process of a pool judge loops; do it here if the process is killed."""
-    try:
-        with process_starts():
-            judged = pool.submit(_judged_stored, ending, block)
-        return judged.result()
-    except BrokenProcessPool:
-        return _judged_stored(ending, block)
-
-
 @cache
 def _stored_run(run_dir: Path) -> RecordedRun:
     """Return the run of a helper, whose objects then live as long as the process."""
@@ -238,42 +224,63 @@ def _stored_run(run_dir: Path) -> RecordedRun:
 
 
 @np.errstate(all="ignore")
-def _judged_stored(ending: RunEnding, block: range) -> list[_Judged]:
-    return _judged_loops(_stored_run(ending.run_dir), ending, None, block)
+def _judged_stored(
+    ending: RunEnding, block: range, known: Sequence[Expectations] | None
+) -> list[_Judged]:
+    return _judged_loops(_stored_run(ending.run_dir), ending, None, block, known)
+
+
+def _record_stored(
+    run_dir: Path, summary: RunSummary, over_time: Sequence[LoopOverTime] | None
+) -> None:
+    _write_recording(_stored_run(run_dir), summary, run_dir, None, over_time)
 
 
 def _judged_loops(
-    run: RecordedRun, ending: RunEnding, beside: "ReplayBeside | None", block: range
+    run: RecordedRun,
+    ending: RunEnding,
+    beside: "ReplayBeside | None",
+    block: range,
+    known: Sequence[Expectations] | None,
 ) -> list[_Judged]:
-    """Judge some loops; ``beside`` replays the only one."""
+    """Judge some loops, of which expectations may be known; ``beside`` replays the only one."""
     records = run.together(block)
-    certificates = _certificates([record.scenario for record in records])
+    expected = known or _expectations([one.scenario for one in records])
     shared = SharedMachines(records if len(block) > 1 else ())
     judged = []
-    for record, own in zip(records, certificates, strict=True):
+    for record, own in zip(records, expected, strict=True):
         phase_ns = run.phases_ns[record.number]
-        summary = summarise(record, int(ending.status), ending.reason, phase_ns)
+        status, reason = int(ending.status), ending.reason
+        summary = summarise(record, status, reason, phase_ns, own.assumptions)
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, record, summary, own, shared, beside))
+        judged.append(_with_results(run, record, summary, own.certificates, shared, beside))
     return judged
 
 
-def _certificates(scenarios: Sequence[Scenario]) -> Sequence[list[ScenarioCertificate] | None]:
-    """Return the certificates of loops; None if they fail, which the claims then report."""
-    try:
-        return certificates_together(scenarios)
-    except Exception:
-        return [None] * len(scenarios)
+def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
+    """Return what to expect of some loops of a run that may still go on."""
+    return _expectations(_stored_loops(run_dir)[block.start : block.stop])
+
+
+@cache
+def _stored_loops(run_dir: Path) -> Sequence[Scenario]:
+    return resolved_loops(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+
+
+def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
+    certificates: Sequence[Sequence[ScenarioCertificate] | None] = [None] * len(scenarios)
+    with suppress(Exception):
+        certificates = certificates_together(scenarios)
+    return [*map(Expectations, map(assumptions, scenarios), certificates)]
 
 
 class ReplayBeside:
     """The replay of the only loop of a run by another process."""
 
-    def __init__(self, pool: ProcessPoolExecutor, run_dir: Path) -> None:
-        with process_starts():
-            self._verdict = pool.submit(stored_verdict, run_dir)
+    def __init__(self, helpers: EndHelpers, run_dir: Path) -> None:
+        self._verdict = helpers.submit(stored_verdict, run_dir)
 
     def part(self) -> ReplayPart | None:
         """Wait for the result; None if the process could not replay the run."""
@@ -413,6 +420,12 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name
     _write_recording(run, outcome.summary, run_dir, loop)
+
+
+def import_libraries() -> None:
+    """Import what writing record and recording needs."""
+    import cosim.output.viewer.run_recording  # imports rerun
+    import cosim.record.table_files  # noqa: F401  # imports pyarrow
 
 
 def _write_recording(

@@ -19,13 +19,13 @@ from queue import SimpleQueue
 from cosim.lazy_modules import lazy_modules
 from cosim.live.child_processes import ChildProcesses, Failure, RemoteStart, RestartPolicy
 from cosim.live.coordinator import Coordinator
+from cosim.live.end_helpers import PreparedEnding, lasting_helpers
 from cosim.live.fork_server import ForkServer, fork_server
 from cosim.live.run_watcher import Watcher, joint_watcher
 from cosim.record.run_directory import (
     LEAST_FREE_BYTES,
     PROCESSES_FILE,
     EndingFile,
-    RunEnding,
     active_run,
     new_run_dir,
     point_to_latest,
@@ -77,7 +77,7 @@ def launch(
     watcher: Watcher | None = None,
     server: ForkServer | None = None,
     listening: "remote_access.Listening | None" = None,
-) -> RunEnding:
+) -> PreparedEnding:
     """Run a scenario; :func:`cosim.live.finalize.finalize` completes its record.
 
     Args:
@@ -95,8 +95,7 @@ def launch(
         NeverStartedError: the run ended before all processes were ready.
     """
     began_ns = time.monotonic_ns()
-    if listening is not None:
-        scenario = remote_access.with_clocks(scenario)
+    scenario = scenario if listening is None else remote_access.with_clocks(scenario)
     with contextlib.ExitStack() as stack:
         server = server or stack.enter_context(fork_server())
         resolved = _prepare(scenario, runs, spawn)
@@ -110,7 +109,8 @@ def launch(
         away = {} if listening is None else listening.hosts
         coordinator = Coordinator(ticket, [role for role in spawn if role not in away])
         stack.callback(coordinator.close)
-        watcher = joint_watcher([] if watcher is None else [watcher])
+        helpers = stack.enter_context(lasting_helpers(resolved))
+        watcher = joint_watcher([watcher or Watcher(), Watcher(started=helpers.prepare)])
         with _no_directory_if_refused(run_dir):
             opened = _open_to_others(stack, ticket, session, listening, coordinator)
         remote = None
@@ -126,7 +126,7 @@ def launch(
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
+    return PreparedEnding(run_dir, ticket.run_id, status, reason, startup_s, helpers)
 
 
 def _prepare(scenario: Scenario, runs: Path, spawn: Sequence[str]) -> Scenario:

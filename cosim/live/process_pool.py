@@ -6,8 +6,9 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
 
@@ -79,3 +80,17 @@ def process_starts() -> Iterator[None]:
         finally:
             sys.modules["__main__"] = main
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def at_idle_priority(module: str, function: str, *arguments: object) -> object:
+    """Import a module and call its function on a core that nothing else needs.
+
+    A thread does both: without permission of the system, it could not leave that priority again.
+    """
+    with ThreadPoolExecutor(1, initializer=_be_idle) as thread:
+        return thread.submit(lambda: getattr(import_module(module), function)(*arguments)).result()
+
+
+def _be_idle() -> None:
+    if sys.platform == "linux":
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

@@ -293,14 +293,25 @@ class NetworkRows:
 
     def of_loop(self, table: str, number: int) -> Iterator[Rows]:
         """Yield the rows of a loop in order."""
-        places, first = self._places[table][number], 0
-        own = (self._inputs[one][self._places[one][number]] for one in self._inputs)
-        mine = np.sort(np.concatenate([*own]))
+        return (rows for (rows,) in self.of_loops(table, [number]))
+
+    def of_loops(self, table: str, numbers: Sequence[int]) -> Iterator[list[Rows]]:
+        """Yield the next rows of each of some loops, in order; the table is read once."""
+        every = [[places[number] for places in self._places.values()] for number in numbers]
+        mine = [
+            np.sort(np.concatenate([*map(np.take, self._inputs.values(), places)]))
+            for places in every
+        ]
+        first = 0
         for rows in self._source.batches(table):
-            begin, end = np.searchsorted(places, (first, first + len(rows)))
-            chosen = rows.take(places[begin:end] - first)
-            chosen["input"] -= self._numbered_before(chosen["input"], mine)
-            yield _of_loop(chosen, number, self._phases_ns)
+            found = []
+            for number, inputs in zip(numbers, mine, strict=True):
+                places = self._places[table][number]
+                begin, end = np.searchsorted(places, (first, first + len(rows)))
+                chosen = rows.take(places[begin:end] - first)
+                chosen["input"] -= self._numbered_before(chosen["input"], inputs)
+                found.append(_of_loop(chosen, number, self._phases_ns))
+            yield found
             first += len(rows)
 
     def _numbered_before(

@@ -6,6 +6,7 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, overload
@@ -365,6 +366,10 @@ class StoredLoops(Sequence[RunRecord]):
             loops = [record.number for record in having]
             for place, rows in self._stored.of_loops(table, loops, types):
                 having[place].source.keep(table, rows)
+        for table, dtype in network_tables().items():
+            parts = zip(*self._shared.of_loops(table, numbers), strict=True)
+            for record, own in zip(records, parts, strict=False):  # none if there are no rows
+                record.source.keep(table, joined(own, dtype))
         return records
 
     def _record_of(self, number: int) -> RunRecord:
@@ -442,6 +447,7 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     Raises:
         OSError, NoackError: they cannot be written.
     """
+
     types = run_tables(run.scenario)
 
     def rows(table: str) -> Iterator[Rows]:
@@ -465,8 +471,16 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     notices = sorted([*common, *of_loops], key=lambda notice: int(notice["t_ns"]))
     reports = joint_reports(run.network.reports, [record.reports for record in run.loops])
     write_whole(run_dir / REPORTS_FILE, json.dumps(reports, indent=2), make_folder=False)
-    tables = ((table, rows(table)) for table in types)
-    write_tables(run_dir / RECORD, tables, types, vector_names(run.scenario), notices)
+    folder, names = run_dir / RECORD, vector_names(run.scenario)
+    with record_folder(folder, notices), ThreadPoolExecutor(cores()) as threads:
+        written = [
+            threads.submit(
+                table_files.write_table, folder / f"{table}.parquet", rows(table), dtype, names
+            )
+            for table, dtype in types.items()
+        ]
+        for one in written:
+            one.result()
 
 
 def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
@@ -479,26 +493,13 @@ def vector_names(scenario: Scenario) -> dict[str, Sequence[str]]:
     return {"state_names": states, "input_names": inputs}
 
 
-def write_tables(
-    folder: Path,
-    tables: Iterable[tuple[str, Iterable[Rows]]],
-    types: Mapping[str, np.dtype[np.void]],
-    names: Mapping[str, Sequence[str]],
-    notices: Iterable[Notice],
-) -> None:
-    """Write tables, with the names of states and inputs, and the run's log."""
+@contextmanager
+def record_folder(folder: Path, notices: Iterable[Notice]) -> Iterator[None]:
+    """Have a folder for the tables that are written within the context, and for the run's log."""
     folder.mkdir(exist_ok=True)
     for scratch in folder.glob(f".*{PARTIAL}"):  # of a process that was killed
         scratch.unlink(missing_ok=True)
-    with ThreadPoolExecutor(cores()) as threads:  # most of the work is done without the lock
-        written = [
-            threads.submit(
-                table_files.write_table, folder / f"{table}.parquet", batches, types[table], names
-            )
-            for table, batches in tables
-        ]
-    for one in written:
-        one.result()
+    yield
     with new_file(folder / _NOTICES_FILE, make_folder=False) as file:
         file.writelines(f"{json.dumps(notice)}\n".encode() for notice in notices)
 

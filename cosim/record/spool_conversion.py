@@ -7,7 +7,7 @@ merged in bounded memory; of several loops, as many are sorted at once as fit in
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -22,8 +22,8 @@ from cosim.record.run_record import (
     RecordedRun,
     load_run,
     read_notices,
+    record_folder,
     vector_names,
-    write_tables,
 )
 from noack.core.errors import MachineError, PeerError, why
 from noack.core.file_access import remove_folder
@@ -120,35 +120,54 @@ _BLOCK_BYTES = 32 * 1024 * 1024
 """Rows of several loops that are sorted at once."""
 
 
-def finish_record(run_dir: Path, show: Callable[[float], None] = lambda share: None) -> RecordedRun:
+Each = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
+
+
+def finish_record(run_dir: Path, each: Each = map) -> RecordedRun:
     """Convert a run's spool to its record, and remove the spool.
 
-    All spools are merged, without duplicate rows. An interrupted attempt can be repeated. ``show``
-    is called with the completed share.
+    All spools are merged, without duplicate rows. An interrupted attempt can be repeated.
+    ``each(function, tables)`` calls a function for each table, the largest first; several
+    processes may do so at once.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     add_kept_reports(run_dir)
-    _convert(run_dir, show)
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    tables = sorted(run_tables(scenario), key=partial(_bytes_of, run_dir), reverse=True)
+    notices = _notices(run_dir / RECORD, run_dir / SPOOL, len(loop_names(scenario)))
+    try:
+        with record_folder(run_dir / RECORD, notices):
+            [*each(partial(convert_table, run_dir), tables)]
+    except OSError as error:
+        raise _kept(run_dir, error) from None
     remove_spool(run_dir)
     return load_run(run_dir)
 
 
-def _convert(run_dir: Path, show: Callable[[float], None]) -> None:
+def convert_table(run_dir: Path, table: str) -> None:
+    """Write the record of a table from an earlier record and from the spool.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    from cosim.record.table_files import write_table  # imports pyarrow
+
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    types, loops = run_tables(scenario), len(loop_names(scenario))
+    dtype = run_tables(scenario)[table]
+    rows = _by_loop(run_dir, table, dtype, len(loop_names(scenario)))
+    write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
 
-    def tables() -> Iterator[tuple[str, Iterator[Rows]]]:
-        for place, (table, dtype) in enumerate(types.items()):
-            show(place / len(types))
-            yield table, _by_loop(run_dir, table, dtype, loops)
 
-    notices = _notices(run_dir / RECORD, run_dir / SPOOL, loops)
-    try:
-        write_tables(run_dir / RECORD, tables(), types, vector_names(scenario), notices)
-    except OSError as error:
-        raise _kept(run_dir, error) from None
+def _bytes_of(run_dir: Path, table: str) -> int:
+    """Return the size of the files with the rows of a table."""
+    return sum(path.stat().st_size for path in _files_of(run_dir, table))
+
+
+def _files_of(run_dir: Path, table: str) -> list[Path]:
+    path = run_dir / RECORD / f"{table}.parquet"
+    return [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
 
 
 def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) -> Iterator[Rows]:
@@ -163,9 +182,7 @@ def _by_loop(run_dir: Path, table: str, dtype: np.dtype[np.void], loops: int) ->
     if not has_loop(table):
         yield from merged(segments, dtype)
         return
-    paths = [*spool_files(run_dir / SPOOL, table), *([path] if path.is_file() else [])]
-    all_bytes = sum(one.stat().st_size for one in paths)
-    at_once = max(loops * _BLOCK_BYTES // max(all_bytes, _BLOCK_BYTES), 1)
+    at_once = max(loops * _BLOCK_BYTES // max(_bytes_of(run_dir, table), _BLOCK_BYTES), 1)
     for first in range(0, loops, at_once):
         block = range(first, min(first + at_once, loops))
         if len(block) > 1:

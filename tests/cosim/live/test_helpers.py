@@ -1,15 +1,25 @@
 """Processes that help with the end of a long run: the results are those without them."""
 
 import json
+import os
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
 
 from cosim.analysis.replay import replay
-from cosim.live import finalize
+from cosim.live import end_helpers, finalize
+from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.finalize import ReplayBeside
-from cosim.record.run_directory import SUMMARY_FILE, RunEnding, write_environment, write_scenario
+from cosim.live.simulated_run import simulate_run
+from cosim.record.run_directory import (
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    RunEnding,
+    write_environment,
+    write_scenario,
+)
 from cosim.record.run_record import load_record, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
@@ -28,9 +38,40 @@ def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_scenario(record.scenario, tmp_path)
     write_environment(tmp_path, "live")
     write_run(alone(record), tmp_path)
-    monkeypatch.setattr(finalize, "_MANY_STEPS", 10)
-    monkeypatch.setattr(finalize, "cores", lambda: 2)
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
     return tmp_path
+
+
+@pytest.fixture
+def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of more loops than are prepared at once, without a summary."""
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
+    assert scenario.loops is not None
+    loops = (scenario.loops[0].model_copy(update={"count": 20}),)
+    return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_prepared_end_is_that_of_a_run_without_preparation(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
+) -> None:
+    given = (many_loops, 0, ExitStatus.OK, "horizon")
+    expected = finalize.finalize(RunEnding(*given), report=False, view=False).summary
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    for thread in helpers._threads:
+        thread.join()
+    assert helpers.expectations(range(20)) is not None
+    monkeypatch.setattr(finalize, "_expectations", _killed)
+    if is_killed:
+        assert helpers.submit(os.getpid).result() != os.getpid()
+        with pytest.raises(BrokenProcessPool):
+            helpers.submit(os._exit, 1).result()
+    ending = PreparedEnding(*given, helpers=helpers)
+    assert finalize.finalize(ending, report=False, view=False).summary == expected
 
 
 def _killed(*_: object) -> None:

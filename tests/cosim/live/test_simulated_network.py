@@ -83,8 +83,8 @@ def test_processes_finalise_the_loops_of_a_long_run_alike(
     path = run_dir / "summary.json"
     before = path.read_text()
     path.unlink()
-    monkeypatch.setattr("cosim.live.finalize._MANY_STEPS", 1)
-    monkeypatch.setattr("cosim.live.finalize.cores", lambda: 2)
+    monkeypatch.setattr("cosim.live.end_helpers._MANY_STEPS", 1)
+    monkeypatch.setattr("cosim.live.end_helpers.cores", lambda: 2)
     assert noack("summary", run_dir).exit_code == 0
     assert path.read_text() == before
 

@@ -1,0 +1,173 @@
+"""Processes that help with the end of a long run, and prepare it while the run goes on.
+
+What follows from the scenario alone is computed at idle priority: a process of the run that wakes
+up takes the core at once. What is not computed when the run ends, or is lost with a helper, is
+computed then.
+"""
+
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING, TypeVar, cast
+
+from cosim.live.process_pool import at_idle_priority, process_starts, processes
+from cosim.record.run_directory import RunEnding
+from noack.core.process_limits import cores
+from noack.scenario.scenario import Scenario, loop_names
+
+if TYPE_CHECKING:
+    from cosim.live.finalize import Expectations
+
+Result = TypeVar("Result")
+Item = TypeVar("Item", bound=Hashable)
+_MANY_STEPS = 50_000
+"""Loops with fewer steps of the plant, all together, are judged in less time than processes
+start."""
+_LOOPS_AT_ONCE = 16
+"""The end of a run waits for the preparation of so many loops at most."""
+
+
+class EndHelpers:
+    """Processes on all cores but one; none if the end of the run takes no time.
+
+    Args:
+        scenario: the scenario of the run.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        timing, self._loops = scenario.timing, range(len(loop_names(scenario)))
+        steps = len(self._loops) * (timing.horizon_ns // timing.plant_period_ns)
+        self.count = cores() - 1 if steps >= _MANY_STEPS else 0
+        self._stack, self._threads = ExitStack(), list[Thread]()
+        self._pool: ProcessPoolExecutor | None = None
+        self._due: deque[Callable[[], object]] = deque()
+        """What is still to be prepared."""
+        self._found: dict[int, Expectations] = {}
+
+    def prepare(self, run_dir: Path) -> None:
+        """Prepare the end of a run of many loops from now on."""
+        if len(self._loops) <= _LOOPS_AT_ONCE:
+            return
+        self.start()
+        for first in self._loops[::_LOOPS_AT_ONCE]:
+            block = self._loops[first:][:_LOOPS_AT_ONCE]
+            self._due.append(partial(self._prepare_loops, run_dir, block))
+        self._due.append(lambda: self._idle("import_libraries"))
+        for _ in range(self.count):
+            self._threads.append(Thread(target=self._prepare_all, daemon=True))
+            self._threads[-1].start()
+
+    def _prepare_all(self) -> None:
+        try:
+            while True:
+                self._due.popleft()()
+        except BrokenProcessPool:  # a process was killed
+            self._pool = None
+        except Exception:  # the end of the run reports an error; IndexError: all is prepared
+            pass
+
+    def _prepare_loops(self, run_dir: Path, block: range) -> None:
+        found = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
+        self._found |= zip(block, found, strict=True)
+
+    def _idle(self, function: str, *arguments: object) -> object:
+        """Let a process call a function of the end of the run at idle priority."""
+        return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
+
+    def expectations(self, loops: range) -> "Sequence[Expectations] | None":
+        """Return what to expect of some loops, if all of them are prepared."""
+        found = [self._found[number] for number in loops if number in self._found]
+        return found if len(found) == len(loops) else None
+
+    def start(self) -> None:
+        """Have processes that are free; prepare no more."""
+        self._due.clear()
+        for thread in self._threads:
+            thread.join()
+        if self._pool is None and self.count:
+            self._pool = self._stack.enter_context(processes(self.count))
+
+    def submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
+        """Let a process call a function."""
+        assert self._pool is not None
+        with process_starts():
+            return self._pool.submit(function, *arguments)
+
+    def call(self, function: Callable[..., Result], *arguments: object) -> Result:
+        """Return the result of a function in a process; call it here if the process is killed."""
+        try:
+            return self.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            return function(*arguments)
+
+    def each(
+        self,
+        function: Callable[[Item], Result],
+        work: Iterable[Item],
+        show: Callable[[float], None],
+    ) -> Iterable[Result]:
+        """Call a function for each item, here and in the processes; return its results."""
+        with self.shared(work, partial(self.call, function), show) as take:
+            found = take(function)
+        return found.values()
+
+    @contextmanager
+    def shared(
+        self, work: Iterable[Item], there: Callable[[Item], Result], show: Callable[[float], None]
+    ) -> Iterator[Callable[[Callable[[Item], Result]], Mapping[Item, Result]]]:
+        """Let threads do work ``there``, item by item, while this one does it with what is yielded.
+
+        This returns the results, all of which are there at the end of the context. ``show`` is
+        called with the completed share.
+        """
+        waiting, found = deque(work), dict[Item, Result]()
+        count = len(waiting)
+
+        def left() -> Iterator[Item]:
+            with suppress(IndexError):
+                while True:
+                    yield waiting.popleft()
+
+        def work_on(function: Callable[[Item], Result]) -> Mapping[Item, Result]:
+            for item in left():
+                found[item] = function(item)
+                show(len(found) / count)
+            return found
+
+        with ThreadPoolExecutor(max(self.count, 1)) as threads:
+            others = [threads.submit(work_on, there) for _ in range(min(self.count, count - 1))]
+            try:
+                yield work_on
+            finally:
+                waiting.clear()  # an interrupted run waits for one item at most
+        for other in others:
+            other.result()
+
+    def close(self) -> None:
+        """End the processes."""
+        self._due.clear()
+        self._stack.close()
+
+
+@contextmanager
+def lasting_helpers(scenario: Scenario) -> Iterator[EndHelpers]:
+    """Have helpers during a run and, unless an error ends it, for its end."""
+    helpers = EndHelpers(scenario)
+    try:
+        yield helpers
+    except BaseException:
+        helpers.close()
+        raise
+
+
+@dataclass(frozen=True)
+class PreparedEnding(RunEnding):
+    """How a run ended whose end was prepared."""
+
+    helpers: EndHelpers | None = None
