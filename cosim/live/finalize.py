@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import claims_of
+from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, claims_of
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
@@ -247,7 +247,11 @@ def _judged_loops(
     records = run.together(block)
     expected = known or _expectations([one.scenario for one in records])
     shared = SharedMachines(records if len(block) > 1 else ())
-    judged = []
+    judged, claims = [], [*map(claims_of, records)]
+    for one, own in zip(claims, expected, strict=True):
+        one.certificates = own.certificates
+    with suppress(Exception):  # the claims of the loop concerned report it
+        certify_late(claims)
     for record, own in zip(records, expected, strict=True):
         phase_ns = run.phases_ns[record.number]
         status, reason = int(ending.status), ending.reason
@@ -255,7 +259,8 @@ def _judged_loops(
         if len(run.loops) == 1:
             # Written again with the results, so that none of them can cost the summary.
             _write_summary(ending.run_dir, _summary(run, ending, [summary]))
-        judged.append(_with_results(run, record, summary, own.certificates, shared, beside))
+        judged.append(_with_results(run, summary, claims[0], shared, beside))
+        del claims[0]  # with its samples
     return judged
 
 
@@ -292,20 +297,20 @@ class ReplayBeside:
 
 def _with_results(
     run: RecordedRun,
-    record: RunRecord,
     summary: LoopSummary,
-    certificates: Sequence[ScenarioCertificate] | None,
+    claims: RunClaims,
     shared: SharedMachines,
     beside: ReplayBeside | None,
 ) -> _Judged:
     """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
+    record = claims.record
     results: dict[str, Any] = {"fidelity": fidelity_for_summary(record, len(run.loops))}
     try:
         results["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # likewise
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
-        results |= _claim_results(record, summary, certificates)
+        results |= _claim_results(claims, summary)
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     if record.kind == "live":
@@ -318,13 +323,7 @@ def _with_results(
     return _Judged(summary.model_copy(update=results), over_time)
 
 
-def _claim_results(
-    record: RunRecord,
-    summary: LoopSummary,
-    certificates: Sequence[ScenarioCertificate] | None,
-) -> dict[str, Any]:
-    claims = claims_of(record)
-    claims.certificates = certificates
+def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
     longest = summary.longest_loss_burst
     if summary.unintended_losses:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))

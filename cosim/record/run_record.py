@@ -447,7 +447,6 @@ def write_run(run: RecordedRun, run_dir: Path) -> None:
     Raises:
         OSError, NoackError: they cannot be written.
     """
-
     types = run_tables(run.scenario)
 
     def rows(table: str) -> Iterator[Rows]:

@@ -35,7 +35,12 @@ from cosim.analysis.claims.claim_definition import (
     Findings,
 )
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
-from cosim.analysis.claims.run_evidence import RunEvidence, RunPart, Samples
+from cosim.analysis.claims.run_evidence import (
+    RunEvidence,
+    RunPart,
+    Samples,
+    certificates_together,
+)
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
 from cosim.record.run_events import NEVER_NS, RecordedChange, changes_of
@@ -381,6 +386,21 @@ class RunClaims:
             void_at_setpoint(made.scenario),
         )
         return ClaimEvaluation(own, part)
+
+
+def certify_late(claims: Sequence[RunClaims]) -> None:
+    """Search together for the certificates of the runs that were later than allowed."""
+    late: list[tuple[ClaimEvaluation, NetworkConditions]] = []
+    for one in claims:
+        first = one.parts[0]
+        if isinstance(first, Claim) or not any(c.constants for c in first.part.certificates or ()):
+            continue
+        if (conditions := first.late_conditions) is not None:
+            late.append((first, conditions))
+    scenarios = [first.record.scenario for first, _ in late]
+    found = certificates_together(scenarios, None, [conditions for _, conditions in late])
+    for (first, _), certificates in zip(late, found, strict=True):
+        first.late_certificates = certificates
 
 
 @lru_cache(maxsize=1)

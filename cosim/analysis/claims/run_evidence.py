@@ -114,7 +114,7 @@ class Samples:
         return np.asarray(np.isfinite(self.true_x).all(axis=1))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class RunEvidence:
     """The data of a run for checking claims; each property is computed once, when first used.
 
@@ -123,6 +123,8 @@ class RunEvidence:
 
     record: RunRecord
     part: RunPart = field(default_factory=RunPart)
+    late_certificates: Sequence[ScenarioCertificate] | None = None
+    """Those under :attr:`late_conditions`, if they are known."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -185,7 +187,9 @@ class RunEvidence:
             scheduled = scheduled_certificates(scenario, self.part.start_error)
         wider: Sequence[ScenarioCertificate | None] = [None] * len(scheduled)
         if self.late_conditions is not None and any(one.constants for one in scheduled):
-            wider = scheduled_certificates(scenario, self.part.start_error, self.late_conditions)
+            wider = self.late_certificates or scheduled_certificates(
+                scenario, self.part.start_error, self.late_conditions
+            )
         for one, late in zip(scheduled, wider, strict=True):
             used = one if late is None or late.constants is None else late
             if one.scope in void:
@@ -342,14 +346,15 @@ def scheduled_certificates(
     They are those under some conditions; by default, under the scenario's schedule. A part of a run
     that starts with an input of the part before has a ``start_error``.
     """
-    (found,) = certificates_together([scenario], start_error, conditions)
+    limits = None if conditions is None else [conditions]
+    (found,) = certificates_together([scenario], start_error, limits)
     return found
 
 
 def certificates_together(
     scenarios: Sequence[Scenario],
     start_error: float | None = None,
-    conditions: NetworkConditions | None = None,
+    conditions: Sequence[NetworkConditions] | None = None,
 ) -> list[list[ScenarioCertificate]]:
     """Return the certificates of several scenarios; see :func:`scheduled_certificates`."""
     searches: list[Search[ScenarioCertificate]] = []
@@ -357,7 +362,8 @@ def certificates_together(
     for number, scenario in enumerate(scenarios):
         if not scenario.coverage.is_certifiable:
             continue
-        limits, error = conditions or allowed_conditions(scenario), 0.0
+        limits = allowed_conditions(scenario) if conditions is None else conditions[number]
+        error = 0.0
         if start_error is not None:
             limits, error = limits._replace(start_s=0.0), start_error
         for scope in filter(None, (own_plant(scenario, error), box(scenario, error))):
