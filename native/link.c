@@ -122,15 +122,20 @@ void link_repeat(
     const noack_recorded *recorded, noack_decision *decision) {
     noack_flow *flow = &link->flows[row];
     *decision = (noack_decision){
+        /* every field, since the compiler's filling with 0 is slow */
         .fate = NOACK_DELIVERED,
         .packet = flow->packets,
+        .consecutive_losses = 0,
         .release_ns = now_ns,
         .copy_ns = NOACK_NEVER_NS,
         .bit = -1,
         .copy_bit = -1,
+        .hold_back_ns = 0,
+        .makes_stale = 0,
         .arrival_ns = now_ns,
         .size_bytes = size_bytes,
         .must_pass = noack_must_pass(link, row),
+        .spared = 0,
     };
     flow->packets++;
     link->counters.received++;

@@ -801,13 +801,13 @@ enum noack_sends { /* the socket that sends a direction's datagrams, and their d
     NOACK_LINK_SOCKET       /* the link's sending socket, which is connected to the destination */
 };
 
-typedef struct {
+typedef struct {     /* 16 bytes: those of thousands of clients fill the caches */
     int32_t fd, error; /* if fd is -1, error is the errno of the failure to open it */
-    int32_t head, tail;
-    int64_t stamp;
+    int32_t is_queued; /* 1: head and tail are the first and the last of its datagrams to be sent */
+    uint16_t head, tail;
 } noack_socket;
 
-typedef struct {
+typedef struct { /* what a datagram needs is in the first 64 bytes, a cache line */
     int64_t key[4];
     int64_t last_ns; /* last datagram of the client or of the destination */
     int64_t number;  /* number of its flows; -1: the row is free */

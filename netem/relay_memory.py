@@ -2,8 +2,10 @@
 
 import select
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from netem.link_state import Integers, LinkState
 from netem.relay_links import EVENT, Bytes
@@ -45,7 +47,7 @@ class RelayMemory:
         self.data: Bytes = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
         self.packets: Rows = np.zeros(row_count, PACKET_ROW)
         self.releases: Rows = np.zeros(row_count, RELEASE_ROW)
-        self._scratch = np.zeros(core.noack_relay_scratch_bytes() + 64, np.uint8)
+        self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
             "clock": {"speed": 1.0}, "change_ns": 2**63 - 1, "segment": segment,
@@ -55,9 +57,8 @@ class RelayMemory:
             "row_count": row_count, "free_slot": -1, "free_block": -1,
         })  # fmt: skip
         """The relay, as the core's functions take it: a ``noack_relay``."""
-        first = (self._scratch.ctypes.data + 63) // 64 * 64
-        self.core.scratch = ffi.cast("void *", first)
-        self._set_clients(np.zeros(_CLIENTS, CLIENT), np.zeros(2 * links + _CLIENTS, SOCKET))
+        self.core.scratch = pointer_to(self._scratch, "void *")
+        self._set_clients(zeros_in_lines(_CLIENTS, CLIENT), np.zeros(2 * links + _CLIENTS, SOCKET))
         self.clients["number"] = self.sockets["fd"] = -1
         self._set_slots(np.zeros(_SLOTS, ENTRY), np.zeros(_SLOTS, SLOT), 0)
         self._block_next = np.zeros(0, np.int32)
@@ -111,7 +112,9 @@ class RelayMemory:
     def add_clients(self) -> None:
         """Double the maximum number of clients."""
         count = len(self.clients)
-        clients, sockets = doubled(self.clients), np.zeros(self.first_path + 2 * count, SOCKET)
+        clients = zeros_in_lines(2 * count, CLIENT)
+        clients[:count] = self.clients
+        sockets = np.zeros(self.first_path + 2 * count, SOCKET)
         clients["number"][count:] = sockets["fd"] = -1
         sockets[: self.first_path + count] = self.sockets
         self._set_clients(clients, sockets)
@@ -224,6 +227,15 @@ def has_headroom(wanted_bytes: int = 0) -> bool:
     except MemoryError:
         return False
     return True
+
+
+_Element = TypeVar("_Element", bound=np.generic)
+
+
+def zeros_in_lines(count: int, dtype: np.dtype[_Element]) -> NDArray[_Element]:
+    """Return an array of zeros, (count,), that begins at a cache line: a multiple of 64 bytes."""
+    room = np.zeros(count * dtype.itemsize + 64, np.uint8)
+    return np.frombuffer(room, dtype, count, -room.ctypes.data % 64)
 
 
 def doubled(array: Rows) -> Rows:

@@ -53,17 +53,26 @@ static double weighted_input_squares(const exact_memory *memory, int p, double s
     enum { GROUPS = NODES / WIDTH };
     const double *us = memory->u, *R = memory->R;
     int64_t m = memory->exact->m;
-    part u[N][GROUPS], at[GROUPS], share[GROUPS], total[4 / WIDTH] = {{0.0}};
+    part u[STRIDE][GROUPS], at[GROUPS], share[GROUPS], total[4 / WIDTH] = {{0.0}};
     memcpy(at, AT, sizeof at);
     memcpy(share, SHARE, sizeof share);
-    for (int64_t j = 0; j < m; j++) {
+    for (int i = 0; i < GROUPS; i++)
+        at[i] = at[i] * spread(s);
+    for (int64_t j = 0; j < m; j += 2) { /* two at once, since each waits for its last product */
+        part even[GROUPS], odd[GROUPS];
 #pragma GCC unroll 6
-        for (int i = 0; i < GROUPS; i++)
-            u[j][i] = spread(us[p * STRIDE + j]);
+        for (int i = 0; i < GROUPS; i++) {
+            even[i] = spread(us[p * STRIDE + j]);
+            odd[i] = spread(us[p * STRIDE + j + 1]);
+        }
         for (int k = p - 1; k >= 0; k--)
 #pragma GCC unroll 6
-            for (int i = 0; i < GROUPS; i++)
-                u[j][i] = fused(u[j][i], at[i] * spread(s), spread(us[k * STRIDE + j]));
+            for (int i = 0; i < GROUPS; i++) {
+                even[i] = fused(even[i], at[i], spread(us[k * STRIDE + j]));
+                odd[i] = fused(odd[i], at[i], spread(us[k * STRIDE + j + 1]));
+            }
+        memcpy(u[j], even, sizeof even);
+        memcpy(u[j + 1], odd, sizeof odd);
     }
     for (int64_t j = 0; j < m; j++)
         for (int i = 0; i < GROUPS; i++) {

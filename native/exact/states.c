@@ -69,7 +69,7 @@ static inline __attribute__((always_inline)) void expand_with(
     }
 }
 
-static void expand(exact_memory *memory, models state, double factor, int begin, int end) {
+static void expand(exact_memory *memory, const models *state, double factor, int begin, int end) {
     int own = memory->weight != NULL || memory->renewed;
     memory->weighted = own ? memory->own_weighted : memory->e;
     memory->error = memory->apart ? memory->own_error : memory->weighted;
@@ -78,13 +78,13 @@ static void expand(exact_memory *memory, models state, double factor, int begin,
         memory->has_D_k = 1;
     }
     if (memory->renewed)
-        expand_with(memory, state, factor, begin, end, 1, 1, 1);
+        expand_with(memory, *state, factor, begin, end, 1, 1, 1);
     else if (memory->is_static)
-        expand_with(memory, state, factor, begin, end, 0, 1, 0);
+        expand_with(memory, *state, factor, begin, end, 0, 1, 0);
     else if (memory->apart)
-        expand_with(memory, state, factor, begin, end, 1, 1, 0);
+        expand_with(memory, *state, factor, begin, end, 1, 1, 0);
     else
-        expand_with(memory, state, factor, begin, end, 1, 0, 0);
+        expand_with(memory, *state, factor, begin, end, 1, 0, 0);
 }
 
 /* The same state with the plant's own as the reference, if that is small beside the present one:
@@ -313,13 +313,15 @@ static void follow(exact_memory *memory, exact_run *run) {
         forecast crossing = UNKNOWN;
         double left_s = least(phase.until_s, horizon_s) - t_s, window_s = farthest_s;
         comparison now = comparison_at(memory, phase, state, auxiliary);
+        int expanded = 0; /* number of coefficients so far */
         memory->apart = !agree || memory->renewed;
-        expand(memory, state, 1.0 / now.scale, 0, 2);
         if (phase.compares && !looked) {
             if (!is_within(state, LARGEST, phase.threshold)) {
                 status = NOACK_EXACT_DIVERGED;
                 break;
             }
+            expand(memory, &state, 1.0 / now.scale, 0, 2);
+            expanded = 3;
             double soon_s = first_window(memory, &now, point, t_s);
             crossing = soon_s < least(window_s, left_s) ? LIKELY : UNKNOWN;
             window_s = least(window_s, soon_s);
@@ -327,7 +329,7 @@ static void follow(exact_memory *memory, exact_run *run) {
         }
         window_s = least(window_s, left_s);
         int p = degree_for(memory->reach_s, window_s);
-        expand(memory, state, 1.0 / now.scale, 3, p);
+        expand(memory, &state, 1.0 / now.scale, expanded, p);
         double found_s = find_event(memory, &now, p, &point, t_s, window_s, crossing);
         if (found_s == UNRESOLVED)
             break;
@@ -403,7 +405,7 @@ static void sample(
         while (t_s[i] - start_s > farthest_s && farthest_s > 0.0 && pieces++ < MOST_PIECES) {
             if (!expanded) {
                 at = renewed(memory, at);
-                expand(memory, at, 1.0, 0, HIGHEST);
+                expand(memory, &at, 1.0, 0, HIGHEST);
             }
             at = state_at(memory, HIGHEST, farthest_s);
             start_s += farthest_s;
@@ -411,7 +413,7 @@ static void sample(
         }
         if (!expanded) {
             at = renewed(memory, at);
-            expand(memory, at, 1.0, 0, HIGHEST);
+            expand(memory, &at, 1.0, 0, HIGHEST);
         }
         expanded = 1;
         double after_s = t_s[i] - start_s;

@@ -114,10 +114,12 @@ static inline int degree_for(const double *reach_s, double window_s) {
     return degree_of(lowest);
 }
 
-/* The sum over k <= p of c_k s^k; p is even. Even and odd powers are two sums, half as long. */
+/* The sum over k <= p of c_k s^k; p is even. Even and odd powers are two sums, half as long. The
+   loops over both are unrolled once: every degree is a multiple of 4. */
 static inline lanes value(const double *curve, int p, double s) {
     lanes even = load(curve + p * STRIDE), odd = filled(0.0);
     double square = s * s;
+#pragma GCC unroll 2
     for (int k = p - 2; k >= 0; k -= 2) {
         even = fma_scaled(even, square, load(curve + k * STRIDE));
         odd = fma_scaled(odd, square, load(curve + (k + 1) * STRIDE));
@@ -148,6 +150,7 @@ static inline curve_point point_at(const double *curve, int p, double s) {
     lanes even = load(curve + p * STRIDE), odd = filled(0.0), even_rise = odd, odd_rise = odd;
     lanes even_bend = odd, odd_bend = odd; /* halves of E'' and O'' */
     double square = s * s;
+#pragma GCC unroll 2
     for (int k = p - 2; k >= 0; k -= 2) {
         even_bend = fma_scaled(even_bend, square, even_rise);
         odd_bend = fma_scaled(odd_bend, square, odd_rise);
@@ -181,6 +184,7 @@ static inline double bend(const double *curve, int p, double s) {
 static inline double largest(const double *curve, int p, double s) {
     lanes even = magnitude(load(curve + p * STRIDE)), odd = filled(0.0);
     double square = s * s;
+#pragma GCC unroll 2
     for (int k = p - 2; k >= 0; k -= 2) {
         even = fma_scaled(even, square, magnitude(load(curve + k * STRIDE)));
         odd = fma_scaled(odd, square, magnitude(load(curve + (k + 1) * STRIDE)));

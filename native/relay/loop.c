@@ -71,10 +71,12 @@ const uint8_t *noack_relay_sender(const noack_relay *relay) {
 
 int64_t noack_relay_receiver(const noack_relay *relay) { return scratch_of(relay)->batch_socket; }
 
-/* Queue the datagram in the first free row of leaving for sending; record its departure. */
+/* Queue the datagram in the first free row of leaving for sending, behind those of the same socket;
+   record its departure. */
 static void line_up(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
-    departure *leaving = &own->leaving[own->leaving_count++];
+    int32_t number = (int32_t)own->leaving_count++;
+    departure *leaving = &own->leaving[number];
     noack_direction *direction = &relay->directions[leaving->datagram.direction];
     leaving->stale = (uint8_t)noack_link_leave(
         direction->link, relay->clients[leaving->datagram.client].place, leaving->datagram.packet,
@@ -88,6 +90,16 @@ static void line_up(noack_relay *relay) {
         leaving->socket = (int32_t)link;
     else
         leaving->socket = (int32_t)(relay->links + link);
+    noack_socket *socket = &relay->sockets[leaving->socket];
+    if (socket->is_queued) {
+        own->leaving[socket->tail].next = number;
+    } else {
+        socket->is_queued = 1;
+        socket->head = (uint16_t)number;
+        own->order[own->order_count++] = leaving->socket;
+    }
+    socket->tail = (uint16_t)number;
+    leaving->next = -1;
 }
 
 /* Queue the datagrams that are due for sending; return CARRY_ON, or which buffer is full. */
@@ -175,44 +187,41 @@ static void read_arrival(noack_relay *relay) {
     }
 }
 
-/* Queue a datagram or its copy for sending if it leaves now, else store it until it is due. */
+/* Queue a datagram or its copy for sending if it leaves now, else store it until it is due. It is
+   described in the first free row of leaving, where nothing has to be copied. */
 static void release(
     noack_relay *relay, int64_t direction, int64_t client, const noack_decision *decision,
     int copy) {
     relay_scratch *own = scratch_of(relay);
     const uint8_t *data = own->buffers[own->batch_next];
+    departure *leaving = &own->leaving[own->leaving_count];
+    noack_slot *datagram = &leaving->datagram;
     int64_t release_ns = copy ? decision->copy_ns : decision->release_ns;
-    int64_t bit = copy ? decision->copy_bit : decision->bit;
     int delayed = release_ns > relay->now_ns;
-    int64_t number = -1;
-    noack_slot datagram = {
-        .packet = decision->packet,
-        .arrival_ns = relay->now_ns,
-        .bit = bit,
-        .size_bytes = (int32_t)decision->size_bytes,
-        .direction = (int32_t)direction,
-        .client = (int32_t)client,
-        .copy = (uint8_t)copy,
-        .counts = (uint8_t)is_first_intact(decision, copy),
-        .fate = (uint8_t)decision->fate,
-    };
-    if (delayed || bit >= 0)
-        number = store_payload(relay, data, &datagram);
-    if (delayed) {
-        relay->put++;
-        int64_t order = departure_order(direction & 1, relay->put);
-        noack_heap_entry entry = {release_ns, order, number};
-        heap_push(relay->heap, &relay->heap_length, entry);
-        relay->clients[client].in_flight++;
+    datagram->packet = decision->packet;
+    datagram->arrival_ns = relay->now_ns;
+    datagram->bit = copy ? decision->copy_bit : decision->bit;
+    datagram->size_bytes = (int32_t)decision->size_bytes;
+    datagram->direction = (int32_t)direction;
+    datagram->client = (int32_t)client;
+    datagram->copy = (uint8_t)copy;
+    datagram->counts = (uint8_t)is_first_intact(decision, copy);
+    datagram->fate = (uint8_t)decision->fate;
+    leaving->address = data;
+    leaving->release_ns = release_ns;
+    leaving->slot = -1;
+    leaving->delayed = 0;
+    if (delayed || datagram->bit >= 0)
+        leaving->slot = (int32_t)store_payload(relay, data, datagram);
+    if (!delayed) {
+        line_up(relay);
         return;
     }
-    own->leaving[own->leaving_count] = (departure){
-        .datagram = datagram,
-        .address = data,
-        .release_ns = release_ns,
-        .slot = (int32_t)number,
-    };
-    line_up(relay);
+    relay->put++;
+    int64_t order = departure_order(direction & 1, relay->put);
+    heap_push(
+        relay->heap, &relay->heap_length, (noack_heap_entry){release_ns, order, leaving->slot});
+    relay->clients[client].in_flight++;
 }
 
 /* Decide for the current datagram, of a client. */

@@ -14,6 +14,7 @@ enum {
     LEAVING = 256,
     ERRORS = 16,
     VECTORS = 1024,                   /* maximum number of vectors in one call */
+    FEW_BYTES = 256,                  /* copying them costs less than a vector of their own */
     MOST_BYTES = 65536,               /* no received datagram is longer */
     BUFFER_STRIDE = MOST_BYTES + 256, /* the buffers' first bytes are in different cache sets */
     CONTROL_BYTES = 64,
@@ -47,15 +48,17 @@ typedef struct {
     error_control error_controls[ERRORS];
     struct epoll_event ready[READY];
     departure leaving[LEAVING];
+    uint8_t joined[LEAVING * FEW_BYTES]; /* payloads of messages that the kernel segments */
+    int64_t joined_bytes;
     int32_t out_first[LEAVING]; /* first datagram of each message */
     int32_t order[LEAVING];     /* the sockets that have something to send */
+    int64_t order_count;
     int64_t ready_count, ready_next;
     int64_t batch_socket, batch_next, batch_end; /* the receive buffers that are filled */
     int32_t hints[BUFFERS]; /* rows that the senders in the buffers may have; -1: none */
     int64_t leaving_count, leaving_bytes;
-    int64_t arrival_ns; /* arrival of the datagram in the current receive buffer */
-    int64_t real_ns;    /* the real-time clock at the last receiving of datagrams */
-    int64_t stamp;
+    int64_t arrival_ns;    /* arrival of the datagram in the current receive buffer */
+    int64_t real_ns;       /* the real-time clock at the last receiving of datagrams */
     int64_t stamps;        /* 1: the kernel adds arrival timestamps */
     int64_t control_bytes; /* buffer for received control messages; 0: none */
     pauses pauses;         /* work is sending */
@@ -63,7 +66,7 @@ typedef struct {
     int64_t has_more;      /* 1: as many as could be received were; others may wait */
     int64_t due_since_ns;  /* since when housekeeping has been due; 0: it is not */
     uint64_t loaded;       /* a sum of what was loaded into the caches, so that it is loaded */
-    uint8_t buffers[BUFFERS][BUFFER_STRIDE];
+    _Alignas(64) uint8_t buffers[BUFFERS][BUFFER_STRIDE];
 } relay_scratch;
 
 static inline relay_scratch *scratch_of(const noack_relay *relay) { return relay->scratch; }

@@ -13,7 +13,9 @@
 
 enum {
     CALLS_PER_READING = 8, /* of the clock */
-    MOST_SEGMENTS = 64,    /* that every kernel with UDP_SEGMENT accepts in one message */
+    /* In one message: every kernel with UDP_SEGMENT accepts 64. Of a longer message, a full queue
+       of the device (tbf) loses more without an error. */
+    MOST_SEGMENTS = 64,
     MOST_SEGMENTED_BYTES = 65507,
     TRIES = 3,
     /* Maximum number of tries. An ICMP error of an earlier datagram makes one send fail. A send
@@ -80,12 +82,27 @@ static int64_t vectors_of(const departure *leaving) {
     return leaving->slot < 0 ? 1 : blocks_for(leaving->datagram.size_bytes);
 }
 
-/* Write the vectors of a datagram's payload; return the next free one. */
-static int64_t add_vectors(const noack_relay *relay, int64_t count, const departure *leaving) {
-    struct iovec *vectors = scratch_of(relay)->out_vectors;
+/* Write the vectors of a datagram's payload; return the next free one. Small payloads of a message,
+   whose vectors begin at first, are copied behind each other: they share a vector. */
+static int64_t add_vectors(
+    const noack_relay *relay, int64_t first, int64_t count, const departure *leaving) {
+    relay_scratch *own = scratch_of(relay);
+    struct iovec *vectors = own->out_vectors;
+    size_t size_bytes = (size_t)leaving->datagram.size_bytes;
+    if (leaving->slot < 0 && relay->segment && size_bytes <= FEW_BYTES) {
+        uint8_t *place = own->joined + own->joined_bytes;
+        memcpy(place, leaving->address, size_bytes);
+        own->joined_bytes += leaving->datagram.size_bytes;
+        struct iovec *last = count > first ? &vectors[count - 1] : NULL;
+        if (last != NULL && (uint8_t *)last->iov_base + last->iov_len == place) {
+            last->iov_len += size_bytes;
+            return count;
+        }
+        vectors[count] = (struct iovec){place, size_bytes};
+        return count + 1;
+    }
     if (leaving->slot < 0) {
-        vectors[count] =
-            (struct iovec){(void *)leaving->address, (size_t)leaving->datagram.size_bytes};
+        vectors[count] = (struct iovec){(void *)leaving->address, size_bytes};
         return count + 1;
     }
     int64_t block = leaving->datagram.block, left_bytes = leaving->datagram.size_bytes;
@@ -136,6 +153,7 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
     relay_scratch *own = scratch_of(relay);
     int64_t vectors = 0;
     int headers = 0;
+    own->joined_bytes = 0;
     while (number >= 0 && headers < LEAVING) {
         const departure *first = &own->leaving[number];
         if (vectors + vectors_of(first) > VECTORS)
@@ -145,7 +163,7 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
         own->out_first[headers] = (int32_t)number;
         int64_t begin = vectors, all_bytes = first->datagram.size_bytes, segments = 1;
         int64_t last_bytes = first->datagram.size_bytes;
-        vectors = add_vectors(relay, vectors, first);
+        vectors = add_vectors(relay, begin, vectors, first);
         number = first->next;
         if (relay->segment && 0 < all_bytes && all_bytes < relay->segment_below) {
             while (number >= 0 && segments < MOST_SEGMENTS
@@ -155,7 +173,7 @@ static int fill(noack_relay *relay, int64_t number, int64_t *following) {
                     || vectors + vectors_of(other) > VECTORS)
                     break;
                 last_bytes = other->datagram.size_bytes;
-                vectors = add_vectors(relay, vectors, other);
+                vectors = add_vectors(relay, begin, vectors, other);
                 all_bytes += last_bytes;
                 segments++;
                 number = other->next;
@@ -256,27 +274,6 @@ static void account(noack_relay *relay, const departure *leaving, int64_t now_ns
         free_payload(relay, leaving->slot);
 }
 
-/* Link the datagrams of each socket in their order; return the number of sockets. */
-static int64_t sort_by_socket(noack_relay *relay) {
-    relay_scratch *own = scratch_of(relay);
-    int64_t sockets = 0;
-    own->stamp++;
-    for (int32_t number = 0; number < own->leaving_count; number++) {
-        departure *leaving = &own->leaving[number];
-        noack_socket *socket = &relay->sockets[leaving->socket];
-        if (socket->stamp != own->stamp) {
-            socket->stamp = own->stamp;
-            socket->head = number;
-            own->order[sockets++] = leaving->socket;
-        } else {
-            own->leaving[socket->tail].next = number;
-        }
-        socket->tail = number;
-        leaving->next = -1;
-    }
-    return sockets;
-}
-
 /* Send what is queued for a socket; return the number of calls for that. */
 static int64_t send_queued(noack_relay *relay, int32_t place) {
     relay_scratch *own = scratch_of(relay);
@@ -300,19 +297,21 @@ static int64_t send_queued(noack_relay *relay, int32_t place) {
    The clock is read once for several calls, but for taps, which receive the time of each. */
 int64_t send_all(noack_relay *relay) {
     relay_scratch *own = scratch_of(relay);
-    int64_t sockets = sort_by_socket(relay), accounted = 0, calls = 0, now_ns = relay->read_ns;
-    for (int64_t place = 0; place < sockets; place++) {
+    int64_t accounted = 0, calls = 0, now_ns = relay->read_ns;
+    for (int64_t place = 0; place < own->order_count; place++) {
         calls += send_queued(relay, own->order[place]);
-        if (calls < CALLS_PER_READING && !relay->taps && place + 1 < sockets)
+        if (calls < CALLS_PER_READING && !relay->taps && place + 1 < own->order_count)
             continue;
         calls = 0;
         now_ns = run_time_ns(&relay->clock);
         for (; accounted <= place; accounted++) {
-            int64_t number = relay->sockets[own->order[accounted]].head;
-            for (; number >= 0; number = own->leaving[number].next)
+            noack_socket *socket = &relay->sockets[own->order[accounted]];
+            socket->is_queued = 0;
+            for (int32_t number = socket->head; number >= 0; number = own->leaving[number].next)
                 account(relay, &own->leaving[number], now_ns);
         }
     }
+    own->order_count = 0;
     own->leaving_count = 0;
     own->leaving_bytes = 0;
     return now_ns;
