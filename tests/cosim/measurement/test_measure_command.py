@@ -107,7 +107,7 @@ def test_correlation_is_that_of_an_autoregressive_delay() -> None:
     assert delays.received == known.sum()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 10**9), st.none() | st.integers(0, 10**12)),

@@ -28,7 +28,7 @@ from tests.cosim.record.changed_records import changed, flipped
 from tests.oracles.comparison import Comparison
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
-H_S, TICKS = 0.05, 8
+H_S, TICKS = 0.05, 7
 A, B = np.array([[0.0, 1.0], [1.0, 0.3]]), np.array([[0.0], [1.0]])
 K, TRUE_A = np.array([[-3.0, -2.0]]), np.array([[0.0, 1.1], [1.2, 0.2]])
 LOST_UPDATES = (1,)

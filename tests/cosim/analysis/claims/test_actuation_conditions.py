@@ -31,7 +31,7 @@ def scenario(actuation: str, *more: str) -> Scenario:
     return resolve(load(path, [*base, *more]))
 
 
-@pytest.mark.parametrize("predictions", [1, 2, 3, 6])
+@pytest.mark.parametrize("predictions", [1, 2, 6])
 @pytest.mark.parametrize(
     ("actuation", "reached"),
     [

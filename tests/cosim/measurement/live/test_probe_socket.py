@@ -9,7 +9,7 @@ import pytest
 from cosim.measurement.live.live_measurement import ProbeSocket, host_number
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="time stamps of Linux")
-WAIT_S = 0.3
+WAIT_S = 0.05
 
 
 def test_an_arrival_has_the_time_at_which_it_came_not_that_of_reading() -> None:
