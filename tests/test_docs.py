@@ -146,11 +146,6 @@ def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:
     assert [one.kind for one in load(path).network.impairments] == ["delay", "rate"]
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda p: p.stem)
-def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> None:
-    assert load(path).name == path.stem
-
-
 TEXTS = sorted({*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")})
 FOLDERS = sorted(path.parent.name for path in ROOT.glob("*/__init__.py"))
 OTHER_FOLDERS = ["benchmarks", "campaigns", "docs", "scenarios", "tests", "tools"]

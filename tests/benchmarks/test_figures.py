@@ -7,12 +7,6 @@ from benchmarks import ends, latency, runs, simulation
 from benchmarks.bare_programs import LOOPS
 from benchmarks.programs import Line, execute, first_step_s
 from benchmarks.report import MeasurementError, Rounds
-from cosim.live.progress import progress_text
-from noack.runtime.control_messages import RunProgress
-
-ACCOUNT: dict[str, Any] = {
-    "t_s": 0.0, "events": 1, "deliveries": 1, "longest_loss_burst": 0, "x_norm": 1.0, "live": None,
-}  # fmt: skip
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -61,18 +55,6 @@ def test_lateness_is_judged_against_cyclictest(
     assert judged.holds is holds
     assert judged.value == 24.0
     assert note in judged.as_json().get("note", "")
-
-
-def test_the_earliest_progress_line_bounds_the_time_of_the_first_step() -> None:
-    lines = [
-        Line(100.9, "noack: something else"),
-        Line(102.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.25}), 20.0)),
-        Line(
-            102.2, progress_text(RunProgress(**ACCOUNT | {"t_s": 0.5}), 20.0)
-        ),  # the epoch is at 101.75 or earlier
-        Line(103.0, progress_text(RunProgress(**ACCOUNT | {"t_s": 1.0}), 20.0)),
-    ]
-    assert first_step_s(100.0, lines) == pytest.approx(1.75)
 
 
 def test_without_a_progress_line_there_is_no_first_step() -> None:

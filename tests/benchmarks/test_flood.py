@@ -1,65 +1,21 @@
 """The process that sends the flood, and the figures of a flooded run."""
 
-import socket
 import subprocess
-from collections.abc import Iterator
-from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
 
-from benchmarks.bare_programs import SEGMENTS, Flood, command_of, flood, unwanted_datagram
+from benchmarks.bare_programs import Flood, command_of
 from benchmarks.faults import FaultedRun, figures_of, recovery_s
 from cosim.cli import find_scenario
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.protocol.wire_format import Flow, Rejection
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.record.changed_records import changed, copied
-from tests.wire_decoder import Decoder
 
 PERIOD_NS = 2_000_000
-
-
-def taken(ear: socket.socket) -> list[bytes]:
-    """Return all received datagrams."""
-    found = []
-    with suppress(BlockingIOError):
-        while True:
-            found.append(ear.recv(2000))
-    return found
-
-
-@pytest.fixture
-def ears() -> Iterator[list[socket.socket]]:
-    """Three receiving sockets."""
-    with ExitStack() as stack:
-        found = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
-        for ear in found:
-            stack.enter_context(ear)
-            ear.bind(("127.0.0.1", 0))
-            ear.setblocking(False)
-        yield found
-
-
-def test_a_flood_is_distributed_evenly_over_the_ports_and_counted(
-    ears: list[socket.socket],
-) -> None:
-    sent = flood([ear.getsockname()[1] for ear in ears], 0.3, 1000.0).sent
-    decoder = Decoder(Flow.UPDATE, 4, 1, bytes(32))
-    counts = [sum(decoder.decode(data) is None for data in taken(ear)) for ear in ears]
-    assert sum(counts) == sent > 0
-    assert max(counts) - min(counts) <= 1
-    assert decoder.rejected[Rejection.RUN] == sent  # it looks like an update of another run
-
-
-def test_one_call_of_an_unlimited_flood_sends_separate_datagrams(ears: list[socket.socket]) -> None:
-    assert flood([ears[0].getsockname()[1]], 0.01, 0).sent % SEGMENTS == 0
-    received = taken(ears[0])
-    assert len(received) >= SEGMENTS
-    assert {len(data) for data in received} == {len(unwanted_datagram())}
 
 
 def test_the_flood_process_prints_the_number_sent() -> None:

@@ -124,14 +124,6 @@ def test_a_mistake_on_the_command_line_is_reported(
     assert "error: " in capsys.readouterr().err
 
 
-def test_a_run_that_cannot_start_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = ["--set", "network.mansd=-1"]
-    assert main(["--minutes", "1", "--runs", str(tmp_path), *settings]) == 2
-    assert "network.mansd" in capsys.readouterr().err
-
-
 HOUR_S = 3600.0
 
 

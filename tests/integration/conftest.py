@@ -125,6 +125,31 @@ AT_RATE = settings(plant__rate_hz=RATE_HZ, controller__rate_hz=RATE_HZ)
 """A fifth of the scenario's rate, to need less CPU time."""
 
 
+PENDULUM = """
+[model]
+A = [[0.0, 1.0], [2.0, 0.0]]
+B = [[0.0], [1.0]]
+gain = [[-6.0, -3.0]]
+
+[plant]
+initial_state = [0.2, 0.0]
+initial_state_halfwidth = [0.1, 0.1]
+rate_hz = 50.0
+
+[controller]
+rate_hz = 50.0
+
+[trigger]
+policy = "periodic"
+period_s = 0.1
+
+[network]
+mansd = 2
+loss = { model = "bernoulli", probability = 0.3 }
+"""
+"""Tables of a loop for scenarios of several."""
+
+
 def private_files(folder: Path) -> list[Path]:
     """Return the private files below a runtime directory."""
     return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]

@@ -56,18 +56,6 @@ def test_actuations_are_lost_within_their_guarantee(finished: Finished, record: 
     assert found["received"] == outcomes.forwarded.sum()
 
 
-def test_the_plant_applies_the_entry_whose_time_has_come(record: RunRecord) -> None:
-    steps, received = record[PLANT_STEP], record[PLANT_ACTUATION]
-    steps = steps[steps["actuation"] >= 0]
-    newest = received[np.searchsorted(received["sequence"], steps["actuation"])]
-    inputs = np.concatenate([newest["u"], newest["predicted"]], axis=1).reshape(len(steps), 5, -1)
-    period_ns = record.scenario.timing.controller_period_ns
-    entries = np.clip((steps["t_ns"] - newest["t_ns"]) // period_ns, 0, 4)
-    assert (steps["entry"] == entries).all()
-    assert (steps["u"] == inputs[np.arange(len(steps)), entries]).all()
-    assert len(np.unique(entries)) > 2
-
-
 @pytest.fixture(scope="module")
 def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A run in which controller and emulator were killed while actuations were lost."""

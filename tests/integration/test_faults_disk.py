@@ -140,34 +140,6 @@ def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
     assert list(small.path.iterdir()) == []
 
 
-@pytest.mark.parametrize("small", [64], indirect=True)
-def test_a_folder_that_becomes_read_only_gives_clear_errors(start: Start, small: Disk) -> None:
-    """Open files can still be written; new files cannot be created."""
-    horizon_s = 24.0
-    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s))
-    running.wait_recording()
-    run_dir = (running.runs / "latest").resolve()
-    mounted(small.path, "--bind", str(small.path))
-    try:
-        mounted(small.path, "-o", "remount,bind,ro")
-        _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
-        assert running.process.returncode == 1
-        lines = [line for line in stderr.splitlines() if line.startswith("noack")]
-        why = f"{run_dir / 'reports.json'}: cannot be written: Read-only file system"
-        assert lines == [
-            f"noack: the run failed: recorder: {why}",
-            f"noack: {run_dir}: the run cannot be written: Read-only file system",
-        ]
-        assert running.left_behind() == []
-    finally:
-        subprocess.run(["umount", "--lazy", str(small.path)], check=True)
-    assert noack("summary", str(run_dir)).exit_code == 0
-    summary = json.loads((run_dir / "summary.json").read_text())
-    assert summary["exit"] == {"status": 1, "reason": f"recorder: {why}"}
-    steps = load_record(run_dir)["plant_step"]
-    assert np.array_equal(steps["sequence"], np.arange(horizon_s * live.RATE_HZ + 1))
-
-
 def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
     running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
     running.wait_recording()

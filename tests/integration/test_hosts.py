@@ -89,43 +89,11 @@ def end_well(*processes: subprocess.Popen[str]) -> list[Any]:
     return printed
 
 
-def test_all_roles_join_from_another_host(start: Start, hosts: TwoHosts, tmp_path: Path) -> None:
-    (_, own), (_, other) = hosts.addresses  # of IPv6
-    recording = record(start, tmp_path, own)
-    for report in end_well(*joined(start, *LOOP_ROLES)):
-        assert report["channel"]["local"].rpartition(":")[0].strip("[]") == other
-    (summary,) = end_well(recording)
-    live.assert_complete(summary["loops"][0])
-    tables = load_record((tmp_path / "runs" / "latest").resolve())
-    assert len(tables["plant_step"]) == 4 * live.RATE_HZ + 1
-    assert not (tmp_path / "invitation.json").exists()
-
-
-SEVERAL = """
+SEVERAL = f"""
 name = "three"
 horizon_s = 4.0
 
-[model]
-A = [[0.0, 1.0], [2.0, 0.0]]
-B = [[0.0], [1.0]]
-gain = [[-6.0, -3.0]]
-
-[plant]
-initial_state = [0.2, 0.0]
-initial_state_halfwidth = [0.1, 0.1]
-rate_hz = 100.0
-
-[controller]
-rate_hz = 100.0
-
-[trigger]
-policy = "periodic"
-period_s = 0.05
-
-[network]
-mansd = 2
-loss = { model = "bernoulli", probability = 0.3 }
-
+{live.PENDULUM}
 [clocks]
 largest_error_us = 1e6  # a busy machine gives wide bounds
 
@@ -140,13 +108,19 @@ phase = 0.5
 AHEAD_S = 3
 
 
-def test_several_loops_run_on_hosts_with_different_clocks(start: Start, tmp_path: Path) -> None:
+def test_several_loops_run_on_hosts_with_different_clocks(
+    start: Start, hosts: TwoHosts, tmp_path: Path
+) -> None:
+    (_, own), (_, other) = hosts.addresses  # of IPv6
     (tmp_path / "three.toml").write_text(SEVERAL)
-    recording = start(0, "record", "three.toml", "--listen", "10.83.3.1", "--json", *live.BARE)
+    recording = start(0, "record", "three.toml", "--listen", own, "--json", *live.BARE)
     live.wait_for(lambda: (tmp_path / "invitation.json").exists() or recording.poll() is not None)
     assert recording.poll() is None, recording.communicate()
     processes = joined(start, "netem", "controller", ahead_s=AHEAD_S)
-    *_, summary = end_well(*processes, recording)
+    *reports, summary = end_well(*processes, recording)
+    places = {one["channel"]["local"].rpartition(":")[0].strip("[]") for one in reports}
+    assert places == {own, other}
+    assert not (tmp_path / "invitation.json").exists()
     assert summary["network"]["replay"]["bit_exact"]
     for loop in summary["loops"]:
         live.assert_complete(loop)

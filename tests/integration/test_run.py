@@ -17,13 +17,10 @@ from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.align import align_tables
 from cosim.record.run_record import RunRecord, load_record
-from noack.protocol.machine_interface import Record
-from noack.protocol.record_tables import Fate, tables
-from noack.protocol.wire_format import read_header
+from noack.protocol.record_tables import tables
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.cosim.record.changed_records import identity_residual
 from tests.integration.conftest import Finished, run_scenario, settings
-from tests.oracles.link import Datagram, update_link_of
 
 SUMMARY_KEYS = {
     "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",
@@ -108,35 +105,6 @@ def test_each_process_receives_from_its_peer_only(live: RunRecord) -> None:
         assert channel[role]["destination"] == local[to]
         assert list(channel[to]["received_from"]) == [local[role]]
     assert local["controller"] not in channel["sensor"]["received_from"]
-
-
-def test_the_plant_holds_only_inputs_that_the_controller_sent(live: RunRecord) -> None:
-    plant, sent = live["plant_step"], live["controller_step"]
-    held = plant["actuation"] >= 0
-    assert held.sum() > 0.9 * len(plant)
-    assert np.array_equal(plant["u"][held], sent["u"][plant["actuation"][held]])
-    assert not plant["u"][~held].any()
-
-
-def test_the_controller_receives_what_the_network_delivers(live: RunRecord) -> None:
-    packets, deliveries = live["netem_packet"], live["controller_delivery"]
-    sequence = np.array([read_header(head.tobytes()).sequence for head in packets["head"]])
-    assert np.array_equal(sequence, np.arange(len(packets)))
-    survivors = sequence[packets["fate"] != Fate.DROPPED]
-    assert np.array_equal(deliveries["sequence"], survivors)
-    sent = live["sensor_measurement"]
-    events = sent[sent["event"] >= 0]
-    assert np.array_equal(deliveries["x"], events["x"][deliveries["sequence"]])
-    assert np.array_equal(deliveries["dropouts"], np.diff(survivors, prepend=-1) - 1)
-
-
-def test_the_fates_depend_on_the_seed_only(live: RunRecord) -> None:
-    link = update_link_of(live.scenario)
-    fates = []
-    for _ in range(len(live["netem_packet"])):
-        outputs = link.handle(Datagram(0, b"anything"), 0)
-        fates += [output.row[5] for output in outputs if isinstance(output, Record)]
-    assert np.array_equal(live["netem_packet"]["fate"], fates)
 
 
 def test_identity_i1_holds_to_rounding_at_every_sample(live: RunRecord) -> None:

@@ -17,32 +17,14 @@ from noack.scenario.scenario import phases_ns
 from tests.integration import conftest as live
 from tests.integration.test_restarts import kill
 
-SCENARIO = """
+HEAD = """
 name = "three"
 horizon_s = 8.0
 speed = 2.0
 recovery = { rejoin_within_s = 0 }
 
-[model]
-A = [[0.0, 1.0], [2.0, 0.0]]
-B = [[0.0], [1.0]]
-gain = [[-6.0, -3.0]]
-
-[plant]
-initial_state = [0.2, 0.0]
-initial_state_halfwidth = [0.1, 0.1]
-rate_hz = 50.0
-
-[controller]
-rate_hz = 50.0
-
-[trigger]
-policy = "periodic"
-period_s = 0.1
-
-[network]
-mansd = 2
-loss = { model = "bernoulli", probability = 0.3 }
+"""
+REST = """
 impairments = [{ kind = "rate", rate_bps = 20_000, queue = 2 }]
 
 [[loops]]
@@ -59,7 +41,7 @@ NAMES = ("good-1", "good-2", "wild")
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scenario") / "three.toml"
-    path.write_text(SCENARIO)
+    path.write_text(HEAD + live.PENDULUM + REST)
     return path
 
 
@@ -148,25 +130,6 @@ def test_loops_begin_at_their_phases(finished: live.Finished) -> None:
         of_one = packets[packets["flow"] == flow]
         _, _, events_ns = updates_in(of_one)
         assert (of_one["now_ns"] - events_ns >= phase_ns).all()
-
-
-def test_a_killed_sensor_is_one_named_failure_and_the_record_is_kept(
-    scenario: Path, tmp_path: Path
-) -> None:
-    with live.begun(tmp_path) as start:
-        running = start(*live.settings(horizon_s=1000.0), command=("run", str(scenario)))
-        running.wait_started()
-        spool = running.runs / "latest" / "spool"
-        live.wait_for(lambda: any(path.stat().st_size for path in spool.glob("sensor_meas*")))
-        running.child("sensor").send_signal(signal.SIGKILL)
-        run = running.finish()
-    assert run.status == 1
-    assert run.summary["exit"]["reason"] == "sensor died: killed by SIGKILL"
-    assert not (run.run_dir / "spool").exists()
-    for name in NAMES:
-        assert loop_of(run, name)["exit"] == run.summary["exit"]
-        assert record_of(run, name).count(PLANT_STEP) > 0
-        assert replay(record_of(run, name)).bit_exact is not None
 
 
 def test_restarted_processes_serve_all_loops_again(scenario: Path, tmp_path: Path) -> None:

@@ -72,11 +72,3 @@ def test_a_campaign_in_a_folder_is_continued(tmp_path: Path) -> None:
     again = noack.campaign(PLAN, folder=tmp_path / "kept", workers=1)
     assert again.estimates().equals(first.estimates())
     assert again._finished.made == 0
-
-
-def test_a_temporary_folder_ends_with_the_result() -> None:
-    one = noack.campaign(PLAN, draws=2, workers=1)
-    folder = one.folder
-    assert folder.is_dir()
-    del one
-    assert not folder.exists()

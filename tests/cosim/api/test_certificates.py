@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 import noack
@@ -22,15 +21,6 @@ def test_a_system_is_certified(scenario: noack.Scenario) -> None:
     assert found.theorem_2 is not None
     assert found.weight is None
     assert json.loads(json.dumps(found.to_json()))["scenario"] == "own_system"
-
-
-def test_a_run_keeps_within_its_certificate(scenario: noack.Scenario, simulated: noack.Run) -> None:
-    certificate = noack.certify(scenario).schedule
-    samples = simulated.samples()
-    t_s = samples["t_s"].to_numpy()
-    x_norm = np.hypot(samples["x_1"].to_numpy(), samples["x_2"].to_numpy())
-    assert (x_norm <= certificate.state(t_s)).all()
-    assert (samples["e_s_norm"].to_numpy() <= certificate.sensor_error(t_s)).all()
 
 
 def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:

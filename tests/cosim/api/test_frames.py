@@ -1,6 +1,5 @@
 """A run's tables against its record and its summary, and as data frames."""
 
-import re
 from collections import Counter
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import noack
-from cosim.analysis.replay.replay_result import rows_differ
 from cosim.record.align import align_tables
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import load_record
@@ -82,16 +80,3 @@ def test_pandas_takes_every_table(simulated: noack.Run) -> None:
     assert simulated.table("plant_step").to_pandas().columns[0] == "t_s"
     events = simulated.events().to_pandas()
     assert events.loc[events.fate == "forced", "received"].all()
-
-
-def test_states_have_the_same_name_everywhere(simulated: noack.Run) -> None:
-    """Figures, samples, columns of the record and replay reports count from 1."""
-    names = ("x_1", "x_2")
-    assert simulated.scenario.model.state_names == names
-    assert [axes.get_ylabel().split("\n")[0] for axes in simulated.plot().axes[:2]] == [*names]
-    for columns in (simulated.samples(), simulated.table("plant_step")):
-        assert [name for name in columns.column_names if re.fullmatch("x_[0-9]+", name)] == [*names]
-    rows = simulated._record["plant_step"]
-    other = rows[3].copy()
-    other["x"][0] += 1
-    assert rows_differ("plant_step", 3, rows[3], other).column == "x_1"

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
 
 import noack
 
@@ -84,14 +83,6 @@ def test_a_run_of_the_api_has_an_ordinary_run_directory(
     assert again.report() == again.directory / "report.html"
 
 
-def test_a_live_run_gives_its_results(scenario: noack.Scenario) -> None:
-    run = noack.run(noack.with_settings(scenario, {"horizon_s": 0.5}))
-    assert run.ok
-    assert run.summary.kind == "live"
-    assert isinstance(run.plot("latency"), Figure)
-    assert run.table("plant_step").num_rows == 250 + 1
-
-
 def test_an_interrupted_live_run_is_returned() -> None:
     program = (
         "import noack\n"
@@ -137,14 +128,6 @@ def test_a_figure_is_shown_by_a_notebook(simulated: noack.Run, name: str) -> Non
     figure = simulated.plot(name)
     assert isinstance(figure, Figure)
     assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
-
-
-def test_certified_bounds_are_drawn_with_the_bounded_signals(simulated: noack.Run) -> None:
-    (axes,) = simulated.plot("errors").axes
-    assert any(line.get_linestyle() != "-" for line in axes.lines)
-    legends = [one for one in axes.get_children() if isinstance(one, Legend)]
-    texts = [text.get_text() for one in legends for text in one.get_texts()]
-    assert any("certified for" in text for text in texts)
 
 
 def test_an_unknown_figure_or_table_gives_one_line(simulated: noack.Run) -> None:

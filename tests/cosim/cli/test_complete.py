@@ -9,7 +9,6 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.cli.completion import run_directories
 from noack.scenario.scenario import Scenario
 from noack.scenario.toml_file import keys
 
@@ -65,8 +64,3 @@ def test_every_key_is_offered_once_including_those_of_optional_tables() -> None:
     assert len(found) == len(set(found))
     assert {"speed", "trigger.policy", "trigger.sigma", "network.loss.probability",
             "plant.watchdog.policy", "seeds.loss"} <= set(found)  # fmt: skip
-
-
-def test_nothing_is_completed_without_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run_directories("") == []

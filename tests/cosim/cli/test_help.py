@@ -12,11 +12,13 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli import app
+<<<<<<< HEAD
 from cosim.cli.command import examples_of
 from netem import emulator_options as emulator
+=======
+from cosim.cli.program import examples_of
+>>>>>>> t3
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
-from netem.tc_words import parse
-from noack.core.errors import NoackError
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
@@ -37,17 +39,6 @@ def examples() -> list[tuple[str, str]]:
 def words_of(example: str) -> list[str]:
     """An example's arguments, without the redirection of its output."""
     return shlex.split(example.partition(">")[0])[1:]
-
-
-def test_the_help_begins_with_an_introduction() -> None:
-    text = help_of()
-    story, _, panels = text.partition("Options")
-    commands = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
-    assert commands == [
-        "doctor", "run", "view", "simulate", "certify", "fidelity", "compare", "campaign", "netem",
-    ]  # fmt: skip
-    assert all(f" {name} " in panels for name in COMMANDS)
-    assert "completion" not in panels
 
 
 @pytest.mark.parametrize("command", ["", *OURS])
@@ -133,20 +124,6 @@ def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
         "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
         "lab", "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
     }  # fmt: skip
-
-
-def test_the_emulators_examples_have_valid_arguments() -> None:
-    text = emulator.command_line_parser().format_help().replace(" \\\n", " ")
-    shown = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
-    assert len(shown) >= 5
-    for example in shown:
-        options = emulator.parsed(emulator.command_line_parser(), shlex.split(example))
-        parse(options.words or ())
-        if options.links is None:
-            emulator.specs_of(options)
-        else:
-            with pytest.raises(NoackError, match=r"links\.toml"):
-                emulator.specs_of(options)
 
 
 @pytest.mark.parametrize("command", OURS)

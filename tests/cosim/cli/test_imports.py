@@ -44,8 +44,8 @@ def test_a_command_with_a_module_of_its_own_imports_only_this_one() -> None:
 
 
 _LARGE = {
-    "asyncio", "cryptography", "matplotlib", "prometheus_client", "pyarrow", "rerun", "rich",
-    "scipy", "ssl",
+    "asyncio", "cryptography", "jinja2", "matplotlib", "prometheus_client", "pyarrow", "rerun",
+    "rich", "scipy", "ssl",
 }  # fmt: skip
 _BEFORE_THE_START = """
 from cosim.cli import main

@@ -41,17 +41,6 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
         found.close()
 
 
-def test_arguments_are_keys_and_values() -> None:
-    words = ["loss.p", "0.9", "mansd=2", "setpoint", "[1.0, 0.0]", "loss.model", "bernoulli"]
-    assert parsed(words) == {
-        "network.loss.probability": 0.9,
-        "network.mansd": 2,
-        "controller.setpoint": [1.0, 0.0],
-        "network.loss.model": "bernoulli",
-    }
-    assert parsed(["trigger.floor", "-0.5"]) == {"trigger.floor": -0.5}
-
-
 VALUES = {
     "loss": '{ model = "gilbert_elliott", mean_loss = 0.5, mean_burst = 3 }',
     "loss.p": "0.9",

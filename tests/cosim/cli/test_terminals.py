@@ -65,20 +65,6 @@ def test_a_terminal_receives_colours_unless_they_are_disabled(tmp_path: Path) ->
     assert not COLOUR.search(on_a_terminal("check", "lane_following", cwd=tmp_path, NO_COLOR="1"))
 
 
-def test_the_variable_no_color_disables_colours_in_tables(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    for name, value in (("TERM", "xterm-256color"), ("FORCE_COLOR", "1")):
-        monkeypatch.setenv(name, value)
-    assert COLOUR.search(CliRunner().invoke(app, SIMULATE).stdout)
-    monkeypatch.setenv("NO_COLOR", "1")
-    done = CliRunner().invoke(app, SIMULATE)
-    assert done.exit_code == 0
-    assert not COLOUR.search(done.stdout)
-
-
 def test_a_dumb_terminal_receives_no_control_characters(tmp_path: Path) -> None:
     output = on_a_terminal(*SIMULATE, cwd=tmp_path, TERM="dumb")
     assert all(one.isprintable() or one in "\r\n" for one in output), output

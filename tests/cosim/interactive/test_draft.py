@@ -15,7 +15,6 @@ from cosim.interactive.draft import (
     draft_of_query,
     known_scenarios,
     open_draft,
-    value_text,
 )
 from cosim.shipped_files import shipped_names
 from noack.core.errors import CallerError
@@ -76,11 +75,6 @@ def test_any_value_at_any_place_is_read_back(key: str, value: object) -> None:
     assert toml_file.parsed(changed.without(key).text, "") == changed.without(key).content
 
 
-def test_values_are_written_on_one_line() -> None:
-    written = value_text({"a": [1, 2.5], "b": "x", "c": {"d": True}})
-    assert written == '{ a = [1, 2.5], b = "x", c = { d = true } }'
-
-
 def test_mistakes_are_shown_at_their_keys() -> None:
     draft = open_draft("lane_following")
     wrong = draft.with_value("network.loss.probability", 2.0).with_value("trigger.beta", -1.0)
@@ -121,23 +115,6 @@ def test_every_choice_gives_a_valid_scenario() -> None:
                 for place in slider.ends:
                     if slider.key != "network.loss.mean_loss":  # limited by the mean burst
                         assert dragged(other, slider, slider.value_at(place)).scenario
-
-
-def test_a_slider_covers_two_decades_and_rounds() -> None:
-    sliders = {one.key: one for one in controls_of(open_draft("lane_following")).sliders}
-    beta = sliders["trigger.beta"]
-    assert (beta.low, beta.high) == (0.05, 5.0)
-    assert beta.value_at(beta.position) == 0.5
-    assert beta.value_at(99.0) == 5.0
-    assert sliders["network.mansd"].value_at(3.7) == 4
-
-
-def test_the_window_of_losses_can_be_dragged() -> None:
-    draft = chosen(open_draft("lane_following"), "network.constraints", "at_most")
-    keys = [one.key for one in controls_of(draft).sliders]
-    assert "network.constraints.0.losses" in keys
-    moved = draft.with_value("network.constraints.0.window", 12)
-    assert moved.scenario.network.constraints[0].model_dump()["window"] == 12
 
 
 def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:

@@ -33,13 +33,6 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert found.e_s_norm[first + 1] == 0.0
 
 
-def test_the_sensor_error_stays_at_or_below_its_threshold() -> None:
-    found = exploration.explore(noack.load("lane_following"))
-    assert found.threshold is not None
-    # Event 0 is at t = 0, before the models know the state.
-    assert (found.e_s_norm <= found.threshold * (1 + 1e-9)).all()
-
-
 def test_the_controllers_curves_begin_with_its_first_update() -> None:
     found = exploration.explore(noack.load("lane_following"))
     assert found.e_c_norm[0] == pytest.approx(found.x_norm[0])  # it knows no state
@@ -109,17 +102,6 @@ def test_a_scenario_without_exact_simulation_is_refused_with_the_reason() -> Non
     assert exploration.why_not_exact(noack.load("lane_following")) is None
 
 
-def test_a_simulated_run_is_drawn_with_its_events() -> None:
-    scenario = noack.load("double_integrator", {"horizon_s": 3.0, "observer": {
-        "kind": "luenberger", "gain": [[40.0, 0.0], [0.0, 40.0]],
-    }})  # fmt: skip
-    assert exploration.why_not_exact(scenario) is not None
-    found = exploration.simulate_sampled(scenario)
-    assert found.kind == exploration.SAMPLED
-    assert len(found.t_s) == len(found.x) == len(found.e_c_norm)
-    assert len(found.event_s) == len(found.delivered) > 0
-
-
 @pytest.mark.parametrize("name", ["lane_following", "double_integrator"])
 def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str) -> None:
     scenario = noack.load(name, {"network.initial_sync": "known_state"})
@@ -132,18 +114,6 @@ def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str)
         exact = run_continuous(drawn_scenario(scenario, 7, draw)).at(t_s)
         wanted = np.stack(exact[1:], axis=1)
         np.testing.assert_allclose(states[draw], wanted, rtol=1e-6, atol=1e-8)
-
-
-def test_the_bands_contain_the_draws() -> None:
-    scenario = noack.load("lane_following")
-    found = ensemble.explore_ensemble(scenario, draws=40)
-    assert found.draws == 40
-    assert (found.diverged, found.failed) == (0, 0)
-    for band in (*found.states, found.x_norm, found.e_c_norm):
-        assert (band.low <= band.middle).all()
-        assert (band.middle <= band.high).all()
-    x0 = resolve(scenario).plant.initial_state
-    assert [band.middle[0] for band in found.states] == pytest.approx(list(x0))
 
 
 def test_draws_that_diverge_are_counted_and_widen_the_band() -> None:
@@ -168,11 +138,3 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     assert missing.verdict == guarantee.NOT_COVERED
     assert "not linear" in missing.reason
     assert np.isnan(missing.e_c).all()
-
-
-def test_a_margin_is_given_for_time_triggered_loops_only() -> None:
-    found = guarantee.margin_of(noack.load("lane_periodic"))
-    assert found.defined
-    assert "stable for every pattern with M ≤ 6" in found.verdict
-    assert [row[0] for row in found.rows] == [str(m) for m in range(1, 8)]
-    assert not guarantee.margin_of(noack.load("lane_following")).defined

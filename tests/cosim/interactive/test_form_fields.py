@@ -82,14 +82,6 @@ def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
     }
 
 
-def test_another_loss_model_begins_with_an_example() -> None:
-    draft = filled(open_draft("lane_following"), field("network.loss.model"), "gilbert_elliott")
-    assert draft.value("network.loss") == {
-        "model": "gilbert_elliott", "mean_loss": 0.5, "mean_burst": 3.0
-    }  # fmt: skip
-    assert draft.scenario.network.loss.model == "gilbert_elliott"  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize("kind", field("trigger.policy").options)
 def test_every_trigger_policy_has_its_own_fields(kind: str) -> None:
     draft = filled(open_draft("lane_following"), field("trigger.policy"), kind)

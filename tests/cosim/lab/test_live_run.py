@@ -70,15 +70,6 @@ def test_an_error_ends_it() -> None:
     assert run.lines == ["the port is taken"]
 
 
-def test_the_log_is_bounded() -> None:
-    run = LiveRun(20.0)
-    for number in range(1000):
-        run._take(f"line {number}")
-    assert len(run.lines) == 200
-    assert run.lines[-1] == "line 999"
-    assert run.first_line == 800
-
-
 def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
     text = open_draft("double_integrator").with_value("horizon_s", 1.0).text
     command = python_command("-m", "cosim.lab.live_run", tmp_path, tmp_path / "runs")

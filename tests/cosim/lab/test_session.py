@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from cosim.interactive.draft import open_draft
-from cosim.interactive.exploration_figure import CERTIFICATE, ENSEMBLE, MARGIN, RUN
+from cosim.interactive.exploration_figure import CERTIFICATE
 from cosim.interactive.scenario_guarantee import VOID, Margin
 from cosim.lab import lab_services as under_test
 from cosim.lab.lab_services import PageCalls, Session
@@ -53,15 +53,6 @@ async def settled(found: Session) -> None:
     await found.change(found.draft)
     assert found._later is not None
     await found._later
-
-
-def test_certificate_and_margin_follow_the_run(drawn: list[Session]) -> None:
-    found = session_of("lane_following", drawn, horizon_s=2.0)
-    asyncio.run(settled(found))
-    assert found.results is not None
-    assert found.results.known == {RUN, CERTIFICATE, ENSEMBLE, MARGIN}
-    assert len(drawn) == 4
-    assert found.results.warning == ""
 
 
 class Watched(Inline):

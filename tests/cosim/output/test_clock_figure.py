@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from cosim.output.figure_drawing import draw
+<<<<<<< HEAD
 from cosim.output.run_figures import run_figures
+=======
+from cosim.output.run_figures import clock_errors, run_figures
+>>>>>>> t3
 from cosim.output.run_tables import key_numbers, short_numbers
 from cosim.output.timing_figures import ClockErrors, clock_errors
 from cosim.record.run_record import RunRecord
@@ -54,10 +58,6 @@ def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
     assert np.nanmax(curve.get_ydata()) == pytest.approx(SENSOR_NS * 1e-3)
     assert cross.get_xdata().tolist() == pytest.approx([FIRST_LOST * 0.05])
     assert set(limit.get_ydata()) == {ALLOWED_US}
-
-
-def test_a_bound_that_was_never_known_is_no_number() -> None:
-    assert ClockErrors(np.zeros(2), np.full(2, np.nan)).largest_us is None
 
 
 def test_one_clock_has_no_figure(clocked: RunRecord) -> None:

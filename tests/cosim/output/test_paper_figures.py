@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.output.figure_description import Axis, FigureDescription, Line, Panel, one_panel
+from cosim.output.figure_description import Axis, Line, Panel, one_panel
 from cosim.output.figure_drawing import draw
-from cosim.output.figure_files import file_content, save_figures
-from cosim.output.figure_format import FigureFormat, figure_files
+from cosim.output.figure_files import file_content
+from cosim.output.figure_format import FigureFormat
 from cosim.output.figure_layout import figure_width
 from noack.core.errors import CallerError
 
@@ -39,18 +39,6 @@ def test_texts_of_a_pdf_have_the_fonts_of_latex() -> None:
         assert font in pdf
     assert b"/Type3" not in pdf.replace(b" ", b"")  # refused by publishers
     assert written.isdisjoint(text.get_text() for text in draw(figure).findobj(Text))
-
-
-def test_nothing_is_drawn_without_a_format(tmp_path: Path) -> None:
-    def drawn(name: str) -> FigureDescription:
-        x = np.arange(3.0)
-        line = Line(x=x, y=x, colour=(0, 0, 0))
-        return one_panel(name, Panel(items=[line], x=Axis(), y=Axis()), 1.0)
-
-    assert save_figures(map(drawn, "ab"), tmp_path / "p.html", None) == []
-    two = map(drawn, "ab")
-    found = save_figures(two, tmp_path / "p.html", figure_files("pdf"))
-    assert found == [tmp_path / "p-figures/a.pdf", tmp_path / "p-figures/b.pdf"]
 
 
 def test_the_figures_of_a_report_are_written(tmp_path: Path) -> None:

@@ -74,25 +74,6 @@ def test_tables_of_a_run_compile_and_have_its_numbers(tmp_path: Path) -> None:
     assert compiled(body, ("booktabs",), tmp_path).exists()
 
 
-@pytest.mark.parametrize(("words", "names"), [
-    (("certify", "lane_following"), ["certificates", "limits"]),
-    (("margin", "lane_periodic", "--most", "2", "--no-period"), ["margin"]),
-])  # fmt: skip
-def test_commands_write_their_tables(
-    words: tuple[str, ...], names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, [*words, "--tables", "tables"])
-    assert done.exit_code == 0, done.output
-    found = sorted(path.name for path in (tmp_path / "tables").iterdir())
-    assert found == [f"{name}.{ending}" for name in names for ending in ("csv", "tex")]
-    assert f"tables/{names[0]}.tex" in done.stdout
-    first = rows_of(tmp_path / "tables" / f"{names[0]}.csv")
-    assert len({len(row) for row in first}) == 1
-    body = "\n\n".join(rf"\input{{tables/{name}.tex}}" for name in names)
-    compiled(body, ("booktabs",), tmp_path)
-
-
 def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> None:
     grid: dict[str, Any] = {
         "name": "losses", "scenario": "double_integrator", "draws": 2,

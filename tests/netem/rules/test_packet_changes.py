@@ -27,38 +27,12 @@ def test_an_empty_payload_is_not_corrupted(decide: Any) -> None:
     assert decided.fates.tolist() == [0, 3] * 50
 
 
-def test_packets_that_must_pass_are_not_corrupted(decide: Any) -> None:
-    decided = decide("corrupt 100% mansd 2 first", 9)
-    assert decided.fates.tolist() == [2, 3, 3] * 3
-    assert ((decided.decisions["bit"] < 0) == (decided.fates == 2)).all()
-
-
-def test_copies_are_corrupted_independently(decide: Any, share_is: Callable[..., None]) -> None:
-    """If corruption comes after duplication. Otherwise both carry the same flipped bit."""
-    after = decide("duplicate 100% corrupt 40%", 200_000).decisions
-    first, second = after["bit"] >= 0, after["copy_bit"] >= 0
-    share_is(first, 0.4)
-    share_is(second, 0.4)
-    share_is(first & second, 0.16)
-    # An intact copy counts as delivery of the original.
-    np.testing.assert_array_equal(after["fate"] == 3, first & second)
-    before = decide("corrupt 40% duplicate 100%", 1000).decisions
-    np.testing.assert_array_equal(before["bit"], before["copy_bit"])
-
-
 def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> None:
     decided = decide("duplicate 20%", 100_000)
     copied = decided.decisions["copy_ns"] >= 0
     share_is(copied, 0.2)
     assert (decided.fates == 0).all()
     assert (decided.decisions["copy_ns"] == np.where(copied, decided.arrivals_ns, -1)).all()
-
-
-def test_a_lost_packet_has_no_copy(decide: Any) -> None:
-    for words in ("loss 50% duplicate 100%", "duplicate 100% loss 50%"):
-        decided = decide(words, 1000)
-        assert ((decided.decisions["copy_ns"] >= 0) == (decided.fates == 0)).all()
-        assert 0 < np.count_nonzero(decided.fates) < 1000
 
 
 def test_the_earlier_of_original_and_copy_leaves_first(decide: Any) -> None:

@@ -75,15 +75,6 @@ def test_a_mat_file_has_the_record(run: noack.Run, tmp_path: Path) -> None:
     assert run.export(path)[0].read_bytes() == path.read_bytes()
 
 
-def test_certificates_are_written_as_mat(tmp_path: Path) -> None:
-    path = tmp_path / "c.mat"
-    done = CliRunner().invoke(app, ["certify", "lane_following", "--out", str(path)])
-    assert done.exit_code == 0
-    document = noack.certify("lane_following").to_json()
-    found = loadmat(path, simplify_cells=True)
-    assert found["paper"]["theorem_2"]["delta"] == document["paper"]["theorem_2"]["delta"]
-
-
 def test_any_document_becomes_structures(tmp_path: Path) -> None:
     content = {
         "a b": None, "a_b": [1, 2.5], "1": [[1, 2], [3, 4]], "_x": ["p", "", None], "n" * 80: True,

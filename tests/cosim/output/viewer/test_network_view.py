@@ -7,7 +7,6 @@ import numpy as np
 from cosim.analysis.network_summary import INTERVALS, QUANTILES, loops_over_time, summarise_run
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary
-from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.run_recording import (
     ERROR,
     MAP,
@@ -18,13 +17,12 @@ from cosim.output.viewer.run_recording import (
     usual_largest,
     write_view,
 )
-from cosim.record.align import align_tables
 from cosim.record.run_directory import RECORDING_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.scenario.scenario_file import load
-from tests.cosim.output.viewer.test_viewer import Chunks, of_views, read, series
+from tests.cosim.output.viewer.test_viewer import Chunks, read, series
 
 MAX_BYTES = 3_000_000
 
@@ -45,23 +43,6 @@ def shown(folder: Path, count: int) -> tuple[RecordedRun, list[LoopSummary], Chu
     return run, loops, read(folder / RECORDING_FILE)
 
 
-def test_of_few_loops_each_is_recorded_in_the_time_of_the_run(tmp_path: Path) -> None:
-    run, loops, found = shown(tmp_path, 3)
-    over_time = loops_over_time(run)
-    _, errors = series(found, ERROR)
-    largest = np.nanmax(over_time.errors, axis=1)
-    np.testing.assert_allclose(10 ** np.nanmax(errors, axis=0), largest, rtol=1e-9)
-    for loop, record in zip(loops, run.loops, strict=True):
-        folder = bp.loop_folder(loop.name)
-        aligned = align_tables(record)
-        t_ns, states = series(found, f"{folder}{bp.state_path('angle')}")
-        np.testing.assert_array_equal(states[:, 0], aligned.x[:, 0])
-        assert any(one.startswith(f"{folder}picture/") for one in found)
-        assert np.ptp(t_ns - aligned.t_ns) == 0
-    origins = of_views(read(tmp_path / RECORDING_FILE, "blueprint"), "ViewBlueprint:space_origin")
-    assert {f"loops/p-{i}/picture" for i in (1, 2, 3)} < {one.strip("/") for one in origins}
-
-
 def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path) -> None:
     run, _, found = shown(tmp_path, 100)
     over_time = loops_over_time(run)
@@ -78,15 +59,6 @@ def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path
     assert series(found, SHARE)[1][-1, -1] <= 100
     assert MAP in found
     assert (tmp_path / RECORDING_FILE).stat().st_size < MAX_BYTES
-
-
-def test_the_map_has_the_colours_of_the_norms() -> None:
-    errors = np.array([[1.0, 0.0, np.nan], [0.1, 0.1, 0.1]])
-    pixels = map_pixels(errors)
-    high, wide = pixels.shape[0] // 2, pixels.shape[1] // 3
-    found = pixels[::high, ::wide].tolist()
-    assert found[0] == [[253, 231, 36], [68, 1, 84], [0, 0, 0]]  # the ends of viridis
-    assert found[1][0] == found[1][2] not in found[0]
 
 
 def test_a_loop_that_diverges_does_not_hide_the_others() -> None:

@@ -24,7 +24,6 @@ from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.core.linear_systems import Propagator
 from noack.protocol.record_tables import Fate
-from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import load
 
@@ -64,23 +63,6 @@ def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     place = np.array(found["translation"], dtype=float)[:, 0, :2] * (1, -1)
     quaternion = np.array(found.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
     return place, -2 * np.arctan2(quaternion[:, 2], quaternion[:, 3])
-
-
-@pytest.mark.parametrize(
-    ("scenario", "kind", "title"),
-    [
-        ("lane_following", LanePicture, "lane"),
-        ("lane_weighted", LanePicture, "lane"),
-        ("lane_acknowledged", LanePicture, "lane"),
-        ("unstable_pendulum", PendulumPicture, "pendulum"),
-        ("cart_pole", PendulumPicture, "cart and its pole"),
-        ("tabuada_dynamic", PhasePicture, "phase plot"),
-    ],
-)
-def test_a_plant_has_the_picture_of_its_kind(scenario: str, kind: type, title: str) -> None:
-    picture = picture_of(resolve(load(ROOT / "scenarios" / f"{scenario}.toml")))
-    assert type(picture) is kind
-    assert title in picture.title
 
 
 @pytest.mark.parametrize("name", PICTURES)
@@ -158,20 +140,6 @@ def test_tank_levels_are_drawn_to_scale() -> None:
     np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
 
 
-def test_a_trail_continues_from_batch_to_batch() -> None:
-    frames = frames_of(2, 0, k=12)
-    whole = PhasePicture(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
-    picture = PhasePicture(["a", "b"], np.ones(2))
-    pieces = [
-        row
-        for i in range(0, 12, 4)
-        for row in arrays(
-            picture.frames(frames.at(np.isin(np.arange(12), range(i, i + 4))))["plant/trail"]
-        )["strips"]
-    ]
-    assert pieces == arrays(whole)["strips"]
-
-
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
     """The visible rows of each entity at each time."""
     found: dict[str, dict[int, list[Any]]] = {}
@@ -213,44 +181,7 @@ def test_each_packet_is_drawn_with_its_fate() -> None:
     assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 9.3
 
 
-def test_a_packet_is_drawn_inside_the_network_for_its_delay() -> None:
-    seen = rows_of(sent(NetworkDiagram(), PACKETS[:1], delay_s=0.8), [3 * S])
-    inside = [float(np.float32(8.8)), 0.0]
-    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if inside in shapes]
-    assert min(waiting) == pytest.approx((0.5 + LEG_S) * S, abs=S / 50)
-    assert max(waiting) == pytest.approx(1.3 * S, abs=S / 50)
-
-
 def test_the_diagram_does_not_depend_on_the_batches() -> None:
     whole = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
     assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == whole
-
-
-def test_many_packets_are_thinned_and_an_idle_network_draws_nothing() -> None:
-    diagram = sent(NetworkDiagram(), [(i / 1000, Fate.DELIVERED) for i in range(2000)])
-    seen = rows_of(diagram, [2 * S])
-    assert max(len(shapes) for shapes in seen["broadcast"].values()) <= LEG_S / 0.025 + 1
-    rows_of(diagram, [3 * S])
-    assert diagram.advance(100 * S) == {}
-
-
-@pytest.mark.parametrize(
-    ("flow", "begin", "end"), [(Flow.ACKNOWLEDGEMENT, 10.5, 6.5), (Flow.ACTUATION, 12.5, 1.0)]
-)
-def test_what_the_controller_sends_is_drawn_to_its_receiver(
-    flow: Flow, begin: float, end: float
-) -> None:
-    diagram = NetworkDiagram(flow)
-    diagram.add(
-        np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),
-        reverse=True,
-    )  # fmt: skip
-    seen = rows_of(diagram, [4 * S])
-    assert seen.keys() == {"reverse", "lost"}
-    (first, *_, last) = [
-        shapes[0][0] for t_ns, shapes in sorted(seen["reverse"].items())
-        if shapes and t_ns < 1.5 * S
-    ]  # fmt: skip
-    assert first > begin
-    assert last < end

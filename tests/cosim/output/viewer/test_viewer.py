@@ -3,7 +3,6 @@ import http.client
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -372,29 +371,6 @@ def test_a_live_viewer_receives_the_growing_file_to_its_end(tmp_path: Path, live
     assert not is_left(group)
 
 
-def test_a_stalled_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
-    path = tmp_path / "recording.rrd"
-    view = new_view(path, live=live)
-    assert live.url is not None
-    parts = urlsplit(live.url + RECORDING)
-    with socket.create_connection((str(parts.hostname), parts.port)) as viewer:
-        viewer.sendall(f"GET {parts.path} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
-        assert viewer.recv(12) == b"HTTP/1.0 200"
-        add_samples(view, 500)
-        view.close()
-        assert (group := live.pid) is not None
-        assert is_left(group)
-        live.close()
-        assert not is_left(group)
-        received = 0
-        with contextlib.suppress(ConnectionResetError):
-            while block := viewer.recv(1 << 16):
-                received += len(block)
-    # The file is larger than all buffers in between, so the viewer's download did stall.
-    assert received < path.stat().st_size
-    assert rows_of(path) == 500 * K
-
-
 def test_a_viewer_that_does_not_start_is_reported_and_the_run_is_recorded(
     tmp_path: Path, live: LiveView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -500,6 +476,17 @@ def test_a_file_that_is_not_a_recording_is_not_served(
         view_recording(path)
 
 
+def listening(viewer: "subprocess.Popen[str]") -> list[str]:
+    """Where a viewer listens: one port is for the page and the recording, one for rerun's files."""
+    process = psutil.Process(viewer.pid)
+    return [
+        address.laddr.ip
+        for one in (process, *process.children())
+        for address in one.net_connections("inet")
+        if address.status == psutil.CONN_LISTEN
+    ]
+
+
 @pytest.mark.parametrize(
     ("sent", "status"),
     [
@@ -521,14 +508,7 @@ def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
         page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
         assert get(page)[0] == 200
         assert get(page + RECORDING) == (200, path.read_bytes())
-        processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
-        listening = [
-            one.laddr.ip
-            for process in processes
-            for one in process.net_connections("inet")
-            if one.status == psutil.CONN_LISTEN
-        ]
-        assert listening == ["127.0.0.1"] * 2  # the page with the recording, and rerun's own files
+        assert listening(child) == ["127.0.0.1"] * 2
         child.send_signal(sent)
         assert child.wait() == status
         wait_for(lambda: not is_left(child.pid))
@@ -593,15 +573,7 @@ def test_a_browser_is_served_with_a_display_if_no_window_is_wanted(
             assert child.stdout is not None
             page = next(word for word in child.stdout.readline().split() if "http" in word)
             assert get(page + RECORDING) == (200, path.read_bytes())
-            processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
-            listening = [
-                address.laddr.ip
-                for process in processes
-                for address in process.net_connections("inet")
-                if address.status == psutil.CONN_LISTEN
-            ]
-            assert len(listening) == 2  # the page with the recording, and rerun's own files
-            assert set(listening) == {"127.0.0.1"}
+            assert listening(child) == ["127.0.0.1"] * 2
         finally:
             child.send_signal(signal.SIGTERM)
             assert child.wait() == ExitStatus.TERMINATED
