@@ -12,12 +12,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli import app
-<<<<<<< HEAD
 from cosim.cli.command import examples_of
-from netem import emulator_options as emulator
-=======
-from cosim.cli.program import examples_of
->>>>>>> t3
 from netem.control.emulator_commands import COMMANDS as EMULATOR_COMMANDS
 
 PROGRAM: Any = get_command(app)

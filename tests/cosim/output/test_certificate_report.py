@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-<<<<<<< HEAD
 from cosim.analysis.certificates import (
-    IDEAL,
-    SCHEDULE,
-=======
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.cli import app
-from cosim.output.certificates import (
->>>>>>> t3
     Certificates,
     certificates_of,
     with_weight,

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 
 from cosim.output.figure_drawing import draw
-<<<<<<< HEAD
 from cosim.output.run_figures import run_figures
-=======
-from cosim.output.run_figures import clock_errors, run_figures
->>>>>>> t3
 from cosim.output.run_tables import key_numbers, short_numbers
-from cosim.output.timing_figures import ClockErrors, clock_errors
+from cosim.output.timing_figures import clock_errors
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, clock_table
