@@ -266,14 +266,14 @@ class ControlPlane:
         content: str | bytes,
         header: bytes = b"",
         priority: Priority | None = None,
-        congestion_control: CongestionControl | None = None,
+        congestion: CongestionControl | None = None,
     ) -> None:
         """Send a message to the subscribers of a key."""
         key = self.key(*parts)
+        sent_as = label(key, header)
         self.session.put(
-            key, content, attachment=label(key, header),
-            priority=priority, congestion_control=congestion_control,
-        )  # fmt: skip
+            key, content, attachment=sent_as, priority=priority, congestion_control=congestion
+        )
 
     def request_stop(self, reason: str) -> None:
         """Ask all processes of the run to stop."""
@@ -282,7 +282,7 @@ class ControlPlane:
     def acknowledge_rows(self, role: str, content: object) -> None:
         """Confirm to a process which of its rows are on disk."""
         drop = CongestionControl.DROP
-        self.publish("persisted", role, content=message_json(content), congestion_control=drop)
+        self.publish("persisted", role, content=message_json(content), congestion=drop)
 
     def persisted(self) -> bytes | None:
         """The recorder's newest confirmation of rows of this process; None without a new one."""
@@ -313,17 +313,14 @@ class ControlPlane:
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
-        self.publish(
-            "telemetry", self.role, table, content=payload, header=header,
-            priority=Priority.BACKGROUND, congestion_control=CongestionControl.DROP,
-        )  # fmt: skip
+        key, low = ("telemetry", self.role, table), Priority.BACKGROUND
+        drop = CongestionControl.DROP
+        self.publish(*key, content=payload, header=header, priority=low, congestion=drop)
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch outside the loop; block until there is room."""
-        block = CongestionControl.BLOCK
-        self.publish(
-            "telemetry", self.role, table, content=payload, header=header, congestion_control=block
-        )
+        key, block = ("telemetry", self.role, table), CongestionControl.BLOCK
+        self.publish(*key, content=payload, header=header, congestion=block)
 
     @staticmethod
     def answer(query: zenoh.Query, content: object) -> None:

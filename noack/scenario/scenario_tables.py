@@ -5,7 +5,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat
 
@@ -39,14 +39,6 @@ from noack.settings.section import ScenarioSection, period_ns
 from noack.trigger.decaying import DecayingSettings
 
 MOST_CHANGES = 256  # largest number of scheduled changes in a run
-
-
-class _Printer(Protocol):
-    """The printer of IPython."""
-
-    def text(self, text: str) -> object:
-        """Add text to the output."""
-        ...
 
 
 class ScenarioTables(ScenarioSection):
@@ -107,7 +99,7 @@ class ScenarioTables(ScenarioSection):
         """The most important settings, in a few lines."""
         return as_text(self._rows())
 
-    def _repr_pretty_(self, printer: "_Printer", cycle: bool) -> None:
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         """Show the same text in IPython."""
         printer.text(str(self))
 
