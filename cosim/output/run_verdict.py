@@ -238,7 +238,8 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
         severe = one.cause not in CAUSES  # the guarantee, or a change
         yield Remark(f"assumption violated at {where}: {one.what}", severe=severe)
     if (more := len(violations) - _MOST_VIOLATIONS) > 0:
-        yield Remark(f"{more} more violations of this kind", severe=True)
+        plural = "s" * (more > 1)
+        yield Remark(f"{more} more violation{plural} of an assumption", severe=True)
     if loop.replay is not None and loop.replay.bit_exact is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary, loop))

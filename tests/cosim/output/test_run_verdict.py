@@ -164,7 +164,7 @@ def test_a_broken_guarantee_is_shown_as_an_error(outcome: Outcome) -> None:
     again = [LOST | {"what": f"MANSD violated: {n} lost"} for n in range(7, 13)]
     text = printed(outcome, assumption_violations=[LOST, *again])
     assert text.count("assumption violated at t = 2.500 s (reported by controller): MANSD") == 5
-    assert "1 more violations of this kind" in text
+    assert "1 more violation of an assumption" in text
     assert RED in text
 
 
