@@ -2,9 +2,9 @@
 
 import select
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from netem.link_state import Integers, LinkState
 from netem.relay_links import EVENT
@@ -46,7 +46,7 @@ class RelayMemory:
         self.data: Array = np.zeros(_DATA_BYTES if taps == 2 else 0, np.uint8)
         self.packets: Array = np.zeros(row_count, PACKET_ROW)
         self.releases: Array = np.zeros(row_count, RELEASE_ROW)
-        self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.dtype(np.uint8))
+        self._scratch = zeros_in_lines(core.noack_relay_scratch_bytes(), np.uint8)
         self.core: CData = ffi.new("noack_relay *", {
             "links": links, "epoll": self._epoll.fileno(), "only_socket": -1,
             "clock": {"speed": 1.0}, "change_ns": 2**63 - 1, "segment": segment,
@@ -228,10 +228,12 @@ def has_headroom(wanted_bytes: int = 0) -> bool:
     return True
 
 
-def zeros_in_lines(count: int, dtype: np.dtype[Any]) -> Array:
-    """Return an array of zeros, (count,), that begins at a cache line: a multiple of 64 bytes."""
-    room = np.zeros(count * dtype.itemsize + 64, np.uint8)
-    return np.frombuffer(room, dtype, count, -room.ctypes.data % 64)
+def zeros_in_lines(count: int, dtype: DTypeLike) -> Array:
+    """Return zeros, (count,), that begin at a cache line: at a multiple of 64 bytes."""
+    size_bytes = count * np.dtype(dtype).itemsize
+    room = np.zeros(size_bytes + 64, np.uint8)
+    begin = -room.ctypes.data % 64
+    return room[begin : begin + size_bytes].view(dtype)
 
 
 def doubled(array: Array) -> Array:
