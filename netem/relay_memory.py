@@ -234,8 +234,10 @@ _Element = TypeVar("_Element", bound=np.generic)
 
 def zeros_in_lines(count: int, dtype: np.dtype[_Element]) -> NDArray[_Element]:
     """Return an array of zeros, (count,), that begins at a cache line: a multiple of 64 bytes."""
-    room = np.zeros(count * dtype.itemsize + 64, np.uint8)
-    return np.frombuffer(room, dtype, count, -room.ctypes.data % 64)
+    size_bytes = count * dtype.itemsize
+    room = np.zeros(size_bytes + 64, np.uint8)
+    begin = -room.ctypes.data % 64
+    return room[begin : begin + size_bytes].view(dtype)
 
 
 def doubled(array: Rows) -> Rows:
