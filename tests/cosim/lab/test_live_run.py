@@ -40,7 +40,8 @@ def test_the_states_follow_each_other() -> None:
     said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
     assert run.is_over
     assert run.ok
-    assert run.progress["events"] == 3
+    assert run.progress is not None
+    assert run.progress.events == 3
     assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
 
 
