@@ -5,6 +5,7 @@ up takes the core at once. What is not computed when the run ends, or is lost wi
 computed then.
 """
 
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -29,6 +30,8 @@ Item = TypeVar("Item", bound=Hashable)
 _MANY_STEPS = 50_000
 """Loops with fewer steps of the plant, all together, are judged in less time than processes
 start."""
+_GRACE_S = 2.0
+"""Wall time for what is being prepared when the run ends."""
 _LOOPS_AT_ONCE = 16
 """The end of a run waits for the preparation of so many loops at most."""
 
@@ -86,10 +89,19 @@ class EndHelpers:
         return found if len(found) == len(loops) else None
 
     def start(self) -> None:
-        """Have processes that are free; prepare no more."""
+        """Have processes that are free; prepare no more.
+
+        On a busy machine idle priority gets almost no time: what is not prepared soon is given up.
+        """
         self._due.clear()
+        until_s = time.monotonic() + _GRACE_S
         for thread in self._threads:
-            thread.join()
+            thread.join(max(until_s - time.monotonic(), 0.0))
+        if any(thread.is_alive() for thread in self._threads):
+            self._abort()
+            for thread in self._threads:
+                thread.join()
+            self._pool = None
         if self._pool is None and self.count:
             self._pool = self._stack.enter_context(processes(self.count))
 
@@ -152,7 +164,11 @@ class EndHelpers:
     def close(self) -> None:
         """End the processes."""
         self._due.clear()
-        self._stack.close()
+        self._abort()
+
+    def _abort(self) -> None:
+        """End the processes, also those that still compute."""
+        self._stack.__exit__(TimeoutError, TimeoutError(), None)
 
 
 @contextmanager

@@ -120,7 +120,9 @@ def state_text(largest: float | None, final: float | None, diverged_at_s: float 
     word = state_of(largest, final, diverged_at_s)
     if not word or diverged_at_s is not None:
         return word
-    return f"{word}, ‖x‖ ≤ {largest:.3g}, {final:.3g} at the end"
+    if word == "stable":
+        return f"{word}, ‖x‖ fell from {largest:.3g} to {final:.3g}"
+    return f"{word}, ‖x‖ was at most {largest:.3g}, at the end {final:.3g}"
 
 
 def _states(loops: Sequence[LoopSummary]) -> str:
@@ -171,7 +173,9 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         return Guarantee(DOUBTFUL, 0.0, why or "no certificate covers this loop")
     void = [claim for claim in loop.claims if claim.verdict == "void"]
     late = [one.what for one in loop.assumption_violations if one.cause in SCHEDULE]
-    covered = f"certified for its lateness: {late[0]}" if late and loop.certified_for else ""
+    covered = (
+        f"certificate recomputed for its lateness: {late[0]}" if late and loop.certified_for else ""
+    )
     if not void:
         return Guarantee(GOOD, 0.0, covered)
     since_s, why = min(
@@ -179,7 +183,7 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         for claim in void
     )
     if late and late[0] == why and not loop.missing_samples:
-        why += "; no certificate covers that"
+        why = f"at worst {why}; no certificate covers that"
     if any(claim.verdict == "held" for claim in certified):
         unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
         return Guarantee(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
@@ -201,7 +205,9 @@ def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
     since = f"{one.since_s:.3f} s"
     if worst == GOOD:
         where = "" if len(loops) == 1 else f" in all {len(loops)} loops"
-        text = f"guarantee kept{where}: {claims}" + (f"; {name}{one.why}" if one.why else "")
+        others = sum(bool(other.why) for other, _ in concerned) - 1
+        more = f" (and {others} more {'loop' if others == 1 else 'loops'})" if others > 0 else ""
+        text = f"guarantee kept{where}: {claims}" + (f"; {name}{one.why}{more}" if one.why else "")
     elif worst == BAD:
         where = "" if len(loops) == 1 else f" in {count} loops,"
         text = f"guarantee broken{where} since {since}{why}"

@@ -61,8 +61,8 @@ CAUSES = {
 
 The other assumptions are the rules of the guarantee, under their own names; "dropouts" is the limit
 of consecutive losses."""
-SCHEDULE = ("sampling", "delay", "hold", "start")
-"""The assumptions whose limits are times of a certificate's conditions, ``sampling_s`` and so on.
+SCHEDULE = ("delay", "hold", "start")
+"""The assumptions about lateness; their limits are ``delay_s`` and so on of the conditions.
 
 A certificate holds for every run that meets its conditions, however they were chosen. So a run that
 was later than its scenario allows has the certificate for the times that it took, if there is one.
@@ -233,18 +233,17 @@ class ObservedConditions(NamedTuple):
 
         Each time of ``SCHEDULE`` is the allowed one, or what the run took, if that was more.
         """
-        observed = {"start_s": self.start_s if np.isfinite(self.start_s) else None} | {
-            f"{name}_s": series.before(until_s).largest()
-            for name, series in (
-                ("sampling", self.sampling), ("delay", self.delay), ("hold", self.hold),
-            )
-        }  # fmt: skip
-        most = {
-            name: max(getattr(allowed, name), value)
-            for name, value in observed.items()
-            if value is not None
-        }
-        return allowed._replace(**most)
+
+        def wider(limit_s: float, series: SampledSeries) -> float:
+            value_s = series.before(until_s).largest()
+            exceeds = value_s is not None and limit_s + _TOLERANCE_S < value_s < np.inf
+            return value_s if value_s is not None and exceeds else limit_s
+
+        return allowed._replace(
+            delay_s=wider(allowed.delay_s, self.delay),
+            hold_s=wider(allowed.hold_s, self.hold),
+            start_s=wider(allowed.start_s, SampledSeries(np.zeros(1), np.array([self.start_s]))),
+        )
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""

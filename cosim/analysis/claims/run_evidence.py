@@ -236,8 +236,10 @@ class RunEvidence:
     def violations(self) -> list[AssumptionViolation]:
         """The assumptions that the run violated, the guarantee included, each at the first time."""
         scenario = self.record.scenario
-        causes = {*causes_of(scenario), *guarantee_causes(scenario)}
-        found = self.observed.violations(self._allowed, causes)
+        rules = {*guarantee_causes(scenario)}
+        found = self.observed.violations(self._allowed, {*causes_of(scenario)} - rules)
+        # An update that a newer one replaced within the certified delay is not lost.
+        found += self.observed.violations(self.certified_for or self._allowed, rules)
         return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property

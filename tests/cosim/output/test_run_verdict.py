@@ -53,8 +53,8 @@ def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome
     assert isinstance(loop.fidelity, FidelityPart)
     claims = len(loop.claims)
     assert lines == [
-        f"completed 20 s: stable, ‖x‖ ≤ {loop.sup_state_norm:.3g}, "
-        f"{loop.final_state_norm:.3g} at the end",
+        f"completed 20 s: stable, ‖x‖ fell from {loop.sup_state_norm:.3g} to "
+        f"{loop.final_state_norm:.3g}",
         f"guarantee kept: {claims} claims held, none violated",
         f"{loop.events} transmissions (ideal loop: {loop.fidelity.events_ideal}), "
         f"{loop.deliveries} delivered",
@@ -101,16 +101,16 @@ def test_the_first_line_states_how_the_run_ended(
         ([claim("void", "old")], {},
          "guarantee kept until 1.000 s, then not checkable: old", "yellow"),
         ([claim("void", LATE["what"])], {"assumption_violations": [LATE], "missing_samples": 0},
-         "guarantee kept until 1.000 s, then not checkable: an input was old; no certificate "
-         "covers that", "yellow"),
+         "guarantee kept until 1.000 s, then not checkable: at worst an input was old; no "
+         "certificate covers that", "yellow"),
         ([claim("void", "gain 2") | {"bound": "none", "since_s": 0.0}], {},
          "guarantee not checkable: no certificate: gain 2", "yellow"),
         ([claim("held"), claim("void", "gain 2") | {"bound": "none", "since_s": 0.0}], {},
          "guarantee kept: 1 claim held, none violated; 1 claim not checkable: no certificate: "
          "gain 2", "green"),
         ([claim("held")], {"assumption_violations": [LATE], "certified_for": COVERED},
-         "guarantee kept: 1 claim held, none violated; certified for its lateness: an input was "
-         "old", "green"),
+         "guarantee kept: 1 claim held, none violated; certificate recomputed for its lateness: "
+         "an input was old", "green"),
         ([claim("held") | {"source": "(I1)"}], {},
          "guarantee not checkable: no certificate covers this loop", "yellow"),
         ([], {}, "guarantee not checkable: no certificate covers this loop", "yellow"),
@@ -130,8 +130,8 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(
 @pytest.mark.parametrize(
     ("largest", "final", "diverged_at_s", "text"),
     [
-        (2.0, 0.1999, None, "stable, ‖x‖ ≤ 2, 0.2 at the end"),
-        (2.0, 0.2001, None, "bounded, ‖x‖ ≤ 2, 0.2 at the end"),
+        (2.0, 0.1999, None, "stable, ‖x‖ fell from 2 to 0.2"),
+        (2.0, 0.2001, None, "bounded, ‖x‖ was at most 2, at the end 0.2"),
         (2.0, 9.0, 1.0, "diverged"),
         (None, None, None, ""),
     ],

@@ -216,6 +216,7 @@ def restarted_sensor(make: Make) -> RunRecord:
         (deaf("netem", 10, 14), 12, "4 consecutive updates lost, 2 allowed"),
         (losing(10, 12, 14, constraint=IN_WINDOW), 14, "3 of 6 consecutive updates lost"),
         (losing(10, 12, 19, constraint=RECOVERY), 12, "only 1 delivered between two bursts"),
+        (deaf("sensor", 100, 103), 0.99, "no measurement for 0.04 s, 0.01 s allowed"),
         (lambda make: with_outage(make(), 2.0, 2.3), 2.01, "an input was 0.315 s old, 0.015 s"),
         (delayed(lambda n: 500), 0.0, "the plant applied no input until "),
         (watchdog("zero"), 2.02, "the watchdog replaced the input: the newest actuation was "),
@@ -248,7 +249,6 @@ def test_claims_are_void_from_the_time_and_for_the_reason_that_the_monitor_repor
     ("violate", "time", "least_s"),
     [
         (delayed(lambda n: 33 if n == 7 else 0), "delay_s", 0.033),
-        (deaf("sensor", 100, 103), "sampling_s", 0.04),
         (lambda make: with_outage(make(), 2.0, 2.05), "hold_s", 0.05),
         (delayed(lambda n: 500 if n < 2 else 0), "start_s", 0.05),
     ],
