@@ -144,7 +144,7 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
         assert assumption.what in parsed.text
         assert assumption.why in parsed.text
     assert scenario_toml(record.scenario) in parsed.text
-    assert "guarantee broken since 2.500 s: violated: controller error" in parsed.text
+    assert "guarantee broken since 0.000 s: violated: controller error" in parsed.text
     assert "live run, model-based, M − 1 = 2, started 2020-01-02" in parsed.text
     assert "noack run" in parsed.text
     assert "plant lateness" in parsed.text
