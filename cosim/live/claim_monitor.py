@@ -137,7 +137,7 @@ class ClaimMonitor:
             return ""
         finally:
             self._limits_s += time.thread_time() - began_s
-        return f", certificates up to {limit_s:.4g} s" if limit_s else ""
+        return f"; there are certificates for up to {limit_s:.4g} s" if limit_s else ""
 
     def _add(self, loop: int, t_ns: int, level: str, what: str, why: str) -> None:
         own = f"{what} from {t_ns / NS_PER_S:.3f} s on: {why}"

@@ -287,9 +287,9 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
-    late = {one.cause for one in loop.assumption_violations} & {"delay", "hold"}
-    unchecked = late and loop.certified_for is None
-    if unchecked and summary.kind == "live" and not loop.restarts:
+    late = {one.what for one in loop.assumption_violations if one.cause in SCHEDULE}
+    unchecked = any(claim.verdict == "void" and claim.why in late for claim in loop.claims)
+    if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
         what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
             f"{what} was later than any certificate of this loop allows, so some claims were not "

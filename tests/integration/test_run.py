@@ -164,7 +164,7 @@ def test_the_recording_shows_the_record(finished: Finished, live: RunRecord) -> 
 
 
 def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> None:
-    """After missed deadlines, certificates are void and state time and cause."""
+    """After missed deadlines, claims are void only where no certificate covers them."""
     claims = [c for c in finished.loop["claims"] if c["source"] in OWN_CLAIMS]
     assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
     for claim in claims:
@@ -179,7 +179,10 @@ def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> No
 
 def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> None:
     """The curves drawn during the run equal those evaluated at its end."""
-    envelopes = ClaimEvaluation(live).envelopes()
+    claims = ClaimEvaluation(live)
+    if claims.certified_for is not None:
+        pytest.skip("the run was late: its claims have another certificate than its recording")
+    envelopes = claims.envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [
         {e.label: e.values for e in envelopes if e.quantity == "x"}[label]

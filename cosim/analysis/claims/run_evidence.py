@@ -165,8 +165,10 @@ class RunEvidence:
 
         A certificate holds for every run that meets its conditions, whenever they were chosen.
         """
-        # The times of a run whose record has gaps are not known.
-        if not self.record.scenario.coverage.is_certifiable or not self._is_complete:
+        if not self.record.scenario.coverage.is_certifiable:
+            return None
+        whole = self.part.whole or self.record
+        if not all(map(whole.is_complete, LOOP_ROLES)):  # rows that are missing may be later
             return None
         allowed, until_s = self._allowed, self.part.until_s
         late = self.observed.first_violation(allowed, SCHEDULE)
@@ -243,19 +245,14 @@ class RunEvidence:
         return [one for one in found if one.t_s < self.part.until_s]
 
     @cached_property
-    def _is_complete(self) -> bool:
-        return all(map((self.part.whole or self.record).is_complete, LOOP_ROLES))
-
-    @cached_property
     def first_gap(self) -> VoidFrom | None:
         """The time from which no claim can be checked.
 
         The record is incomplete, or the error of a process's clock is not bounded as required.
         """
-        limit, whole = _ANY, self.part.whole or self.record
-        if not self._is_complete:  # measurements may be missing
-            limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
+        limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
         found = [self.observed.first_violation(limit, ("sampling", *CLOCK_CAUSES))]
+        whole = self.part.whole or self.record
         for role in LOOP_ROLES:
             if whole.is_complete(role):
                 continue

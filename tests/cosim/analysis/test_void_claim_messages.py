@@ -79,7 +79,9 @@ def test_the_recorder_reports_a_violation_once_and_records_it(
         recorder.poll()
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
-    line = f"later than allowed from 0.506 s on: {cause}, certificates up to 0.05502 s"
+    line = (
+        f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.05502 s"
+    )
     late = [report.warnings for report in plane.reports]
     assert late == [[]] * 5 + [[line]] * 6
     notices = recorded(recorder, tmp_path).notices

@@ -2,9 +2,11 @@
 
 import json
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -72,6 +74,25 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
             helpers.submit(os._exit, 1).result()
     ending = PreparedEnding(*given, helpers=helpers)
     assert finalize.finalize(ending, report=False, view=False).summary == expected
+
+
+def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = Event()
+
+    def endless(helpers: EndHelpers, *_: object) -> None:
+        waiting = helpers.submit(time.sleep, 1e6)
+        begun.set()
+        waiting.result()
+
+    monkeypatch.setattr(EndHelpers, "_prepare_loops", endless)
+    monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    begun.wait()
+    ending = PreparedEnding(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
+    assert len(finalize.finalize(ending, report=False, view=False).summary.loops) == 20
 
 
 def _killed(*_: object) -> None:

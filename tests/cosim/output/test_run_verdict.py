@@ -180,7 +180,8 @@ def test_a_run_across_hosts_names_the_firewall_the_network_and_what_to_collect(
 ) -> None:
     found: dict[str, Any] = {
         "kind": "live", "unintended_losses": 3, "unintended_losses_by_leg": {"actuation": 3},
-        "assumption_violations": [LATE], "replay": {"complete": False, "bit_exact": None},
+        "assumption_violations": [LATE],
+        "claims": [claim("void", LATE["what"])], "replay": {"complete": False, "bit_exact": None},
     }  # fmt: skip
 
     def texts(clock_error_s: float | None) -> str:
