@@ -17,7 +17,6 @@ import noack
 from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import CertifiedClaim, ClaimDefinition
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, definitions
-from cosim.analysis.claims.run_evidence import RunPart
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.align import UNKNOWN, align_tables
 from cosim.record.run_record import RunRecord
@@ -153,23 +152,21 @@ def test_missing_events_and_predictions_follow_from_the_tables(run: RunRecord) -
         np.testing.assert_allclose(samples.since_event.predicted[i], predicted, rtol=1e-9)
 
 
-def test_after_a_change_nothing_is_known_of_the_input_until_the_first_new_one(
-    run: RunRecord,
-) -> None:
-    """Its delay is not limited by the conditions: until then other bounds cover the input."""
+def test_nothing_is_known_of_the_input_until_the_first_one_if_it_is_late(run: RunRecord) -> None:
+    """The delay does not limit when it comes: until then other bounds cover the input."""
     whole = ClaimEvaluation(run)
     certificate, *_ = whole.certificates
     bounds = whole.known_state_bounds(certificate)
     assert bounds is not None
     instant, (samples,) = replace(bounds, delay_s=0.0), whole.samples()
     known = samples.since_event.missing
-    after = replace(whole, part=RunPart(start_error=0.0)).missing_events(samples, instant)
+    after = whole.missing_events(samples, instant)
     begun_s = samples.t_s - samples.since_event.age_s
     early = begun_s < whole.started_s
     assert early.any()
     assert (after[early] == UNKNOWN).all()
     np.testing.assert_array_equal(after[~early], known[~early])
-    np.testing.assert_array_equal(whole.missing_events(samples, instant), known)
+    np.testing.assert_array_equal(whole.missing_events(samples, bounds), known)
 
 
 def test_a_violation_is_reported_with_its_first_time(run: RunRecord) -> None:
