@@ -61,12 +61,10 @@ def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) ->
             while True:
                 os.write(filling, b"x")
         os.close(filling)
-        launcher = psutil.Process(process.pid)
 
         def has_ended() -> bool:
-            """Whether the loop and the recorder have; the blocked launcher reaps no process."""
-            over = sum(live.is_over(child) for child in launcher.children())
-            return over >= len(ROLES) or process.poll() is not None
+            """Whether the loop and the recorder have: none runs, reaped by the launcher or not."""
+            return all(live.child_of(process, role) is None for role in ROLES)
 
         live.wait_for(has_ended)  # although the pipe is not read
     finally:
