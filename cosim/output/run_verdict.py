@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from cosim.analysis.claims.observed_conditions import CAUSES, SCHEDULE
+from cosim.analysis.claims.observed_conditions import BEYOND_CERTIFICATE, CAUSES, SCHEDULE
 from cosim.analysis.fidelity import Fidelity, SignalDifference
 from cosim.analysis.run_summary import Outcome
 from cosim.analysis.summary_model import (
@@ -182,7 +182,9 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         (claim.since_s or 0.0, ("no certificate: " if claim.bound == "none" else "") + claim.why)
         for claim in void
     )
-    if late and late[0] == why and not loop.missing_samples:
+    if why.endswith(BEYOND_CERTIFICATE):
+        why = f"at worst {why}"
+    elif late and late[0] == why and not loop.missing_samples:
         why = f"at worst {why}; no certificate covers that"
     if any(claim.verdict == "held" for claim in certified):
         unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
@@ -288,7 +290,10 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     late = {one.what for one in loop.assumption_violations if one.cause in SCHEDULE}
-    unchecked = any(claim.verdict == "void" and claim.why in late for claim in loop.claims)
+    unchecked = any(
+        claim.verdict == "void" and (claim.why in late or claim.why.endswith(BEYOND_CERTIFICATE))
+        for claim in loop.claims
+    )
     if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
         what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (

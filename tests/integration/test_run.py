@@ -180,7 +180,7 @@ def test_no_claim_with_checked_assumptions_is_violated(finished: Finished) -> No
 def test_the_recording_shows_the_bounds(finished: Finished, live: RunRecord) -> None:
     """The curves drawn during the run equal those that its end evaluates for its schedule."""
     claims = ClaimEvaluation(live)
-    claims.late_conditions = None  # the recording has the bounds of the scenario's schedule
+    claims.wider = None  # the recording has the bounds of the scenario's schedule
     envelopes = claims.envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [

@@ -39,7 +39,7 @@ from cosim.analysis.claims.run_evidence import (
     RunEvidence,
     RunPart,
     Samples,
-    certificates_together,
+    late_certificates,
 )
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.analysis.value_reduction import decimate
@@ -390,17 +390,9 @@ class RunClaims:
 
 def certify_late(claims: Sequence[RunClaims]) -> None:
     """Search together for the certificates of the runs that were later than allowed."""
-    late: list[tuple[ClaimEvaluation, NetworkConditions]] = []
-    for one in claims:
-        first = one.parts[0]
-        if isinstance(first, Claim) or not any(c.constants for c in first.part.certificates or ()):
-            continue
-        if (conditions := first.late_conditions) is not None:
-            late.append((first, conditions))
-    scenarios = [first.record.scenario for first, _ in late]
-    found = certificates_together(scenarios, None, [conditions for _, conditions in late])
-    for (first, _), certificates in zip(late, found, strict=True):
-        first.late_certificates = certificates
+    firsts = [first for one in claims if isinstance(first := one.parts[0], ClaimEvaluation)]
+    for first, found in zip(firsts, late_certificates(firsts), strict=True):
+        first.wider = found
 
 
 @lru_cache(maxsize=1)

@@ -67,6 +67,8 @@ SCHEDULE = ("delay", "hold", "start")
 A certificate holds for every run that meets its conditions, however they were chosen. So a run that
 was later than its scenario allows has the certificate for the times that it took, if there is one.
 """
+BEYOND_CERTIFICATE = " s certified"
+"""How a violation of the widest certificate ends, in place of " s allowed"."""
 DROPOUTS = LongestBurst(0).name
 _NO_INPUT = "the plant applied no input at all, the first within {1:.4g} s required"
 """In place of a time until the first input, which is the only condition without an upper limit."""
@@ -228,16 +230,28 @@ class ObservedConditions(NamedTuple):
         """Return the time at which the run first violated a condition; None if never."""
         return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
 
+    def later_times(self, allowed: NetworkConditions) -> list[float]:
+        """Return when the run became later than ``allowed``, and later than it had been so far."""
+        start = SampledSeries(np.zeros(1), np.array([self.start_s]))
+        every = (
+            (self.delay, allowed.delay_s), (self.hold, allowed.hold_s), (start, allowed.start_s),
+        )  # fmt: skip
+        peaks = [(series.peaks(), limit_s + _TOLERANCE_S) for series, limit_s in every]
+        return sorted(
+            {t_s for one, most_s in peaks for t_s in one.t_s[one.value > most_s].tolist()}
+        )
+
     def widened(self, allowed: NetworkConditions, until_s: float = np.inf) -> NetworkConditions:
         """Return conditions that the run's schedule meets up to a time.
 
-        Each time of ``SCHEDULE`` is the allowed one, or what the run took, if that was more.
+        Each time of ``SCHEDULE`` is the allowed one, or what the run took, if that was more. It is
+        not met where an input never came.
         """
 
         def wider(limit_s: float, series: SampledSeries) -> float:
-            value_s = series.before(until_s).largest()
-            exceeds = value_s is not None and limit_s + _TOLERANCE_S < value_s < np.inf
-            return value_s if value_s is not None and exceeds else limit_s
+            values_s = series.before(until_s).value
+            value_s = float(values_s[np.isfinite(values_s)].max(initial=0.0))
+            return value_s if value_s > limit_s + _TOLERANCE_S else limit_s
 
         return allowed._replace(
             delay_s=wider(allowed.delay_s, self.delay),

@@ -6,7 +6,7 @@ be computed only after a run. It is the largest one over all intervals between t
 
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
+    BEYOND_CERTIFICATE,
     CLOCK_CAUSES,
-    SCHEDULE,
     AssumptionViolation,
     ObservedConditions,
     Reals,
@@ -62,6 +62,9 @@ from noack.theory.certificates.scenario_certificates import box, certify, own_pl
 from noack.theory.certificates.solution import Search, completed
 from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 
+LateSchedules = Generator[
+    NetworkConditions, Sequence[ScenarioCertificate], Sequence[ScenarioCertificate] | None
+]
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
 
@@ -123,8 +126,6 @@ class RunEvidence:
 
     record: RunRecord
     part: RunPart = field(default_factory=RunPart)
-    late_certificates: Sequence[ScenarioCertificate] | None = None
-    """Those under :attr:`late_conditions`, if they are known."""
 
     def samples(self) -> Iterator[Samples]:
         """Yield all measurements in order, part by part."""
@@ -160,21 +161,44 @@ class RunEvidence:
         return trajectory_delta(self.record, until_s)
 
     @cached_property
-    def late_conditions(self) -> NetworkConditions | None:
-        """The conditions of a run that was later than its scenario allows; None for any other.
+    def _scheduled(self) -> Sequence[ScenarioCertificate]:
+        """The certificates under the scenario's schedule."""
+        if self.part.certificates is not None:
+            return self.part.certificates
+        return scheduled_certificates(self.record.scenario, self.part.start_error)
 
-        A certificate holds for every run that meets its conditions, whenever they were chosen.
+    def late_schedules(self) -> "LateSchedules":
+        """Yield schedules of a run that was later than its scenario allows, until one is certified.
+
+        They are the one that the whole run kept, and then those that it kept up to a time: the
+        generator is sent the certificates of each, and returns those of the latest time. A
+        certificate holds for every run that meets its conditions, whenever they were chosen.
         """
-        if not self.record.scenario.coverage.is_certifiable:
+        whole, allowed, until_s = self.part.whole or self.record, self._allowed, self.part.until_s
+        # Rows that are missing may be later.
+        if not all(map(whole.is_complete, LOOP_ROLES)) or not any(map(_exists, self._scheduled)):
             return None
-        whole = self.part.whole or self.record
-        if not all(map(whole.is_complete, LOOP_ROLES)):  # rows that are missing may be later
+        times_s = [t_s for t_s in self.observed.later_times(allowed) if t_s < until_s]
+        widest = self.observed.widened(allowed, until_s)
+        if not times_s or widest == allowed:
             return None
-        allowed, until_s = self._allowed, self.part.until_s
-        late = self.observed.first_violation(allowed, SCHEDULE)
-        if late is None or late.t_s >= until_s:
-            return None
-        return self.observed.widened(allowed, until_s)
+        found: Sequence[ScenarioCertificate] = yield widest
+        if any(map(_exists, found)):
+            return found
+        best, kept, beyond = None, 0, len(times_s)
+        while beyond - kept > 1:
+            middle = (kept + beyond) // 2
+            found = yield self.observed.widened(allowed, times_s[middle])
+            if any(map(_exists, found)):
+                best, kept = found, middle
+            else:
+                beyond = middle
+        return best
+
+    @cached_property
+    def wider(self) -> Sequence[ScenarioCertificate] | None:
+        """The certificates under the widest of the :meth:`late_schedules`; None without one."""
+        return late_certificates([self])[0]
 
     @cached_property
     def certificates(self) -> list[ScenarioCertificate]:
@@ -183,17 +207,9 @@ class RunEvidence:
         This is the scenario's schedule; or a wider one, if the run was later than allowed and there
         is a certificate nevertheless.
         """
-        found, void, scenario = [], self.part.void, self.record.scenario
-        scheduled = self.part.certificates
-        if scheduled is None:
-            scheduled = scheduled_certificates(scenario, self.part.start_error)
-        wider: Sequence[ScenarioCertificate | None] = [None] * len(scheduled)
-        if self.late_conditions is not None and any(one.constants for one in scheduled):
-            wider = self.late_certificates or scheduled_certificates(
-                scenario, self.part.start_error, self.late_conditions
-            )
-        for one, late in zip(scheduled, wider, strict=True):
-            used = one if late is None or late.constants is None else late
+        found, void = [], self.part.void
+        for one, late in zip(self._scheduled, self.wider or self._scheduled, strict=True):
+            used = late if _exists(late) else one
             if one.scope in void:
                 used = replace(one, constants=None, floor_constants=None, void=void[one.scope])
             found.append(used)
@@ -202,9 +218,9 @@ class RunEvidence:
     @property
     def certified_for(self) -> NetworkConditions | None:
         """The wider schedule, if a certificate of it is used."""
-        late = self.late_conditions
-        used = [one.conditions for one in self.certificates if one.constants is not None]
-        return late if late in used else None
+        used = [one.conditions for one in self.certificates if _exists(one)]
+        late = [one.conditions for one in self.wider or () if one.conditions in used]
+        return late[0] if late else None
 
     @cached_property
     def _as_read(self) -> ObservedConditions:
@@ -275,9 +291,12 @@ class RunEvidence:
 
     def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:
         """Return the time at which the run first violated the conditions of a certificate."""
-        known = self._violations
+        known, conditions = self._violations, certificate.conditions
         if id(certificate) not in known:
-            known[id(certificate)] = self.observed.first_violation(certificate.conditions)
+            found = self.observed.first_violation(conditions)
+            if found is not None and conditions == self.certified_for:
+                found = found._replace(why=found.why.replace(" s allowed", BEYOND_CERTIFICATE))
+            known[id(certificate)] = found
         return known[id(certificate)]
 
     def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:
@@ -335,27 +354,55 @@ class RunEvidence:
         return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
 
 
-def scheduled_certificates(
-    scenario: Scenario,
-    start_error: float | None = None,
-    conditions: NetworkConditions | None = None,
-) -> list[ScenarioCertificate]:
-    """Return the certificates of a resolved scenario, if it can have any.
+def _exists(certificate: ScenarioCertificate) -> bool:
+    return certificate.constants is not None
 
-    They are those under some conditions; by default, under the scenario's schedule. A part of a run
-    that starts with an input of the part before has a ``start_error``.
+
+def late_certificates(runs: Sequence[RunEvidence]) -> list[Sequence[ScenarioCertificate] | None]:
+    """Return the certificates under the widest of the late schedules of each run, if any."""
+    found: list[Sequence[ScenarioCertificate] | None] = [None] * len(runs)
+    due: list[tuple[int, LateSchedules, Sequence[ScenarioCertificate] | None]] = [
+        (number, one.late_schedules(), None)
+        for number, one in enumerate(runs)
+        if one.record.scenario.coverage.is_certifiable
+    ]
+    while due:
+        tried: list[tuple[int, LateSchedules, NetworkConditions]] = []
+        for number, search, certificates in due:
+            try:
+                conditions = next(search) if certificates is None else search.send(certificates)
+                tried.append((number, search, conditions))
+            except StopIteration as best:
+                found[number] = best.value
+        answers = certificates_together(
+            [runs[number].record.scenario for number, *_ in tried],
+            [runs[number].part.start_error for number, *_ in tried],
+            [conditions for *_, conditions in tried],
+        )
+        due = [(*one[:2], answer) for one, answer in zip(tried, answers, strict=True)]
+    return found
+
+
+def scheduled_certificates(
+    scenario: Scenario, start_error: float | None = None
+) -> list[ScenarioCertificate]:
+    """Return the certificates of a resolved scenario under its schedule, if it can have any.
+
+    A part of a run that starts with an input of the part before has a ``start_error``.
     """
-    limits = None if conditions is None else [conditions]
-    (found,) = certificates_together([scenario], start_error, limits)
+    (found,) = certificates_together([scenario], [start_error])
     return found
 
 
 def certificates_together(
     scenarios: Sequence[Scenario],
-    start_error: float | None = None,
+    start_errors: Sequence[float | None] | None = None,
     conditions: Sequence[NetworkConditions] | None = None,
 ) -> list[list[ScenarioCertificate]]:
-    """Return the certificates of several scenarios; see :func:`scheduled_certificates`."""
+    """Return the certificates of several scenarios; see :func:`scheduled_certificates`.
+
+    They are those under some conditions; by default, under the schedule of each scenario.
+    """
     searches: list[Search[ScenarioCertificate]] = []
     numbers: list[int] = []
     for number, scenario in enumerate(scenarios):
@@ -363,8 +410,8 @@ def certificates_together(
             continue
         limits = allowed_conditions(scenario) if conditions is None else conditions[number]
         error = 0.0
-        if start_error is not None:
-            limits, error = limits._replace(start_s=0.0), start_error
+        if start_errors is not None and (given := start_errors[number]) is not None:
+            limits, error = limits._replace(start_s=0.0), given
         for scope in filter(None, (own_plant(scenario, error), box(scenario, error))):
             searches.append(scope.search(limits))
             numbers.append(number)

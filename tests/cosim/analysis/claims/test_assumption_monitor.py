@@ -15,12 +15,14 @@ from cosim.analysis.claims.condition_reader import (
     read_conditions,
 )
 from cosim.analysis.claims.observed_conditions import (
+    BEYOND_CERTIFICATE,
     CAUSES,
     CLOCK_CAUSES,
     AssumptionViolation,
     ObservedConditions,
     combined,
 )
+from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary_model import ClaimVerdict
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -217,8 +219,6 @@ def restarted_sensor(make: Make) -> RunRecord:
         (losing(10, 12, 14, constraint=IN_WINDOW), 14, "3 of 6 consecutive updates lost"),
         (losing(10, 12, 19, constraint=RECOVERY), 12, "only 1 delivered between two bursts"),
         (deaf("sensor", 100, 103), 0.99, "no measurement for 0.04 s, 0.01 s allowed"),
-        (lambda make: with_outage(make(), 2.0, 2.3), 2.01, "an input was 0.315 s old, 0.015 s"),
-        (delayed(lambda n: 500), 0.0, "the plant applied no input until "),
         (watchdog("zero"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (watchdog("model"), 2.02, "the watchdog replaced the input: the newest actuation was "),
         (safe_input, 0.01, "the controller had no state and sent its safe input, largest entry "),
@@ -264,6 +264,33 @@ def test_a_late_run_has_the_certificate_of_its_lateness(
     assert {one.verdict for one in claims.judge() if one.source in ("certificate", "(I1)")} == {
         ClaimVerdict.HELD
     }
+
+
+@pytest.mark.parametrize(
+    ("violate", "time", "why"),
+    [
+        (lambda make: with_outage(make(), 2.0, 2.3), "hold", "an input was 0.315 s old, "),
+        (delayed(lambda n: 500), "delay", "an update took effect after 0.51 s, 0.01 s certified"),
+    ],
+)  # fmt: skip
+def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
+    violate: Callable[[Make], RunRecord], time: str, why: str, make: Make
+) -> None:
+    record = violate(make)
+    claims = ClaimEvaluation(record)
+    covered, series = claims.certified_for, getattr(claims.observed, time)
+    assert covered is not None
+    (since_s,) = {one.since_s for one in claims.judge() if one.source == "certificate"}
+    assert since_s > min(reported(record)).t_s  # when it was later than allowed
+    assert series.before(since_s).value.max(initial=0.01) == getattr(covered, f"{time}_s")
+    (found,) = {one.why for one in claims.judge() if one.source == "certificate"}
+    assert found.startswith(why)
+    assert found.endswith(BEYOND_CERTIFICATE)
+    # The next lateness has none.
+    (most,) = series.peaks().value[series.peaks().t_s == since_s]
+    later = covered._replace(**{f"{time}_s": most})
+    (beyond,) = certificates_together([record.scenario], None, [later])
+    assert {one.constants for one in beyond} == {None}
 
 
 def test_a_non_finite_value_is_not_a_measurement(make: Make) -> None:
