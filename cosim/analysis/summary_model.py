@@ -259,7 +259,7 @@ class ConditionsPart(SummaryPart):
 
 
 class SchedulePart(SummaryPart):
-    """The times that a certificate covers, as in :class:`ConditionsPart`."""
+    """Times that are allowed, or that a certificate covers, as in :class:`ConditionsPart`."""
 
     sampling_s: float
     delay_s: float
@@ -351,6 +351,8 @@ class LoopSummary(SummaryPart):
     linearisation: LinearisationPart | NoLinearisationPart | None = None
     fidelity: FidelityPart | NoFidelityPart | None = None
     conditions: ConditionsPart | None = None
+    allowed: SchedulePart | None = None
+    """The schedule that the scenario allows; None where there are no certificates."""
     certified_for: SchedulePart | None = None
     """The schedule that the certificates cover, if the run was later than its scenario allows."""
     claims: list[Claim] = []

@@ -329,6 +329,7 @@ def _claim_results(claims: RunClaims, summary: LoopSummary) -> dict[str, Any]:
         longest = max(longest, int(claims.conditions["dropouts"] or 0))
     return {
         "conditions": ConditionsPart(**claims.conditions),
+        "allowed": _schedule(claims.allowed),
         "certified_for": _schedule(claims.certified_for),
         "claims": claims.judge(),
         "judged_until_s": claims.judged_until_s,

@@ -26,6 +26,7 @@ from cosim.output.run_tables import (
     loops_table,
     mode_words,
     network_rows,
+    schedule_tables,
     shares_network,
     timing_table,
 )
@@ -202,7 +203,8 @@ def _signals(report: Report) -> Content:
 
 @section
 def _claims(report: Report) -> Content | None:
-    return {"claims": report.loop.claims} if report.loop.claims else None
+    loop = report.loop
+    return {"claims": loop.claims, "tables": [*schedule_tables(loop)]} if loop.claims else None
 
 
 @section

@@ -40,6 +40,12 @@ LOOPS_CAPTION = (
     "burst: most consecutive losses; forced: delivered by the guarantee; share: of the "
     "forwarded bytes; delay and ‖e_c‖: largest"
 )
+_SCHEDULE = {
+    "sampling_s": "between two measurements",
+    "delay_s": "from an event to the plant",
+    "hold_s": "age of an input",
+    "start_s": "until the first input",
+}
 _FEW = 3
 _SHORT = (
     "lost in the network", "actuations lost", "longest loss burst (", "deliveries forced",
@@ -61,6 +67,7 @@ def summary_tables(summary: RunSummary) -> Iterator[ResultTable]:
     yield ResultTable("numbers", title, KEY_VALUE, key_numbers(summary))
     if loop.claims:
         yield _claims_table(loop.claims, f"claims: {title}")
+    yield from schedule_tables(loop)
     if loop.lateness_us:  # none in virtual time
         yield timing_table(loop)
 
@@ -306,6 +313,20 @@ def _replay(verdict: ReplayPart | None) -> Iterator[tuple[str, str]]:
     elif (first := verdict.first_difference) is not None:
         word = f"differs: {first.table}, row {first.row}, {first.column}"
     yield "replay", word if verdict.complete else f"{word} (record incomplete)"
+
+
+def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
+    """Yield the table of the times on which certificates depend, if the loop can have any."""
+    if (allowed := loop.allowed) is None or (observed := loop.conditions) is None:
+        return
+    exists = any("certificate" in one.source and one.bound != "none" for one in loop.claims)
+    covered = (loop.certified_for or allowed) if exists else None
+    rows = []
+    for name, words in _SCHEDULE.items():
+        times_s = (getattr(part, name) if part else None for part in (allowed, observed, covered))
+        rows.append((words, *(NONE if one is None else duration(one) for one in times_s)))
+    caption = "largest times: allowed by the scenario, observed, covered by the certificates used"
+    yield ResultTable("schedule", caption, ("", "allowed", "observed", "certified"), rows)
 
 
 def timing_table(loop: LoopSummary) -> ResultTable:

@@ -353,6 +353,8 @@ def _print_details(console: Console, summary: RunSummary) -> None:
     print_assumptions(console, loop.assumptions)
     if "claims" in tables:
         _print_claims(console, tables["claims"], loop.claims)
+    if "schedule" in tables:
+        console.print(terminal_table(tables["schedule"]))
 
 
 def _print_loops(console: Console, summary: RunSummary, *, verbose: bool) -> None:

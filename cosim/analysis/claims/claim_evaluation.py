@@ -65,7 +65,12 @@ from noack.scenario.scenario import Scenario
 from noack.theory.bounds.disturbances import bound_forcing
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.conditions import OWN_PLANT, about_setpoint, void_at_setpoint
+from noack.theory.certificates.conditions import (
+    OWN_PLANT,
+    about_setpoint,
+    allowed_conditions,
+    void_at_setpoint,
+)
 from noack.theory.certificates.scenario_certificates import outside_box
 
 _IDEAL_LOOP = (
@@ -317,6 +322,12 @@ class RunClaims:
         if isinstance(first, ClaimEvaluation) and first.record is self._judged:
             return first.conditions
         return ClaimEvaluation(self._judged).conditions
+
+    @property
+    def allowed(self) -> NetworkConditions | None:
+        """The conditions of the scenario's certificates; None if it can have none."""
+        scenario = self.record.scenario
+        return allowed_conditions(scenario) if scenario.coverage.is_certifiable else None
 
     @property
     def certified_for(self) -> NetworkConditions | None:
