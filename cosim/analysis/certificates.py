@@ -72,7 +72,8 @@ class Certificates:
     """Theorem 2 by the paper's formula, with Δ of ``paper``; None if it cannot be evaluated."""
     weight: Matrix | None
     """W of the trigger's norm, (n, n), if this call chose it; else None."""
-
+    late_periods: int
+    """Allowed lateness in steps of the plant."""
     unlimited: UnlimitedLosses | None
     """What holds without a limit on the losses; None if the network enforces its guarantee, or if
     the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
@@ -85,7 +86,7 @@ class Certificates:
         if OWN_PLANT in void:
             raise CallerError(f"controller.setpoint: {void[OWN_PLANT]}")
         scenario = about_setpoint(scenario)
-        self.scenario, self.weight = scenario, weight
+        self.scenario, self.weight, self.late_periods = scenario, weight, late_periods
         self._scheduled = nominal_conditions(scenario, late_periods)
         conditions = {IDEAL: ideal_conditions(scenario), SCHEDULE: self._scheduled}
         scopes = (own_plant(scenario), None if BOX in void else box(scenario))
@@ -256,6 +257,22 @@ def certificates_of(
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, allowed, progress)
     return Certificates(weighted, allowed, W)
+
+
+def in_chosen_norm(
+    scenario: Scenario, found: Certificates, progress: Callable[[float], None] = lambda share: None
+) -> Certificates | None:
+    """Return the certificates in a norm that noack chooses, if there are any for the schedule.
+
+    Args:
+        scenario: as loaded.
+        found: its certificates in the given norm, of which there are none for the schedule.
+        progress: called with the completed share of the choice.
+    """
+    with contextlib.suppress(CallerError):  # no weight can be chosen for this scenario
+        chosen = certificates_of(scenario, "chosen", found.late_periods, progress)
+        return chosen if chosen.schedule.constants is not None else None
+    return None
 
 
 _PERSISTENT = {

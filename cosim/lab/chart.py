@@ -124,7 +124,7 @@ def _series(
     made |= {"type": "line", "symbol": "none", "silent": True}
     if isinstance(item, Line):
         style = {"color": colour, "width": round(_PIXELS_PER_POINT * item.width, 1),
-                 "type": _DASHES.get(item.dash, "solid")}  # fmt: skip
+                 "type": _DASHES.get(item.dash, "solid"), "opacity": item.opacity}  # fmt: skip
         return [made | {"lineStyle": style}]
     with np.errstate(all="ignore"):
         columns[f"{name}-width"] = _rounded(item.high - item.low)

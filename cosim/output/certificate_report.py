@@ -14,6 +14,7 @@ from cosim.analysis.certificates import SCHEDULE, Certificates, constant_rows, p
 from cosim.analysis.margin_search import MarginResult
 from cosim.output.result_tables import ResultTable, terminal_table
 from cosim.output.run_verdict import print_assumptions
+from noack.core.linear_systems import Matrix
 from noack.core.number_format import duration, number
 from noack.scenario.resolution import policy_of
 from noack.theory.certificates.assumptions import assumptions
@@ -23,8 +24,10 @@ from noack.theory.certificates.scenario_certificates import MOST_S, outside_box
 from noack.theory.random_losses.moments import UnlimitedLosses
 
 
-def print_certificates(console: Console, found: Certificates) -> None:
-    """Print the tables."""
+def print_certificates(
+    console: Console, found: Certificates, chosen: Certificates | None = None
+) -> None:
+    """Print the tables, and what is certified in a norm that noack chose instead."""
     constants, *limits = certificate_tables(found)
     console.print(terminal_table(constants))
     _print_notes(console, found)
@@ -45,11 +48,19 @@ def print_certificates(console: Console, found: Certificates) -> None:
     for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
-        rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
-        console.print(
-            f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
-            markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
+        _print_weight(console, found.weight)
+    if chosen is not None and chosen.weight is not None:
+        console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
+        console.print(terminal_table(next(certificate_tables(chosen))))
+        _print_weight(console, chosen.weight)
+
+
+def _print_weight(console: Console, weight: Matrix) -> None:
+    rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
+    console.print(
+        f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip
 
 
 def _in_words(found: Certificates) -> Iterator[str]:
@@ -141,7 +152,13 @@ def _print_notes(console: Console, found: Certificates) -> None:
                 f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
     policy = found.scenario.trigger.policy
-    if found.weight is None and policy == "decaying" and any(c.void for c in certificates):
+    exists = found.schedule.constants is not None  # else another norm is tried
+    if (
+        exists
+        and found.weight is None
+        and policy == "decaying"
+        and any(c.void for c in certificates)
+    ):
         console.print("--weight chosen searches for a norm in which more is certified")
 
 

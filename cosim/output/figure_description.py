@@ -55,6 +55,7 @@ class Line:
     label: str = ""
     width: float = 1.3
     dash: Dash = SOLID
+    opacity: float = 1.0
     steps: Steps = ""
     order: float = 2.0
     """A higher one is drawn in front."""

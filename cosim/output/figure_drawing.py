@@ -178,7 +178,7 @@ def _(item: Line, axes: Axes, norm: Normalize | None) -> Artist | None:
     style: dict[str, Any] = {
         "color": rgb(item.colour), "linewidth": item.width, "zorder": item.order,
         "linestyle": (0, item.dash) if item.dash else "-", "marker": item.marker,
-        "markersize": item.size,
+        "markersize": item.size, "alpha": item.opacity,
     }  # fmt: skip
     if item.steps:
         style["drawstyle"] = f"steps-{item.steps}"

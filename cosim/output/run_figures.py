@@ -66,6 +66,8 @@ _STATES_NARROWEST_IN, _LOSSES_NARROWEST_IN, _LOSSES_WIDEST_IN = 1.7, 2.2, 5.0
 _MOST_STATES = 16
 _LONGEST_TITLE = 40
 _DECADES = 6
+_FAR, _LIGHT = 20.0, 0.45
+"""Bounds that are mostly over so many times the curves are drawn with this opacity."""
 _MOST_LABELS = 12
 
 
@@ -327,8 +329,20 @@ def _norms(
     """Describe a figure of norms; its axis is limited: resets fall to rounding errors."""
     measured = np.concatenate([line.y for line in lines])
     y = Axis(label="norm", logarithmic=True, about=measured, decades=_DECADES)
-    panel = Panel(title=title, items=[*lines, *bounds], x=time_axis(lines[0].x), y=y)
+    drawn = [replace(one, opacity=_LIGHT) if _is_far(one, lines) else one for one in bounds]
+    panel = Panel(title=title, items=[*lines, *drawn], x=time_axis(lines[0].x), y=y)
     return one_panel(name, panel, height_in)
+
+
+@np.errstate(all="ignore")
+def _is_far(bound: Line, curves: Sequence[Line]) -> bool:
+    """Whether a bound is many times larger than the curves, most of the time."""
+    if not len(bound.x) or not all(len(curve.x) for curve in curves):
+        return False
+    at_bound = [np.interp(bound.x, curve.x, curve.y) for curve in curves]
+    ratios = bound.y / np.fmax.reduce(at_bound)
+    known = ratios[np.isfinite(ratios)]
+    return len(known) > 0 and bool(np.median(known) > _FAR)
 
 
 def _errors(scenario: Scenario, run: AlignedRun, bounds: list[Line]) -> FigureDescription:
@@ -399,7 +413,9 @@ def _input(record: RunRecord) -> FigureDescription:
 
 
 def _dashed(curves: Sequence[Line]) -> str:
-    return " Dashed: claimed bounds." if curves else ""
+    if not curves:
+        return ""
+    return f" Dashed: claimed bounds; lighter: mostly over {_FAR:g} times the curves."
 
 
 def _seconds(t_ns: NDArray[np.int64]) -> Reals:
@@ -413,7 +429,8 @@ def _inter_event(record: RunRecord, bounds: list[Line]) -> FigureDescription:
     shortest = f", the shortest {interval_s.min():.3g} s" if len(interval_s) else ""
     label = "inter-event time [s]"
     return times_figure("inter-event", title, dots, label, horizon_s, bounds).captioned(
-        "Inter-event times, over time and as a histogram." + _dashed(bounds),
+        "Inter-event times, over time and as a histogram."
+        + (" Dashed: claimed bounds." if bounds else ""),
         f"Inter-event times on a logarithmic axis{shortest}.",
     )
 

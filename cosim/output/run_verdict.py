@@ -289,6 +289,8 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
+    if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
+        yield "no bound is certified: noack certify looks for a norm with which there are some"
     late = {one.what for one in loop.assumption_violations if one.cause in SCHEDULE}
     unchecked = any(
         claim.verdict == "void" and (claim.why in late or claim.why.endswith(BEYOND_CERTIFICATE))

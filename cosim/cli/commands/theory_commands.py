@@ -34,6 +34,9 @@ def certify(
 ) -> int:
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
 
+    If there are none for the given norm, those of a norm that noack chooses follow, with the lines
+    for the scenario file.
+
     Exit status 1: nothing can be certified.
 
     Options:
@@ -46,13 +49,20 @@ def certify(
         noack certify lane_following --weight chosen   with a norm that certifies more
         noack certify lane_weighted --late 6 --json   allow 6 steps of lateness
     """
-    loaded = given.load()
+    loaded, chosen = given.load(), None
     if weight == "chosen":
         with progress.work_bar("choosing the weight") as bar:
             found = certificates.certificates_of(loaded, weight, late, bar)
     else:
         found = certificates.certificates_of(loaded, weight, late)
-    cli.show(json, found.to_json, certificate_report.print_certificates, found)
+    if weight == "given" and found.schedule.constants is None:
+        with progress.work_bar("no certificate in the given norm; choosing another") as bar:
+            chosen = certificates.in_chosen_norm(loaded, found, bar)
+
+    def to_json() -> dict[str, object]:
+        return found.to_json() | {"in_chosen_norm": chosen and chosen.to_json()}
+
+    cli.show(json, to_json, certificate_report.print_certificates, found, chosen)
     cli.write_tables(certificate_report.certificate_tables(found), tables, json=json)
     if out is not None:
         mat_export.save_mat(found.to_json(), out)
