@@ -204,7 +204,7 @@ class TriggerBounds:
         Raises:
             NoCertificateError: nothing bounds e_s, or nothing separates events.
         """
-        due_s, apart_s = self._between_events(conditions)
+        due_s, forced_s, apart_s = self._between_events(conditions)
         h_s = conditions.sampling_s
         idle_s = self._after(self.rule.idle_ns, conditions)
         untested_s = max(idle_s - h_s, 0.0) if math.isfinite(idle_s) else 0.0
@@ -226,8 +226,9 @@ class TriggerBounds:
         if self.is_homogeneous:
             apart_s = max(apart_s, conditions.spacing_s)
         return bounds[0]._replace(
-            unit=level or 1.0, apart_s=apart_s, due_s=due_s, also=tuple(bounds[1:])
-        )
+            unit=level or 1.0, apart_s=apart_s, due_s=due_s, forced_s=forced_s,
+            also=tuple(bounds[1:]),
+        )  # fmt: skip
 
     def divided(
         self, conditions: NetworkConditions, apart_s: float
@@ -241,7 +242,14 @@ class TriggerBounds:
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
         alone = [
-            bound._replace(apart_s=apart_s, due_s=whole.due_s, unit=1.0, reached=None, also=())
+            bound._replace(
+                apart_s=apart_s,
+                due_s=whole.due_s,
+                forced_s=whole.forced_s,
+                unit=1.0,
+                reached=None,
+                also=(),
+            )  # fmt: skip
             for bound in whole.every
         ]
         return [(bound._replace(beta=0.0), bound) for bound in alone]
@@ -280,8 +288,12 @@ class TriggerBounds:
             ]
         return [(t_s, self.area / t_s, least / t_s) for t_s in times_s.tolist()]
 
-    def _between_events(self, conditions: NetworkConditions) -> tuple[float, float]:
-        """Return the longest and the shortest time between two events, whatever e_s does."""
+    def _between_events(self, conditions: NetworkConditions) -> tuple[float, float, float]:
+        """Return times between two events, whatever e_s does.
+
+        Returns:
+            The longest; the shortest after which an event is due; the shortest.
+        """
         rule = self.rule
         due_s = self._after(rule.longest_ns, conditions)
         earliest_ns = max(rule.idle_ns, 0.0)
@@ -289,7 +301,8 @@ class TriggerBounds:
             earliest_ns = rule.longest_ns if rule.forecast is None else rule.shortest_ns
         step_s = conditions.spacing_s
         apart_s = _rounded_up(min(earliest_ns, rule.longest_ns) / NS_PER_S, step_s)
-        return due_s, apart_s
+        forced_s = _rounded_up(rule.longest_ns / NS_PER_S, step_s)
+        return due_s, forced_s, apart_s
 
     def _after(self, time_ns: float, conditions: NetworkConditions) -> float:
         """Return the longest time from an event to the first test a time after it."""
@@ -301,7 +314,8 @@ class TriggerBounds:
 
 
 def _rounded_up(time_s: float, step_s: float) -> float:
-    return step_s * math.ceil(time_s / step_s - 1e-9) if step_s else time_s
+    is_exact = step_s == 0 or math.isinf(time_s)
+    return time_s if is_exact else step_s * math.ceil(time_s / step_s - 1e-9)
 
 
 class ErrorGrowth:

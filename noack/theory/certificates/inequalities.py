@@ -374,7 +374,7 @@ class ErrorInequalities:
             if bound.reached is not None
         ]
         found_s = np.max(times_s, axis=0)
-        found_s = np.maximum(np.minimum(found_s, self._bound.due_s), self._bound.apart_s)
+        found_s = np.maximum(np.minimum(found_s, self._bound.forced_s), self._bound.apart_s)
         if (grid_s := self._conditions.spacing_s) == 0:
             return np.asarray(found_s)
         return np.asarray(grid_s * np.maximum(np.ceil(found_s / grid_s - 1e-9), 1.0))
