@@ -41,6 +41,8 @@ def find_shipped(name: str, folder: str) -> Path:
     Raises:
         CallerError: a name without a folder that is neither a file nor a shipped one.
     """
+    if not name:
+        raise CallerError(f"no {folder.removesuffix('s')} is named: give a file or a shipped one")
     path, names = Path(name), shipped_names(folder)
     try:
         exists = path.exists()

@@ -99,7 +99,7 @@ def ending_line(end: ExitPart, reached_s: float, horizon_s: float, states: str =
         ExitStatus.OK: (f"completed {reached}", GOOD),
         ExitStatus.FAILED: (f"failed after {reached_of}", BAD),
     }.get(ExitStatus(end.status), (f"stopped after {reached_of}", DOUBTFUL))
-    details = "; ".join(filter(None, (reason, states)))
+    details = "; ".join(filter(None, (reason.removeprefix("stopped "), states)))
     return VerdictLine(f"{how}: {details}" if details else how, style)
 
 
@@ -138,7 +138,8 @@ def _states(loops: Sequence[LoopSummary]) -> str:
 def transmission_line(events: int, deliveries: int, ideal: int | None = None) -> VerdictLine:
     """Return the numbers of transmissions and deliveries, and that of the ideal loop."""
     beside = "" if ideal is None else f" (ideal loop: {ideal})"
-    return VerdictLine(f"{events} transmissions{beside}, {deliveries} delivered", NEUTRAL)
+    sent = "1 transmission" if events == 1 else f"{events} transmissions"
+    return VerdictLine(f"{sent}{beside}, {deliveries} delivered", NEUTRAL)
 
 
 class Guarantee(NamedTuple):
