@@ -158,11 +158,11 @@ docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 
 lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra mcap --extra metrics --group build -o requirements.lock
+		--no-header pyproject.toml --extra mcap --extra metrics --extra viewer --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
+		--no-header pyproject.toml --extra viewer --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --extra lab -c requirements-dev.lock -o requirements-lab.lock
+		--no-header pyproject.toml --extra lab --extra viewer -c requirements-dev.lock -o requirements-lab.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header --group compiler -o requirements-compiler.lock
 

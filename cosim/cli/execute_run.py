@@ -28,6 +28,7 @@ with lazy_modules():
         run_watcher,
     )
     from cosim.output import run_verdict
+    from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
     from noack.protocol import topology
@@ -105,6 +106,8 @@ def run_processes(
     with fork_server.fork_server(server) as server:
         ending = None
         link_load.require_capacity(loaded)
+        if options.live:
+            rerun_program.require_viewer()
         warn_of_other_runs()
         # Those of the theory come at the start: nothing waits for the launcher then.
         warnings = run_watcher.Watcher(started=lambda run_dir: warn_of_violations(loaded))

@@ -270,8 +270,8 @@ def _runtime_folder(machine: MachineFacts, _: RunRequirements) -> Iterator[Outco
 def _viewer(machine: MachineFacts, _: RunRequirements) -> Iterator[Outcome]:
     text = f"rerun {machine.viewer}"
     if machine.viewer is None:
-        remedy = "`pip install --force-reinstall noack`"
-        yield BAD, "rerun cannot be imported", "no recording is written or shown", remedy
+        remedy = "`pip install 'noack[viewer]'`"
+        yield LIMITED, "not installed", "no recording is written or shown", remedy
     elif machine.display:
         yield GOOD, f"{text}, and a display"
     else:

@@ -23,7 +23,7 @@ import numpy as np
 import zenoh
 
 from cosim.live.launcher import needed_bytes
-from cosim.output.viewer.live_viewer import has_display
+from cosim.output.viewer.rerun_program import has_display, is_installed
 from cosim.record.run_directory import environment
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
@@ -203,7 +203,7 @@ def measure(
         disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
         runtime_folder=_runtime_folder(),
         display=has_display(),
-        viewer=about["packages"].get("rerun-sdk") if find_spec("rerun") else None,
+        viewer=about["packages"].get("rerun-sdk") if is_installed() else None,
         extras={name: find_spec(module) is not None for name, (module, _) in EXTRAS.items()},
         versions={"python": about["python"], **about["packages"]},
     )

@@ -18,6 +18,7 @@ from pathlib import Path
 from cosim.interactive.draft import Draft
 from cosim.live.launcher import launch
 from cosim.live.run_watcher import Watcher
+from cosim.output.viewer.rerun_program import is_installed
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
@@ -196,7 +197,7 @@ def main() -> int:
     )
     try:
         draft = Draft("scenario", folder, "", sys.stdin.buffer.read().decode())
-        ending = launch(draft.scenario, runs, live=True, watcher=watcher)
+        ending = launch(draft.scenario, runs, live=is_installed(), watcher=watcher)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a stop now must not cost the summary
         _say("finalising", reason=ending.reason)
         from cosim.live.finalize import finalize  # not earlier: it would take time from the loop

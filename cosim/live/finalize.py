@@ -29,6 +29,7 @@ from cosim.analysis.summary_model import (
 )
 from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.progress import work_bar
+from cosim.output.viewer.rerun_program import is_installed, require_viewer
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -102,6 +103,7 @@ def finalize(
             # That of an earlier attempt may be complete: it stays if there is no space for another.
             quiet = (MachineError,) if is_shown else ()
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
+                require_viewer()
                 if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
                     helpers.call(_record_stored, run_dir, summary, over_time)
                 else:
@@ -416,6 +418,7 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
             loop.
         MachineError: the recording cannot be written.
     """
+    require_viewer()
     outcome, run = reopen(run_dir, view=False), load_run(run_dir)
     if loop is not None:
         run.number_of(loop)  # refuses an unknown name
@@ -424,8 +427,10 @@ def write_recording(run_dir: Path, loop: str | None = None) -> None:
 
 def import_libraries() -> None:
     """Import what writing record and recording needs."""
-    import cosim.output.viewer.run_recording  # imports rerun
-    import cosim.record.table_files  # noqa: F401  # imports pyarrow
+    import cosim.record.table_files  # imports pyarrow
+
+    if is_installed():
+        import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
 
 
 def _write_recording(

@@ -55,7 +55,7 @@ from noack.scenario.scenario import Scenario, loop_names
 
 with lazy_modules():
     from cosim.live import claim_monitor
-    from cosim.output.viewer import live_viewer, run_feed, run_recording
+    from cosim.output.viewer import live_viewer, rerun_program, run_feed, run_recording
 
 if TYPE_CHECKING:
     from cosim.live.claim_monitor import ClaimMonitor, Finding
@@ -408,7 +408,8 @@ def _record(process: RunProcess, live_view: "LiveView | None") -> None:
     core.noack_prefer_others()  # without real-time settings, the loop would wait for milliseconds
     # The launcher writes the view of a restarted recorder, of a long run, and of several loops.
     unseen = len(process.phases_ns) > 1 or is_long(process.scenario)
-    if view is not None or not (process.start.is_restart or unseen):
+    can_record = rerun_program.is_installed() and not (process.start.is_restart or unseen)
+    if view is not None or can_record:
         try:
             view = view or _open_view(process, None)
             recorder.show_in(view)

@@ -23,7 +23,7 @@ with lazy_modules():
     from cosim.analysis import run_summary
     from cosim.live import finalize
     from cosim.output import figure_files, result_tables, run_figures, run_tables, run_verdict
-    from cosim.output.viewer import live_viewer
+    from cosim.output.viewer import live_viewer, rerun_program
     from cosim.record import collection, run_directory, run_record
     from cosim.studies import run_archive, run_comparison
 
@@ -81,6 +81,7 @@ def view(
     if json:
         cli.print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
+    rerun_program.require_viewer()
     live_viewer.view_recording(path, native=False if web else None)
     return ExitStatus.OK
 

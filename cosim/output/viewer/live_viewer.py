@@ -42,6 +42,7 @@ from cosim.output.viewer.rerun_program import (
     OWN_HOST,
     WebViewer,
     end_process,
+    has_display,
     logged_port,
     peer_user,
     start_rerun,
@@ -275,13 +276,6 @@ class _Handler(BaseHTTPRequestHandler):
 _MAGIC = b"RRF"
 _PATIENCE_S = 5.0
 _WINDOW = "window"
-
-
-def has_display() -> bool:
-    """Whether a window can be opened here."""
-    if sys.platform in ("darwin", "win32"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class LiveView:

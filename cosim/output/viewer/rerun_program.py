@@ -22,10 +22,33 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from noack.core.errors import MachineError, PeerError
+from noack.core.errors import CallerError, MachineError, PeerError
 
+NOT_INSTALLED = "the viewer's package is not installed: pip install 'noack[viewer]'"
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.02
+
+
+def is_installed() -> bool:
+    """Whether recordings can be written and shown."""
+    return importlib.util.find_spec("rerun") is not None
+
+
+def require_viewer() -> None:
+    """Check that recordings can be written and shown.
+
+    Raises:
+        CallerError: the extra that they need is not installed.
+    """
+    if not is_installed():
+        raise CallerError(NOT_INSTALLED)
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def start_rerun(
@@ -108,7 +131,7 @@ def _path() -> str:
         for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun", "rerun.exe"):
             if (folder / name).is_file():
                 return str(folder / name)
-    raise MachineError("the viewer of the package rerun-sdk is not installed")
+    raise MachineError(NOT_INSTALLED)
 
 
 HOST = "127.0.0.1"
