@@ -15,7 +15,6 @@ from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.scenario_file import load, put, validate
 from noack.settings.section import ScenarioSection
-from noack.settings.user_files import NamedFile
 
 MOST = toml_file.MOST_LEVELS
 READERS = [load, load_campaign, load_links]
@@ -55,20 +54,6 @@ def test_long_key_is_refused_before_it_is_parsed(text: str) -> None:
     tomllib.loads(text)  # the text is valid TOML
     with pytest.raises(CallerError, match=rf"^here: a key has more than {MOST} parts$"):
         toml_file.parsed(text, "here")
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"{key(MOST)} = 1",
-        f"x = '{LONG}' # {LONG} = 1",
-        f'x = """\n{LONG} = 1\n"""\n# """\ny = 1.5',
-        *(f"x = [{string}, '{LONG}']" for string in TRICKY),
-        "x = [" + "0.5, " * 1000 + "]",
-    ],
-)
-def test_dots_outside_keys_are_not_taken_for_a_long_key(text: str) -> None:
-    assert toml_file.parsed(text, "here") == tomllib.loads(text)
 
 
 @pytest.mark.parametrize("part", ["a", "a ", "a.b ", '"""\\', '"', "'''\\"])
@@ -152,15 +137,6 @@ def test_the_number_of_further_mistakes_is_given() -> None:
     lines = str(caught.value).splitlines()
     assert len(lines) == 51
     assert lines[-1] == "here: 56 more mistakes"  # 6 required keys are missing, too
-
-
-def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    for name in ("/dev/zero", "fifo"):
-        file = NamedFile(name, tmp_path, "run.toml: network.loss")
-        for read in (file.content, file.sha256):
-            with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
-                read()
 
 
 class _Named(ScenarioSection):
