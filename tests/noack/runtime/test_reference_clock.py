@@ -9,15 +9,10 @@ from typing import Any
 import pytest
 
 from benchmarks.hosts import DrivenClocks
-from noack.core.clock import NS_PER_S, RunClock
+from noack.core.clock import NS_PER_S
 from noack.core.errors import PeerError
-from noack.protocol.machine_interface import BEGINNING, Notice, Record
-from noack.protocol.record_tables import LOST_NS
 from noack.runtime.host_clocks.reference_clock import (
-    FOUND,
-    LOST,
     LOST_AFTER_NS,
-    ClockRecord,
     ClockReport,
     ReferenceClock,
     reference_clock,
@@ -29,21 +24,6 @@ from noack.scenario.scenario_file import validate
 
 KEY = bytes(range(32))
 ROOMY = ClocksSection(largest_error_us=1e6)  # a busy machine gives wide bounds
-
-
-class SteppedClocks(DrivenClocks):
-    """The real-time clock is stepped, and the machine may be away for a while."""
-
-    real_ahead_ns = own_ahead_ns = 0
-
-    def monotonic_ns(self) -> int:
-        return super().monotonic_ns() + self.own_ahead_ns
-
-    def realtime_ns(self) -> int:
-        return super().realtime_ns() + self.real_ahead_ns
-
-    def stamp_ns(self, stamp: bytes) -> int:
-        return super().stamp_ns(stamp) + self.real_ahead_ns
 
 
 @pytest.fixture
@@ -100,19 +80,10 @@ def test_the_difference_to_the_coordinators_clock_is_in_the_bound(
         since_ns = report.now_ns
 
 
-def test_steps_of_the_real_time_clock_do_not_matter(stack: ExitStack) -> None:
-    clocks = SteppedClocks(NS_PER_S, -100_000)
-    clock = following(stack, clocks)
-    for step_ns in (3600 * NS_PER_S, -NS_PER_S, 10**6, -7200 * NS_PER_S):
-        clocks.real_ahead_ns += step_ns
-        for _ in range(3):
-            assert polled(clock).lost is None
-
-
 def test_a_bound_without_answers_is_lost_and_found_again(stack: ExitStack) -> None:
     with ExitStack() as first:
         port = reference_at(first).address[1]
-        clock = ReferenceClock(("127.0.0.1", port), KEY, ROOMY, SteppedClocks())
+        clock = ReferenceClock(("127.0.0.1", port), KEY, ROOMY, DrivenClocks())
         stack.enter_context(closing(clock))
         clock.wait_until_known()
         assert polled(clock).lost is None
@@ -128,21 +99,6 @@ def test_a_bound_without_answers_is_lost_and_found_again(stack: ExitStack) -> No
     assert "the reference has another clock than before" in causes
 
 
-def test_after_the_machine_was_away_the_bound_is_lost_since_then(stack: ExitStack) -> None:
-    """A suspended machine's clock stops; here the reference's seems to run backward."""
-    clocks = SteppedClocks()
-    clock = following(stack, clocks)
-    for _ in range(3):
-        before = polled(clock)
-    clocks.own_ahead_ns += NS_PER_S // 100
-    reports = [clock.poll() for _ in range(1)]
-    while reports[-1].lost is None:
-        time.sleep(0.01)
-        reports.append(clock.poll())
-    assert reports[-1].lost == "the exchanges contradict each other or the assumed rate"
-    assert reports[-1].since_ns <= before.now_ns
-
-
 def test_it_does_not_begin_without_an_answer_or_with_a_wide_bound(stack: ExitStack) -> None:
     silent = stack.enter_context(closing(TimeReference(("127.0.0.1", 0), KEY)))
     clock = stack.enter_context(closing(ReferenceClock(silent.address, KEY, ROOMY)))
@@ -155,54 +111,6 @@ def test_it_does_not_begin_without_an_answer_or_with_a_wide_bound(stack: ExitSta
     clock = stack.enter_context(closing(ReferenceClock(address, KEY, narrow)))
     with pytest.raises(PeerError, match=r"known within \d+ µs, 0\.001 µs allowed$"):
         clock.wait_until_known(wait_s=0.2)
-
-
-class Scripted(ReferenceClock):
-    """A reference whose reports are given."""
-
-    def __init__(self, reports: list[ClockReport]) -> None:
-        self.reports = reports
-
-    def poll(self) -> ClockReport:
-        return self.reports.pop(0)
-
-
-def test_rows_and_lines_of_the_log() -> None:
-    ms = 10**6
-    reports = [
-        ClockReport(0, 50 * ms, 7, 3000, 10),
-        ClockReport(50 * ms, 100 * ms, 8, None, 10, "no answer"),
-        ClockReport(100 * ms, 150 * ms, 8, None, 10, "no answer"),
-        ClockReport(10 * ms, 200 * ms, 9, None, 12, "a contradiction"),
-        ClockReport(200 * ms, 250 * ms, 9, 4000, 13),
-    ]
-    clock = RunClock(0, 2.0, lambda: 0)
-    record = ClockRecord("sensor", BEGINNING, clock, Scripted(reports), has_table=True)
-    outputs = [record.news(2 * one.now_ns) for one in list(reports)]
-    rows = [one for each in outputs for one in each if isinstance(one, Record)]
-    assert [one.table for one in rows] == ["sensor_clock"] * 5
-    assert [one.row for one in rows] == [
-        (0, 10, 0, 100 * ms, 50 * ms, 7, 3000),
-        (1, 10, 100 * ms, 200 * ms, 100 * ms, 8, LOST_NS),
-        (2, 10, 200 * ms, 300 * ms, 150 * ms, 8, LOST_NS),
-        (3, 12, 20 * ms, 400 * ms, 200 * ms, 9, LOST_NS),
-        (4, 13, 400 * ms, 500 * ms, 250 * ms, 9, 4000),
-    ]
-    lines = [one for each in outputs for one in each if isinstance(one, Notice)]
-    assert [(one.t_ns, one.level) for one in lines] == [
-        (200 * ms, LOST), (400 * ms, LOST), (500 * ms, FOUND)
-    ]  # fmt: skip
-    assert lines[1].text == "the bound of its clock's error is lost: a contradiction"
-
-
-def test_the_coordinators_own_clock_has_no_error() -> None:
-    record = ClockRecord("plant", BEGINNING, RunClock(time.monotonic_ns()), None, has_table=True)
-    for number in range(3):
-        (one,) = record.news(0)
-        assert isinstance(one, Record)
-        assert one.row[0] == number
-        assert one.row[-2:] == (0, 0)
-    assert record.summary() == {}
 
 
 def test_a_process_with_another_clock_needs_a_reference(content: dict[str, Any]) -> None:

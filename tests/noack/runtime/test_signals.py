@@ -12,14 +12,6 @@ from noack.core.errors import ExitStatus
 from noack.runtime.command_line import Signals
 
 
-def test_a_signal_forwarded_several_times_counts_once() -> None:
-    with Signals().handled() as signals:
-        for _ in range(3):
-            os.kill(os.getpid(), signal.SIGINT)
-        assert signals.received == signal.SIGINT
-        assert signals.status is ExitStatus.INTERRUPTED
-
-
 def test_a_second_signal_ends_the_process_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = time.monotonic_ns()
     with Signals().handled() as signals:
@@ -66,7 +58,6 @@ TERM = (signal.SIGTERM, 143, "stopped on request (SIGTERM)")
     ("words", "ended"),
     [
         (["cosim.cli", "typer", "--version"], INT),
-        (["cosim.cli", "typer", "--version"], TERM),
         (["netem", "netem.channel", "--help"], INT),
         (["plant_server", "noack.runtime.run_process", "--help"], TERM),
     ],
