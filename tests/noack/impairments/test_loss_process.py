@@ -90,15 +90,6 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert all_lost <= longest * (1 + 1e-9)
 
 
-def test_many_packets_are_computed_by_powers_and_by_steps_alike() -> None:
-    guarantee = LossGuarantee((LongestBurst(4),))
-    by_powers = process(INDEPENDENT).keeps(guarantee, 3000)
-    steps = np.eye(5)[0]
-    for _ in range(3000):
-        steps = np.array([(1 - P) * steps.sum(), *(P * steps[:-1])])
-    assert by_powers == pytest.approx(steps.sum(), rel=1e-9)
-
-
 def test_losses_that_depend_on_times_are_refused() -> None:
     with pytest.raises(NotPredictableError):
         process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})

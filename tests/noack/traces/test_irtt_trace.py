@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.core.errors import CallerError
 from noack.traces.irtt_trace import read_irtt
 from noack.traces.packet_trace import MAX_PACKETS
 from noack.traces.trace_formats import read_trace
@@ -70,12 +69,3 @@ def test_wrong_documents(change: Any, message: str) -> None:
     change(content)
     with pytest.raises(ValueError, match=message):
         read_irtt(io.BytesIO(json.dumps(content).encode()), MAX_PACKETS)
-
-
-def test_cut_and_damaged_files(tmp_path: Path) -> None:
-    data = json.dumps(document()).encode()
-    path = tmp_path / "irtt.json"
-    for wrong in (data[:-2000], gzip.compress(data)[:-2000], gzip.compress(data)[:40] + b"x" * 99):
-        path.write_bytes(wrong)
-        with pytest.raises(CallerError, match=r"ends within|cannot be decompressed"):
-            read_trace(path)
