@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from noack.core.errors import MachineError
-from noack.core.file_access import new_file, write_whole
+from noack.core.file_access import locked, new_file, write_whole
 
 
 def test_a_file_is_replaced_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -56,3 +56,12 @@ def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> N
         interrupted()
     assert path.read_text() == "old"
     assert [one.name for one in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_lock_file_is_not_a_link(tmp_path: Path) -> None:
+    (tmp_path / "lock").symlink_to(tmp_path / "target")
+    with pytest.raises(OSError, match="not a regular file"), locked(tmp_path / "lock"):
+        pass
+    assert not (tmp_path / "target").exists()
+    with pytest.raises(OSError, match="none/lock"), locked(tmp_path / "none" / "lock"):
+        pass

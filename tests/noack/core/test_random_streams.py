@@ -1,6 +1,7 @@
 import hashlib
 
 import numpy as np
+import pytest
 
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
@@ -15,6 +16,8 @@ def test_a_stream_is_the_documented_generator() -> None:
     # The expected numbers are constants: a seed gives the same draws in every version.
     numbers = stream(2, "netem", "update", "loss", "0").random(3)
     assert numbers.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]
+    with pytest.raises(ValueError, match="needs a name"):
+        stream(0)
 
 
 def test_a_streams_key_is_the_seed_sequences_state() -> None:

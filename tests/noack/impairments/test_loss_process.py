@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import numpy as np
 import pytest
 
 from noack.impairments.link_settings import LinkSettings
@@ -65,14 +64,6 @@ def test_a_guarantee_is_kept_with_the_total_probability_of_all_patterns_that_kee
     patterns = list(product([False, True], repeat=8))
     expected = sum(probability(losses, one) for one in patterns if is_kept(guarantee, one))
     assert losses.keeps(guarantee, 8) == pytest.approx(expected, rel=1e-9)
-
-
-def test_tails_and_the_largest_probability_of_independent_losses() -> None:
-    losses = process(INDEPENDENT, {"kind": "corrupt", "probability": 0.1})
-    lost = 1 - (1 - P) * 0.9
-    assert losses.is_independent
-    assert losses.largest_probability == pytest.approx(lost)
-    assert losses.tails(5)[0] == pytest.approx(lost ** np.arange(1, 6))
 
 
 def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_past() -> None:

@@ -158,18 +158,6 @@ def test_a_sensor_that_waits_without_acknowledgements_is_refused() -> None:
     assert text_of(own) == NOT_ACKNOWLEDGED
 
 
-def test_the_last_of_several_loops_is_checked_too() -> None:
-    own = LoopMachines([controller(seed, Sizes(1, 1)) for seed in range(3)])
-    assert text_of(own) is None
-    own.machines[2].machine.m = 0
-    assert text_of(own) == "a machine has not 1 to 64 states and inputs"
-
-
-def test_python_is_told_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match=r"^controller: an actuation has more than 64 entries$"):
-        LoopMachines([controller(1, OF._replace(predictions=31))])
-
-
 def test_each_text_is_in_the_table() -> None:
     texts = re.findall(r'(?:return|:) "([^"]+)"', SOURCE.read_text())
     assert {text for *_, text in CASES} | {NOT_ACKNOWLEDGED} == {*texts}
@@ -181,3 +169,8 @@ def test_a_layout_with_a_word_that_the_machine_does_not_write_is_refused(word: i
     assert text_of(own) is None
     own.core.tables[0].layouts[0][4] = word
     assert text_of(own) == "the rows of a table have another size than the machines write"
+
+
+def test_python_is_told_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match=r"^controller: an actuation has more than 64 entries$"):
+        LoopMachines([controller(1, OF._replace(predictions=31))])

@@ -1,10 +1,11 @@
 """Where compiled code is stored, and the behaviour when it cannot be stored."""
 
+import signal
 from pathlib import Path
 
 import pytest
 
-from noack.plants.systems.code_cache import cache_folder, compiler
+from noack.plants.systems.code_cache import _one_at_a_time, cache_folder, compiler
 
 SOURCES = [Path(__file__)]
 
@@ -49,3 +50,27 @@ def test_without_a_home_there_is_no_cache(home: Path, monkeypatch: pytest.Monkey
     assert function(21) == 42
     # numba, under its older rules, has no location of its own for it either
     assert function._cache.cache_path is None
+
+
+def test_empty_cache_files_are_compiled_again(folder: Path) -> None:
+    for suffix in ("nbi", "nbc"):
+        assert compiler(folder)(doubled)(21) == 42
+        (file,) = folder.rglob(f"*.doubled-*.{suffix}")
+        file.write_bytes(b"")
+        assert compiler(cache_folder("netem", SOURCES))(doubled)(21) == 42
+        assert file.stat().st_size > 0
+
+
+@pytest.mark.usefixtures("usual_signals")
+def test_ctrl_c_waits_for_the_compiler(folder: Path) -> None:
+    """LLVM calls Python back, and does not survive an exception there."""
+    compiled = []
+
+    def interrupted(signature: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        compiled.append(signature)
+
+    with pytest.raises(KeyboardInterrupt):
+        _one_at_a_time(interrupted, folder / ".lock")(1)
+    assert compiled == [1]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -115,6 +115,8 @@ def test_a_warning_is_not_a_failure_and_fmu_output_is_suppressed(
         ),
         ({"parameters": {"mu": "high"}}, "give a number, not 'high'"),
         ({"parameters": {"fail_status": 1.5}}, "give a whole number, not 1.5"),
+        ({"parameters": {"energy": 1.0}}, '"energy" cannot be set at the start'),
+        ({"state_variables": ("x0", "x0")}, 'state_variables: "x0" is named twice'),
         ({"parameters": {"u": 1.0}}, '"u" is an input; its value at rest is operating_input'),
         ({"on_record": ("heat",)}, 'plant.system.on_record: the FMU has no variable "heat"'),
         ({"initial_variables": ()}, "but the FMU begins at [0.0, 0.0]"),
@@ -135,6 +137,7 @@ def test_settings_that_do_not_fit_the_fmu_are_refused_in_one_line(
     ("edit", "expected"),
     [
         (("CoSimulation modelId", "ModelExchange modelId"), "not for co-simulation"),
+        (("{oscillator}", "{other}"), "cannot be started: Failed to instantiate"),
         (('modelIdentifier="oscillator"', 'modelIdentifier="other"'), "this machine needs"),
         (('fmiVersion="2.0"', 'fmiVersion="1.0"'), "is no FMU of FMI 2 or 3, or a damaged one"),
         (("</fmiModelDescription>", ""), "is no FMU of FMI 2 or 3"),
@@ -189,3 +192,10 @@ def test_only_folders_left_by_killed_processes_are_removed(
     finally:
         os.close(lock)
     assert sorted(own_folder_for_temporary_files.iterdir()) == [used, other]
+
+
+def test_an_fmu_that_requests_termination_has_failed(tmp_path: Path) -> None:
+    parameters = {"fail_at_s": 0.02, "fail_status": -1}
+    system = FmuSystem(settings(build(tmp_path, 3), parameters=parameters), X0)
+    with pytest.raises(SystemFailedError, match="requests the end of the simulation"):
+        motion(system, [0.0] * 100)

@@ -59,3 +59,8 @@ def test_endless_changes_of_a_sign_end_the_integration(monkeypatch: pytest.Monke
     assert code < 0
     assert abs(z[0]) < 1e-3
     assert rates.evaluations < 20_000
+
+
+def test_equations_that_are_not_finite_are_a_failure() -> None:
+    code, _ = advanced(Switched(lambda z, sign: [math.nan]), [1.0], 1.0)
+    assert code == jump_integrator.TOO_SMALL_STEPS

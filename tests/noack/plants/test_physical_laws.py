@@ -116,3 +116,15 @@ def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised
     assert np.isnan(states[2]).all()
     with pytest.raises(KeyError, match="far"):
         motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [1.0, 1.0])
+
+
+def test_a_non_finite_state_stays_non_finite() -> None:
+    assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
+
+
+def test_the_linearisation_has_the_published_frequency_response() -> None:
+    A, B = settings().linearisation()
+    w = np.logspace(-1, 7, 50)
+    _, expected = signal.freqresp(published(), w)
+    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

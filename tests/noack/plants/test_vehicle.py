@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
+from noack.plants.four_tank import FourTankSettings
 from noack.plants.plant_settings import OdeSystem, linearise
 from noack.plants.vehicle import VehicleSettings, equations, library
 from noack.scenario.named_models import single_track_lane
@@ -58,6 +59,8 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
     """An implicit solver for stiff equations, over a lane change, with the servo written out."""
     chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
     system = OdeSystem(chosen.equations(), X0)
+    np.testing.assert_allclose(system.x[1:], X0[1:], rtol=1e-12)  # "kinematic" has fewer states
+    assert len(system.z) == len(chosen.internal_names)
     name = f"vehicle_dynamics_{library}"
     dynamics = getattr(import_module(f"vehiclemodels.{name}"), name)
 
@@ -73,23 +76,17 @@ def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
     np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
 
 
-def test_a_speed_above_the_vehicles_maximum_is_refused() -> None:
-    with pytest.raises(CallerError, match=r"maximum speed of a truck is 22\.22 m/s"):
-        OdeSystem(
-            settings(model="kinematic", parameters="truck", speed_m_per_s=30.0).equations(),
-            np.zeros(4),
-        )
-
-
 @pytest.mark.parametrize(("given", "expected"), [
     ({"parameters": "truck"}, "parameters: the library has no masses"),
     ({"friction": 0.5}, 'friction: the model "single_track" has none'),
+    ({"model": "kinematic", "parameters": "truck", "speed_m_per_s": 30.0},
+     r"maximum speed of a truck is 22\.22 m/s"),
 ])  # fmt: skip
 def test_settings_that_the_library_does_not_support_are_refused(
     given: dict[str, Any], expected: str
 ) -> None:
-    with pytest.raises(ValueError, match=expected):
-        settings(**given)
+    with pytest.raises((ValueError, CallerError), match=expected):
+        OdeSystem(settings(**given).equations(), np.zeros(4))
 
 
 WIDTHS = {"ks": 5, "st": 7, "std": 9, "mb": 29}
@@ -143,3 +140,26 @@ def test_equations_that_cannot_be_compiled_are_run_in_python(
     assert rates(np.array([1.0, 3.0]), 0.0, 0.0).tolist() == [2.0, 6.0]
     lines = capsys.readouterr().err.splitlines()
     assert lines[-1].startswith("noack: warning: the vehicle's equations stay slow")
+
+
+@pytest.mark.parametrize("model", ["kinematic", "multi_body"])
+def test_a_vehicle_has_no_linearisation_if_x_is_not_its_state(model: str) -> None:
+    """A kinematic vehicle has fewer states; a multi-body vehicle rolls as fast as it turns."""
+    assert all(np.isnan(matrix).all() for matrix in linearised(settings(model=model)))
+
+
+def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("noack.plants.plant_settings.find_spec", lambda name: None)
+    with pytest.raises(CallerError, match=r"pip install 'noack\[vehicle\]'"):
+        settings().require_installed()
+
+
+def test_the_equations_are_compiled_once_before_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(compiled, "compiled_dynamics", made.append)
+    monkeypatch.setattr(compiled, "is_compiled", lambda model: model == "st")
+    VehicleSettings(kind="vehicle").prepare()
+    VehicleSettings(kind="vehicle", model="multi_body").prepare()
+    VehicleSettings(kind="vehicle", model="kinematic", parameters="truck").prepare()
+    FourTankSettings(kind="four_tank").prepare()
+    assert made == ["mb", "kst"]

@@ -224,26 +224,15 @@ def test_a_run_accepts_one_version_only(values: list[float], encrypted: bool) ->
     assert_rejected(decoder, renamed, Rejection.TAG)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "accepted"),
-    [
-        ("sequence", 2**63 - 1, True), ("sequence", 2**63, False), ("sequence", 2**64 - 1, False),
-        ("t_ns", 2**62 - 1, True), ("t_ns", 2**62, False), ("t_ns", -1, False),
-    ],
-)  # fmt: skip
-def test_a_number_beyond_the_records_range_is_rejected(
-    field: str, value: int, accepted: bool
-) -> None:
-    decoder = new_decoder()
-    data = datagram([0.0, 0.0, 0.0], **{field: value})  # type: ignore[arg-type]
-    if not accepted:
-        assert_rejected(decoder, data, Rejection.RANGE)
-        return
-    message = decoder.decode(data)
+@pytest.mark.parametrize(("field", "most"), [("sequence", 2**63 - 1), ("t_ns", 2**62 - 1)])
+def test_a_number_beyond_the_records_range_is_rejected(field: str, most: int) -> None:
+    decoder, zeros = new_decoder(), [0.0, 0.0, 0.0]
+    assert_rejected(decoder, datagram(zeros, **{field: most + 1}), Rejection.RANGE)  # type: ignore
+    message = decoder.decode(datagram(zeros, **{field: most}))  # type: ignore[arg-type]
     assert message is not None
-    assert np.int64(getattr(message, field)) == value
+    assert np.int64(getattr(message, field)) == most
     # The number does not wrap: everything after the last number is old.
-    assert_rejected(decoder, datagram([0.0, 0.0, 0.0], sequence=0), Rejection.STALE)
+    assert_rejected(decoder, datagram(zeros), Rejection.STALE)
 
 
 FAULTS = [
@@ -283,3 +272,11 @@ def test_an_acknowledgement_carries_no_vector() -> None:
     message = decoder.decode(datagram([], flow=4, sequence=7, t_ns=5))
     assert message is not None
     assert (*message[:3], message.vector.size) == (Flow.ACKNOWLEDGEMENT, 7, 5, 0)
+
+
+def test_a_key_or_a_vector_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="32 bytes, not 31"):
+        Encoder(RUN, bytes(31))
+    for shape in ((0,), (65,), (2, 2), (1, 3)):
+        with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
+            Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))

@@ -67,6 +67,8 @@ def _fifo(path: Path) -> None:
             lambda path: path.chmod(0o640),
             "other users can read or change it; make it yours alone: chmod 600 ",
         ),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is no text"),
+        (lambda path: path.write_text("{"), "not an invitation: not a valid ticket: "),
         (_fifo, "cannot be read: not a regular file"),
         (lambda path: os.truncate(path, 10**9), "not an invitation: larger than 64 MiB"),
         (

@@ -12,13 +12,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from noack.core.errors import ExitStatus
-from noack.runtime.command_line import (
-    LogFormat,
-    failed,
-    log_event,
-    log_format,
-    print_to_stderr,
-)
+from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
 
 Object = dict[str, Any]
 

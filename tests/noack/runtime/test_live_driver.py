@@ -19,6 +19,7 @@ from noack.core.core_library import core
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
+from noack.runtime.live_driver import LiveDriver
 from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
 from tests.wire_decoder import NO_VECTOR
 
@@ -172,19 +173,6 @@ def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[
         assert sorted(live.rows.tables) == ["sensor_acknowledgement", SENSOR_MEASUREMENT]
 
 
-def test_measurements_do_not_keep_an_acknowledgement_waiting(content: dict[str, Any]) -> None:
-    """They fill all the room of a call; the other socket is read first the next time."""
-    content["network"] |= {"protocol": "ack"}
-    with closing(Live("sensor", [scenario(content)] * 20, acknowledged=True)) as live:
-        live.send(*measurements(3, 20))
-        live.send(Message(Flow.ACKNOWLEDGEMENT, 10, 5, NO_VECTOR, 0), by=live.answers)
-        live.drive_until_accepted(60)
-        table = "sensor_acknowledgement"
-        (at_ns,) = live.rows.of(table, columns(live, table), NOW)
-        times_ns = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
-        assert sum(t_ns > at_ns for t_ns in times_ns) > 20
-
-
 def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.senders[0] = -1
@@ -195,13 +183,8 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
         assert (report["sent"], report["send_errors"]) == (0, {text: 1})
 
 
-def test_messages_from_before_the_admission_are_stale(content: dict[str, Any]) -> None:
-    phases_ns = [0, 4_000_000]
-    loops = [scenario(content)] * 2
-    with closing(Live("sensor", loops, phases_ns, admitted_ns=10_000_000)) as live:
-        # In the run's time 9 and 10 ms; of the second loop 9 and 10 ms, too.
-        given = [measurement(k, [1.0, 0.0], loop) for loop in (0, 1)
-                 for k in (9 - 4 * loop, 10 - 4 * loop)]  # fmt: skip
-        live.send(*given)
-        live.drive(lambda: sum(live.driver.rejected.values()) + live.driver.accepted == 4)
-        assert live.driver.reports() == [{"accepted": 1, "rejected": {"stale": 1}}] * 2
+def test_numbers_that_it_cannot_act_on_are_refused(content: dict[str, Any]) -> None:
+    with closing(Live("sensor", [scenario(content)])) as live:
+        live.driver.core.receiver_count = 3
+        with pytest.raises(ValueError, match="receiver_count: not from 0 to 2"):
+            LiveDriver._check(live.driver)

@@ -1,6 +1,7 @@
 """Lock files whose process has ended, and several readers at the same time."""
 
 import os
+import resource
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 from noack.core import file_access
+from noack.core.errors import MachineError
 from noack.runtime import private_folder
 from noack.runtime.private_folder import open_private
 
@@ -28,21 +30,6 @@ def names() -> list[str]:
         return sorted(folder.names())
 
 
-def test_a_file_is_stale_to_each_of_two_readers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second one looks while the first one has its lock."""
-    leave("lab.json")
-    found = []
-
-    def and_look(*arguments: Any, **how: Any) -> bool:
-        monkeypatch.setattr(private_folder, "lock", file_access.lock)
-        locked = file_access.lock(*arguments, **how)
-        found.extend(private_folder.live_lock_files("k"))
-        return locked
-
-    monkeypatch.setattr(private_folder, "lock", and_look)
-    assert private_folder.live_lock_files("k") == found == []
-
-
 def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -59,4 +46,18 @@ def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
         monkeypatch.setattr(private_folder, "lock", stopped)
         private_folder.live_lock_files("k")
         assert names() == ["lab.json", "lab.sock", "lab.sock.lock"]
+    assert names() == []
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing() -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with (
+            pytest.raises(MachineError, match=r"lab\.json: cannot be written: File too large"),
+            private_folder.lock_file("k", "lab", {"long": "x" * 2000}),
+        ):
+            raise AssertionError("it was written")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert names() == []

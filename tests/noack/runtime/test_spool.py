@@ -1,14 +1,10 @@
-import itertools
 import shutil
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from cosim.record.spool_conversion import merged, spool_segments
 from noack.core.errors import MachineError
 from noack.runtime.spool import SpoolWriter, read_chunks
 
@@ -21,10 +17,6 @@ def spool(folder: Path, writer: str, table: str, *batches: tuple[int, bytes]) ->
         with_writer.append(table, first, payload)
     with_writer.close()
     return folder / f"{table}.{writer}"
-
-
-def numbers(first: int, end: int) -> bytes:
-    return np.arange(first, end, dtype="<i8").tobytes()
 
 
 def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
@@ -42,20 +34,6 @@ def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
         assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
     path.write_bytes(whole + struct.pack("<QQ", 11, 2**62))  # a damaged length takes no memory
     assert list(read_chunks(tmp_path, "plant_step")) == batches
-
-
-@given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
-def test_rows_spooled_twice_are_merged(
-    tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
-) -> None:
-    """The recorder stored the first rows, the process all rows, in batches of other sizes."""
-    folder = tmp_path_factory.mktemp("spool")
-    for writer, cuts, end in (("recorder", cuts_a, 13), ("plant", cuts_b, 20)):
-        edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
-        batches = [(a, numbers(a, b)) for a, b in itertools.pairwise(edges)]
-        spool(folder, writer, "step", *batches)
-    rows = np.concatenate([*merged(spool_segments(folder, "step", ROW), ROW)])
-    assert rows["input"].tolist() == list(range(20))
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])

@@ -1,6 +1,7 @@
 """Rows on their way to the recorder: batches, losses, memory, and the handing over at the end."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,14 @@ from hypothesis import strategies as st
 from noack.core.errors import NoAnswerError
 from noack.protocol.machine_interface import Record
 from noack.runtime import telemetry
-from noack.runtime.telemetry import ReceivedRows, TelemetryBuffer, deliver_report, first_row
+from noack.runtime.spool import kept_run_name
+from noack.runtime.telemetry import (
+    OwnSpool,
+    ReceivedRows,
+    TelemetryBuffer,
+    deliver_report,
+    first_row,
+)
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}
@@ -158,3 +166,21 @@ def test_rows_that_the_recorder_never_takes_are_stored_and_reported(
         assert plane.reports[-1]["stored"].get("one", []) == stored
         assert len(disk) == len(stored) * 3
         assert len(buffer.stored().get("one", ())) == len(stored)
+
+
+def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> None:
+    """Runs of two recorders that began in one second, with processes on one host."""
+    header = json.dumps({"first": 0}).encode()
+    one, again, other = (
+        OwnSpool(tmp_path / "run", "sensor", writer, kept_of)
+        for writer, kept_of in [("a", "0001"), ("b", "0001"), ("c", "0002")]
+    )
+    assert not (tmp_path / "run").exists()  # nothing is left of a run that kept nothing
+    for spool in (one, again, other):
+        spool.append("sensor_event", header, b"rows")
+        spool._files.close()
+    assert one.folder == again.folder == tmp_path / "run"
+    assert other.folder == tmp_path / "run-0002"
+    assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
+    assert len(list((one.folder / "spool").glob("sensor_event.*"))) == 2
+    assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1

@@ -59,24 +59,6 @@ def test_the_rate_for_what_must_pass_is_the_limit(
     require_capacity(scenario_of(content, 1000, 5, loops, enforce_mansd=False))
 
 
-def test_the_actuations_need_a_rate_too(content: dict[str, Any]) -> None:
-    """30 controllers with 500 ticks a second; one of any 5 actuations must pass."""
-    inputs = len(content["model"].get("B", [[0]])[0])
-    bits = 8 * (datagram_bytes(inputs) + 28)
-    needed_bps = 30 * bits * 500 // 5
-
-    def checked(rate_bps: int, **actuation: Any) -> None:
-        rate = {"kind": "rate", "rate_bps": rate_bps, "queue": 5}
-        network = content["network"] | {"actuation": {"impairments": [rate], **actuation}}
-        loops = [{"name": "a", "count": 30}]
-        require_capacity(validate(content | {"network": network, "loops": loops}, "here"))
-
-    checked(needed_bps, mansd=4)
-    with pytest.raises(CallerError, match=rf"network\.actuation.*any 5 .* need {needed_bps} bit/s"):
-        checked(needed_bps - 1, mansd=4)
-    checked(1000)  # without a guarantee nothing must pass
-
-
 def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
     loops = {"name": "a", "count": 30}
     slow = scenario_of(content, 1000, 5, loops)
@@ -85,6 +67,24 @@ def test_an_event_trigger_is_only_warned_about(content: dict[str, Any]) -> None:
     assert f"need {30 * BITS * 500 // 3} bit/s" in warning
     fast = scenario_of(content, 30 * BITS * 500, 5, loops)
     assert [*load_warnings(link_loads(fast), fast)] == []
+    delay = {"kind": "delay", "jitter_s": 0.001, "distribution": "normal"}
+    slow = scenario_of(content, 1000, 5, loops, impairments=[delay])
+    (warning,) = load_warnings(link_loads(slow), slow)
+    assert "no bound of the delay of updates is known (network.impairments.0)" in warning
+
+
+def test_recorded_opportunities_are_a_bottleneck(content: dict[str, Any]) -> None:
+    """An opportunity carries 1504 bytes; a datagram has 32 more than its payload."""
+    loops = {"name": "a", "count": 30, "trigger": PERIODIC}
+    needed_bps = 30 * 8 * (datagram_bytes(2) + 32) / 0.05 / 3
+    most_ms = int(1000 * 8 * 1504 / needed_bps)
+    enough, less = (
+        scenario_of(content, 1, 1, loops, impairments=[{"kind": "opportunities", "times_ms": [ms]}])
+        for ms in (most_ms, most_ms + 1)
+    )
+    require_capacity(enough)
+    with pytest.raises(CallerError, match=f"need {int(needed_bps)} bit/s"):
+        require_capacity(less)
 
 
 def longest_delay_s(scenario: Scenario, loops: int, seed: int, together: bool) -> float:

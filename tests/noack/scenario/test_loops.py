@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from noack.core.errors import CallerError
-from noack.scenario.resolution import loop_of, resolve, resolve_run, resolved_loops
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
-from noack.scenario.scenario_file import dumps, load, toml_text, validate
+from noack.scenario.scenario_file import load, toml_text, validate
 
 
 def with_loops(content: dict[str, Any], *loops: dict[str, Any]) -> Scenario:
@@ -124,50 +124,24 @@ def test_keys_of_the_entry_change_the_file(content: dict[str, Any], tmp_path: Pa
     assert (loop.controller.rate_hz, loop.mode, loop.seeds.plant) == (25.0, "model", 3)
 
 
-def test_what_is_written_has_the_content_of_the_file(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    given = loaded(tmp_path, content, OTHER)
-    for scenario in (given, resolve_run(given)):
-        elsewhere = tmp_path / "elsewhere.toml"
-        elsewhere.write_text(dumps(scenario))
-        again = load(elsewhere)
-        assert again == scenario
-        for one, other in zip(resolved_loops(again), resolved_loops(given), strict=True):
-            assert one == other
-
-
 def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     np.savez(tmp_path / "parts/model.npz", A=[[-3.0]], B=[[1.0]], gain=[[-1.0]])
     (tmp_path / "parts/trigger.py").write_text("class Trigger: ...")
-    other = OTHER | {
-        "model": {"file": "model.npz"},
-        "trigger": {"policy": "python", "name": "Trigger", "file": "trigger.py"},
-    }
-    loop = loops_of(loaded(tmp_path, content, other))[1]
-    assert loop.model.A == ((-3.0,),)
-    trigger: Any = loop.trigger
-    assert trigger.file == str(tmp_path / "parts/trigger.py")
-    assert len(trigger.sha256) == 64
-
-
-NETWORK = {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}}
-
-
-def test_what_the_loops_share_is_that_of_the_run(content: dict[str, Any], tmp_path: Path) -> None:
-    theirs = {
-        "network": NETWORK | {"mansd": 3, "limit": 5}, "certificate": {"late_periods": 1},
-        "changes": [{"at_s": 1.0, "set": {"mansd": 1}}], "horizon_s": 99.0,
-    }  # fmt: skip
-    own = content | {"network": NETWORK}
-    assert loaded(tmp_path, own, OTHER | theirs) == loaded(tmp_path, own, OTHER)
+    own = {"policy": "python", "name": "Trigger", "file": "trigger.py"}
+    other = OTHER | {"model": {"file": "model.npz"}, "trigger": own}
+    elsewhere = own | {"file": "parts/trigger.py"}
+    for entry in ({}, {"trigger": elsewhere}):
+        loop = loops_of(loaded(tmp_path, content, other, **entry))[1]
+        assert loop.model.A == ((-3.0,),)
+        trigger: Any = loop.trigger
+        assert trigger.file == str(tmp_path / "parts/trigger.py")
+        assert len(trigger.sha256) == 64
 
 
 @pytest.mark.parametrize(
     ("name", "other", "message"),
     [
-        ("parts/none.toml", {}, "no such file, nor a shipped scenario; `noack scenarios` lists"),
         ("lane_folowing", {}, "nor a shipped scenario; did you mean lane_following?"),
         ("", {}, 'scenario = "": no such file, nor a shipped scenario'),
         ("parts/other.toml", {"loops": [{"name": "c"}]},

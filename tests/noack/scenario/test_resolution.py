@@ -1,6 +1,5 @@
 """From a scenario to a run: draws, matrices, and set points with their equilibria."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import input_at
-from noack.scenario.scenario_file import dumps, load, validate
+from noack.scenario.scenario_file import load, validate
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)
@@ -107,20 +106,6 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
     A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
     found = input_at(A, B, x_r)
     assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
-
-
-POSITION: dict[str, Any] = {"C": [[1.0, 0.0]], "noise_std": [0.01]}
-
-
-def test_a_resolved_scenario_has_its_gain_and_resolves_to_itself(content: dict[str, Any]) -> None:
-    content["plant"]["measurement"] = POSITION
-    content["observer"] = {"kind": "luenberger", "poles_per_s": [[-5.0, 1.0]]}
-    once = resolve(validate(content, "file"))
-    assert once.observer is not None
-    assert once.observer.kind == "luenberger"
-    assert once.observer.gain is not None
-    again = validate(tomllib.loads(dumps(once)), "again")
-    assert again == once == resolve(again)
 
 
 def test_the_lane_model_is_the_papers() -> None:

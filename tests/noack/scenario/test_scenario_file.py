@@ -3,7 +3,7 @@
 import os
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import tomli_w
 import noack
 from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve, resolved_loops
-from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
@@ -45,12 +44,6 @@ plant = { initial_state = [1, 0] }
 trigger = { beta = 0.5, alpha_per_s = 0.25 }
 network = { mansd = 2, loss = { model = "worst_case" } }
 """
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    (tmp_path / "some.toml").write_text(LANE)
-    return tmp_path / "some.toml"
 
 
 def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
@@ -134,13 +127,6 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
         assert line.startswith(begins), line
 
 
-def test_a_long_value_is_shortened(tmp_path: Path) -> None:
-    (line,) = mistakes(LANE, tmp_path, [f'mode="{"x" * 500}"'])
-    assert len(line) < 200
-    assert "xxx..." in line
-    assert "should be 'model' or 'zoh'" in line
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -167,24 +153,6 @@ def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: 
     (line,) = mistakes_with(text, tmp_path, ())
     assert line.startswith("FILE: not valid TOML: ")
     assert says in line
-
-
-@pytest.mark.parametrize(
-    ("setting", "read"),
-    [
-        ("trigger.beta=0.3", lambda s: s.trigger.beta == 0.3),
-        ("mode=zoh", lambda s: s.mode == "zoh"),
-        ("description=a = b", lambda s: s.description == "a = b"),
-        ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that is missing from the file
-    ],
-)
-def test_settings_replace_values_of_the_file(
-    setting: str, read: Callable[[Scenario], bool], path: Path
-) -> None:
-    assert not read(load(path))
-    changed = load(path, [setting])
-    assert read(changed)
-    assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
 def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:

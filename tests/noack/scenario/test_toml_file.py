@@ -15,6 +15,7 @@ from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.scenario.scenario_file import load, put, validate
 from noack.settings.section import ScenarioSection
+from noack.settings.user_files import NamedFile
 
 MOST = toml_file.MOST_LEVELS
 READERS = [load, load_campaign, load_links]
@@ -153,3 +154,10 @@ def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
         toml_file.read(tmp_path / "none.toml", _Named)
     near = f"did you mean {tmp_path}/one.toml?"
     assert str(caught.value) == f"{tmp_path}/none.toml: no such file; {near}"
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    file = NamedFile("/dev/zero", tmp_path, "run.toml: network.loss")
+    for read in (file.content, file.sha256):
+        with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
+            read()

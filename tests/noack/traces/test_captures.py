@@ -175,3 +175,9 @@ def test_every_datagram_is_found_again(
         assert str(flow) == (
             f"{source}:{one.source_port} → {destination}:{one.destination_port} on interface 0"
         )
+
+
+def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:
+    section = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 0100 0000 ffffffffffffffff 1c000000")
+    with pytest.raises(ValueError, match=r"^after packet 0: a block is too short"):
+        list(captured_packets(io.BytesIO(section + bytes.fromhex("06000000 0c000000 0c000000"))))

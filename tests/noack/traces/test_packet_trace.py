@@ -1,8 +1,11 @@
-"""Packet traces, the CSV format and wrong files; relative delays of clocks that differ."""
+"""Packet traces: CSV and the round trips of IRTT, wrong files, relative delays of other clocks."""
 
-import csv
+import gzip
+import io
+import json
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,20 +14,16 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from noack.core.errors import CallerError
-from noack.traces.packet_trace import PacketTrace, envelope_slope, packet_trace, relative_delays
+from noack.impairments.kinds.replay import Replay
+from noack.traces.irtt_trace import read_irtt
+from noack.traces.packet_trace import (
+    MAX_PACKETS,
+    PacketTrace,
+    envelope_slope,
+    packet_trace,
+    relative_delays,
+)
 from noack.traces.trace_formats import read_trace
-
-CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
-
-
-@pytest.mark.parametrize("path", sorted(CICV5G.glob("*.csv")), ids=lambda path: path.stem)
-def test_shipped_traces_are_read_as_they_are_written(path: Path) -> None:
-    rows = list(csv.DictReader(path.read_text().splitlines()))
-    trace = read_trace(path)
-    assert trace.sequence.tolist() == list(range(len(rows)))
-    assert trace.sent_ns.tolist() == [int(row["sent_ms"]) * 10**6 for row in rows]
-    assert trace.received_ns.tolist() == [int(row["received_ms"]) * 10**6 for row in rows]
-    assert not trace.lost.any()
 
 
 def test_units_order_and_lost_packets(tmp_path: Path) -> None:
@@ -152,3 +151,79 @@ def test_a_step_of_a_clock_is_found(step_ns: int) -> None:
     assert float(line.split()[5]) == pytest.approx(step_ns / 1e6, abs=2)
     assert 35 < float(line.split(" s: ")[0].split()[-1]) < 37
     assert not any("ppm" in line for line in trace.notes)
+
+
+def test_an_unknown_name_of_a_trace_gets_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
+        Replay(file="rural").without_files(tmp_path, "")
+
+
+def test_nothing_received() -> None:
+    trace = packet_trace(np.arange(3), np.zeros(3, np.int64), np.ones(3, bool))
+    assert relative_delays(trace).lost.all()
+
+
+COUNT = 700
+
+
+def document(count: int = COUNT) -> dict[str, Any]:
+    lost = {3: True, 5: "true_up", 6: "true_down", 7: "true_down"}
+    trips = []
+    for k in range(count):
+        send = {"wall": 1508180723502727340 + k, "monotonic": 1000 + k * 20_000_000}
+        receive = {} if k in lost else {"wall": 1, "monotonic": send["monotonic"] + 30_000_000 + k}
+        trips.append({
+            "seqno": k, "lost": lost.get(k, "false" if k % 2 else False),
+            "timestamps": {
+                "client": {"receive": receive, "send": send},
+                "server": {"receive": {}, "send": {}}, "late": False,
+            },
+            "delay": {}, "ipdv": {},
+        })  # fmt: skip
+    return {
+        "version": {"irtt": "0.9.0"}, "system_info": {"hostname": 'a "round_trips\\" host é'},
+        "stats": {"rtt": {"n": 1}}, "round_trips": trips,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+@pytest.mark.parametrize("compress", [False, True])
+def test_round_trips_are_read(indent: int | None, compress: bool, tmp_path: Path) -> None:
+    data = json.dumps(document(), indent=indent, ensure_ascii=False).encode()
+    path = tmp_path / "irtt.json"
+    path.write_bytes(gzip.compress(data) if compress else data)
+    trace = read_trace(path)
+    assert np.flatnonzero(trace.lost).tolist() == [3, 5, 6, 7]
+    assert trace.sent_ns.tolist() == [k * 20_000_000 for k in range(COUNT)]
+    kept = [k for k in range(COUNT) if k not in (3, 5, 6, 7)]
+    assert trace.delay_ns[kept].tolist() == [30_000_000 + k for k in kept]
+    assert trace.notes[1:] == ("lost forward: 1", "lost in reverse: 2", "lost on an unknown way: 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("round_trips"), 'has no list "round_trips"'),
+        (lambda d: d["round_trips"][4].pop("seqno"), "round trip 5: expected seqno, lost"),
+        (lambda d: d["round_trips"][4].update(lost="maybe"), "round trip 5: expected"),
+        (lambda d: d["round_trips"].insert(9, 7), "round trip 10: expected"),
+        (lambda d: d["round_trips"][8].update(seqno=2**62), "round trip 9: has a number"),
+        (lambda d: d["round_trips"][8].update(seqno=7), "round trip 9: has a sequence number that"),
+        (lambda d: d["round_trips"][0].update(ipdv="x" * 200_000), "more than 65536 characters"),
+    ],
+)
+def test_wrong_documents(change: Any, message: str) -> None:
+    content = document(20)
+    content["system_info"] = {}
+    change(content)
+    with pytest.raises(ValueError, match=message):
+        read_irtt(io.BytesIO(json.dumps(content).encode()), MAX_PACKETS)
+
+
+def test_cut_and_damaged_files(tmp_path: Path) -> None:
+    data = json.dumps(document()).encode()
+    path = tmp_path / "irtt.json"
+    for wrong in (data[:-2000], gzip.compress(data)[:-2000], gzip.compress(data)[:40] + b"x" * 99):
+        path.write_bytes(wrong)
+        with pytest.raises(CallerError, match=r"ends within|cannot be decompressed"):
+            read_trace(path)

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from noack.core.core_library import CoreMemory, core, ffi
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.sections import POLICIES
+from noack.trigger.deadline import DeadlineSettings
+from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import TriggerDecision, TriggerRule, fill_rule, rule_rows
 from tests.oracles.trigger_rules import Trigger
@@ -89,3 +92,21 @@ def test_the_core_decides_as_the_rule_is_stated(name: str, seed: int) -> None:
             assert found.event == (exceeds or t_ns >= stated.due_ns(stated.rule))
         if found.event:
             begin(t_ns, z[:N])
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
+    """One mode decays 1e16 times as slowly as the other; P is not positive definite as computed."""
+    B, K = (
+        np.array([[113.33624038521207], [43.17068933023515]]),
+        [[-3.896659939542095, -1.4842666344932138]],
+    )
+    settings = LyapunovSettings(policy="lyapunov", rate_per_s=0.3)
+    with pytest.raises(CallerError, match="within rounding"):
+        settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))
+
+
+def test_the_same_threshold_from_a_later_origin() -> None:
+    rule = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}
+    deadline = DeadlineSettings(policy="deadline", rule=rule, interval_s=1.0)
+    assert deadline.at_origin(3.0).rule.beta == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)

@@ -100,7 +100,6 @@ def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path)
     ("code", "expected"),
     [
         ("x = 1", "LookupError: own.py has no Delta"),
-        ("class Delta: pass", "TypeError: it has no method start"),
         ("class Delta:\n  def start(self, t_s, x): pass", "TypeError: it has no method test"),
         ("class Delta:\n  def __init__(self, gain): pass", "TypeError: Delta.__init__() missing 1"),
         ("class Delta:\n  def start(self, t_s, x): x[0] = 1\n  def test(self, *given): return True",
@@ -116,3 +115,17 @@ def test_a_mistake_in_the_class_gives_one_line(tmp_path: Path, code: str, expect
         simulate(scenario(tmp_path, code))
     assert str(refused.value).startswith(f'trigger.name = "Delta": {expected}')
     assert "\n" not in str(refused.value)
+
+
+def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:
+    code = """
+        class Delta:
+            def start(self, t_s, x):
+                self.since_s = t_s
+
+            def test(self, t_s, x, e_s):
+                return t_s - self.since_s > 0.4999
+    """
+    found = np.diff(events(simulate(scenario(tmp_path, code))))
+    assert len(found) > 5
+    assert set(found) == {500_000_000}
