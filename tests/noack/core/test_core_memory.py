@@ -30,12 +30,3 @@ def test_models_with_the_same_matrix_share_its_exponentials() -> None:
     matrix = core.noack_transition(one, 5)
     assert matrix - one.matrices in range(0, 4 * one.places, 4)  # kept, where it was
     assert sorted(known[known != 0]) == [5, 7]
-
-
-def test_a_model_that_stands_still_needs_no_exponentials() -> None:
-    memory = CoreMemory()
-    static = memory.transitions(np.zeros((3, 3)), (5,))
-    assert static.is_static
-    assert not np.frombuffer(ffi.buffer(static.steps_ns, 8 * static.places), np.int64).any()
-    large = memory.transitions(np.eye(64))
-    assert large.places * 64 * 64 <= 2**20  # numbers

@@ -2,12 +2,10 @@
 
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from noack.core import file_access
 from noack.core.errors import MachineError
 from noack.core.file_access import locked, new_file, write_whole
 
@@ -46,24 +44,6 @@ def test_nothing_that_another_user_has_made_in_the_folder_is_written_to(tmp_path
     assert (precious.read_text(), path.read_text(), path.is_symlink()) == ("secret", "text", False)
 
 
-@pytest.mark.parametrize("make", [
-    lambda name, target: name.symlink_to(target),
-    lambda name, target: name.hardlink_to(target),
-    lambda name, target: os.mkfifo(name),
-    lambda name, target: name.mkdir(),
-], ids=["link", "hard link", "FIFO", "folder"])  # fmt: skip
-def test_a_guessed_name_is_an_error(
-    make: Callable[[Path, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If the random name were known, nothing that exists under it would be opened."""
-    (precious := tmp_path / "precious").write_text("secret")
-    monkeypatch.setattr(file_access.os, "urandom", bytes)
-    make(tmp_path / ".0000000000000000.partial", precious)
-    with pytest.raises(MachineError, match="cannot be written: File exists"):
-        write_whole(tmp_path / "a.txt", "text")
-    assert precious.read_text() == "secret"
-
-
 def test_a_failure_keeps_the_old_file_and_leaves_no_new_one(tmp_path: Path) -> None:
     (path := tmp_path / "a.txt").write_text("old")
 
@@ -83,3 +63,5 @@ def test_a_lock_file_is_not_a_link(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not a regular file"), locked(tmp_path / "lock"):
         pass
     assert not (tmp_path / "target").exists()
+    with pytest.raises(OSError, match="none/lock"), locked(tmp_path / "none" / "lock"):
+        pass

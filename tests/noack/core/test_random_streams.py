@@ -1,5 +1,4 @@
 import hashlib
-import itertools
 
 import numpy as np
 import pytest
@@ -17,23 +16,8 @@ def test_a_stream_is_the_documented_generator() -> None:
     # The expected numbers are constants: a seed gives the same draws in every version.
     numbers = stream(2, "netem", "update", "loss", "0").random(3)
     assert numbers.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]
-
-
-def test_other_seeds_and_names_give_other_numbers() -> None:
-    paths = [("a",), ("b",), ("a", "b"), ("ab",), ("a", ""), ("", "a"), ("plant",)]
-    seeds = [0, 1, 2, 2**32, 2**32 + 1, 2**64 - 1]
-    firsts = {stream(seed, *path).random() for seed, path in itertools.product(seeds, paths)}
-    assert len(firsts) == len(seeds) * len(paths)
-    keys = {stream_key(seed, *path) for seed, path in itertools.product(seeds, paths)}
-    assert len(keys) == len(seeds) * len(paths)
-
-
-def test_an_empty_stream_name_or_a_negative_seed_is_refused() -> None:
-    for function in (stream, stream_key):
-        with pytest.raises(ValueError, match="needs a name"):
-            function(0)
-    with pytest.raises(ValueError, match="non-negative"):
-        stream(-1, "a")
+    with pytest.raises(ValueError, match="needs a name"):
+        stream(0)
 
 
 def test_a_streams_key_is_the_seed_sequences_state() -> None:

@@ -68,21 +68,3 @@ def test_a_history_finds_the_first_violation_of_each_rule(
     for rule, at in first.items():
         assert keeps(tuple(lost[:at]), rule)
         assert at == len(lost) or not keeps(tuple(lost[: at + 1]), rule)
-
-
-@pytest.mark.parametrize("rules", GUARANTEES, ids=str)
-def test_bursts_and_windows_hold_in_every_allowed_sequence(rules: tuple[LossRule, ...]) -> None:
-    """And the longest burst and each rule's own window are reached."""
-    guarantee = LossGuarantee(rules)
-    longest, most = 0, dict.fromkeys(guarantee.windows, 0)
-    for lost in product([False, True], repeat=LENGTH):
-        if not all(keeps(lost, rule) for rule in rules):
-            continue
-        bursts = (len(list(run)) for value, run in groupby(lost) if value)
-        longest = max(longest, *bursts, 0)
-        for window in most:
-            sums = (sum(lost[i : i + window.packets]) for i in range(LENGTH - window.packets + 1))
-            most[window] = max(most[window], *sums)
-    assert longest == guarantee.longest_burst
-    assert all(found <= window.losses for window, found in most.items())
-    assert max(most[window] for window in guarantee.windows) == max(w.losses for w in most)

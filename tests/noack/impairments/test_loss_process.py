@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import numpy as np
 import pytest
 
 from noack.impairments.link_settings import LinkSettings
@@ -67,14 +66,6 @@ def test_a_guarantee_is_kept_with_the_total_probability_of_all_patterns_that_kee
     assert losses.keeps(guarantee, 8) == pytest.approx(expected, rel=1e-9)
 
 
-def test_tails_and_the_largest_probability_of_independent_losses() -> None:
-    losses = process(INDEPENDENT, {"kind": "corrupt", "probability": 0.1})
-    lost = 1 - (1 - P) * 0.9
-    assert losses.is_independent
-    assert losses.largest_probability == pytest.approx(lost)
-    assert losses.tails(5)[0] == pytest.approx(lost ** np.arange(1, 6))
-
-
 def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_past() -> None:
     losses = process(BURSTY)
     assert not losses.is_independent
@@ -88,15 +79,6 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert given <= losses.largest_probability * (1 + 1e-9)
         all_lost = probability(losses, (*past, *[True] * 4)) / probability(losses, past)
         assert all_lost <= longest * (1 + 1e-9)
-
-
-def test_many_packets_are_computed_by_powers_and_by_steps_alike() -> None:
-    guarantee = LossGuarantee((LongestBurst(4),))
-    by_powers = process(INDEPENDENT).keeps(guarantee, 3000)
-    steps = np.eye(5)[0]
-    for _ in range(3000):
-        steps = np.array([(1 - P) * steps.sum(), *(P * steps[:-1])])
-    assert by_powers == pytest.approx(steps.sum(), rel=1e-9)
 
 
 def test_losses_that_depend_on_times_are_refused() -> None:

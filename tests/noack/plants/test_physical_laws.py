@@ -36,14 +36,6 @@ def test_the_step_response_is_the_published_transfer_functions() -> None:
     assert angle[-1] > 5.0
 
 
-def test_the_linearisation_has_the_published_frequency_response() -> None:
-    A, B = settings().linearisation()
-    w = np.logspace(-1, 7, 50)
-    _, expected = signal.freqresp(published(), w)
-    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
 def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: float) -> np.ndarray:
     """The same law by an implicit integrator with events: forward, backward, at standstill."""
     J, b, L = motor.inertia_kg_m2, motor.friction_n_m_s, motor.inductance_h
@@ -86,10 +78,6 @@ def test_friction_and_stiction_agree_with_another_solver(inductance_h: float) ->
     assert stuck or inductance_h > 1e-3
 
 
-def test_a_non_finite_state_stays_non_finite() -> None:
-    assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
-
-
 def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
     _, v, angle, rate = x.tolist()
     m, length = settings.pole_kg, settings.length_m
@@ -117,31 +105,6 @@ def test_its_linearisation_has_the_poles_of_the_literature() -> None:
     np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
 
 
-def test_the_integration_agrees_with_another_solver() -> None:
-    def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
-        return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
-
-    system = OdeSystem(PlantEquations(pendulum), np.array([2.0, 0.0]))
-    states = motion(system, [0.5] * 500, 20_000_000)
-    exact = solve_ivp(
-        lambda t, z: pendulum(t, z, np.array([0.5])), (0, 10), [2.0, 0.0],
-        method="DOP853", rtol=1e-13, atol=1e-13,
-    )  # fmt: skip
-    np.testing.assert_allclose(states[-1], exact.y[:, -1], atol=1e-6)
-
-
-def test_the_state_is_nan_after_it_has_escaped() -> None:
-    """ż = z² from 1 is infinite at 1 s."""
-
-    def escaping(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
-        return (float(z[0]) ** 2,)
-
-    system = OdeSystem(PlantEquations(escaping), np.array([1.0]))
-    states = motion(system, [0.0] * 20, 100_000_000)
-    assert np.isfinite(states[9]).all()
-    assert np.isnan(states[12:]).all()
-
-
 def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:
     def broken(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
         if t > 0.003:
@@ -153,3 +116,15 @@ def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised
     assert np.isnan(states[2]).all()
     with pytest.raises(KeyError, match="far"):
         motion(OdeSystem(PlantEquations(broken), np.zeros(1)), [1.0, 1.0])
+
+
+def test_a_non_finite_state_stays_non_finite() -> None:
+    assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()
+
+
+def test_the_linearisation_has_the_published_frequency_response() -> None:
+    A, B = settings().linearisation()
+    w = np.logspace(-1, 7, 50)
+    _, expected = signal.freqresp(published(), w)
+    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -133,20 +133,14 @@ def test_a_plant_is_found_by_entry_point_and_by_module(
         ("import nothing_so_named",
          "ModuleNotFoundError: No module named 'nothing_so_named' (mine.py, line 1)"),
         ("class P(:", "SyntaxError"),
-        ("class Q: pass", "LookupError: mine.py has no P"),
         ("raise SystemExit(3)", "SystemExit: 3 (mine.py, line 1)"),
         ("class P: pass", "it has neither derivative nor advance; one of them is needed"),
-        ("class P:\n def derivative(s, t, z, u): return z\n def advance(s, u, t, h): pass",
-         "both derivative and advance"),
         ("class P:\n def __init__(s, g): pass", "missing 1 required positional argument: 'g'"),
         ("class P:\n def derivative(s, t, z, u): return z[:1]",
          "derivative(t_s, z, u) has shape (1,), expected (2,)"),
-        ("class P:\n def derivative(s, t, z, u): return 'ab'", "is not of real numbers"),
         ("class P:\n def derivative(s, t, z, u):\n  return 1 / (u[0] * 0)", "(mine.py, line 3)"),
         ("class P:\n def state(s, x): return [[1.0]]\n def derivative(s, t, z, u): return z",
          "state(x0) has shape (1, 1)"),
-        ("class P:\n def output(s, z): return z[:1]\n def derivative(s, t, z, u): return z",
-         "x has shape (1,), expected (2,)"),
         ("class P:\n def output(s, z): return 2 * z\n def derivative(s, t, z, u): return z",
          "x is [0.6, 0.0] at the start; plant.initial_state is [0.3, 0.0]"),
         ("class P:\n def start(s, x0): pass\n def advance(s, u, t, h): pass",
@@ -164,8 +158,6 @@ def test_a_class_that_is_not_a_plant_is_refused_in_one_line(
 
 
 DERIVATIVE = """
-    import sys
-
     class P:
         def derivative(self, t_s, z, u):
             if t_s > 0.0201:
@@ -186,13 +178,10 @@ ADVANCE = """
 @pytest.mark.parametrize(
     ("code", "line", "expected"),
     [
-        (DERIVATIVE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 7)"),
-        (DERIVATIVE, "sys.exit(3)", "SystemExit: 3"),
-        (DERIVATIVE, 'import noack; noack.load("nowhere")', "CallerError: nowhere: no such file"),
+        (DERIVATIVE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 5)"),
         (DERIVATIVE, "z[0] = 7.0", "read-only"),
         (DERIVATIVE, "return [z[1] + 1e-3j, 0.0]",
          "TypeError: derivative(t_s, z, u) is not of real numbers"),
-        (DERIVATIVE, 'return ["1", "2"]', "derivative(t_s, z, u) is not of real numbers"),
         (ADVANCE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 8)"),
         (ADVANCE, "self.x = [1.0, 2.0, 3.0]", "x has shape (3,), expected (2,)"),
     ],
@@ -206,13 +195,6 @@ def test_a_mistake_in_a_step_is_a_failure_that_names_class_and_line(
         motion(system, [0.0] * 20)
     assert str(failed.value).startswith('plant.system.name = "P": ')
     assert expected in str(failed.value)
-
-
-def test_a_file_changed_after_loading_is_not_executed(tmp_path: Path) -> None:
-    loaded = settings(tmp_path, PENDULUM, "Pendulum")
-    (tmp_path / "mine.py").write_text("raise SystemExit('executed')")
-    with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
-        PythonSystem(loaded, X0, 1)
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,8 @@ import itertools
 import math
 import re
 import struct
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -225,87 +224,15 @@ def test_a_run_accepts_one_version_only(values: list[float], encrypted: bool) ->
     assert_rejected(decoder, renamed, Rejection.TAG)
 
 
-@given(vectors, sequences, st.sampled_from([1, 2, 3]), st.integers(0, 65_534))
-def test_encrypted_datagrams_show_nothing_of_the_vector(
-    values: list[float], sequence: int, flow: int, loop: int
-) -> None:
-    """Messages with the same vector and another number, flow or loop have unrelated bytes."""
-    vector = np.array(values)
-    encoder = Encoder(RUN, KEY, encrypted=True)
-    first = Message(Flow(flow), sequence, 0, vector, loop)
-    others = [
-        first._replace(sequence=sequence ^ 1),
-        first._replace(flow=Flow(flow % 3 + 1)),
-        first._replace(loop=loop ^ 1),
-    ]
-    seen = [encoder.encode(message)[32:] for message in (first, *others)]
-    assert len(set(seen)) == len(seen)
-    assert all(vector.tobytes() not in ciphertext for ciphertext in seen)
-    readable = Encoder(RUN, KEY).encode(first)
-    assert len(seen[0]) == len(readable[32:])
-
-
-@given(vectors, vectors)
-def test_another_length_or_dimension_is_rejected(expected: list[float], sent: list[float]) -> None:
-    decoder = new_decoder(dimension=len(expected))
-    data = datagram(expected)
-    for size in range(0, len(data), 7):
-        assert_rejected(decoder, data[:size], Rejection.LENGTH)
-    assert_rejected(decoder, data + b"x", Rejection.LENGTH)
-    if len(sent) != len(expected):
-        assert_rejected(decoder, datagram(sent), Rejection.LENGTH)
-        # The size is right; the header states another dimension.
-        assert_rejected(decoder, datagram(expected, dimension=len(sent)), Rejection.LENGTH)
-    assert decoder.decode(data) is not None
-
-
-@given(st.lists(st.integers(0, 30), min_size=1, max_size=40))
-def test_only_newer_datagrams_are_accepted(arrivals: list[int]) -> None:
-    decoder, newest = new_decoder(), -1
-    for sequence in arrivals:  # in any order, some repeated
-        data = datagram([float(sequence), 0.0, 0.0], sequence=sequence)
-        if sequence > newest:
-            message = decoder.decode(data)
-            assert message is not None
-            assert (message.sequence, message.vector[0]) == (sequence, sequence)
-            newest = sequence
-        else:
-            assert_rejected(decoder, data, Rejection.STALE)
-    assert decoder.accepted == len(set(itertools.accumulate(arrivals, max)))
-
-
-@given(vectors, st.data(), st.sampled_from([math.inf, -math.inf, math.nan]))
-def test_infinities_and_nans_are_rejected(
-    values: list[float], data: st.DataObject, bad: float
-) -> None:
-    decoder = new_decoder(dimension=len(values))
-    damaged = list(values)
-    damaged[data.draw(st.integers(0, len(values) - 1))] = bad
-    assert_rejected(decoder, datagram(damaged, sequence=5), Rejection.NOT_FINITE)
-    # its sequence number is still usable
-    assert decoder.decode(datagram(values, sequence=5)) is not None
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "accepted"),
-    [
-        ("sequence", 2**63 - 1, True), ("sequence", 2**63, False), ("sequence", 2**64 - 1, False),
-        ("t_ns", 2**62 - 1, True), ("t_ns", 2**62, False), ("t_ns", -1, False),
-    ],
-)  # fmt: skip
-def test_a_number_beyond_the_records_range_is_rejected(
-    field: str, value: int, accepted: bool
-) -> None:
-    decoder = new_decoder()
-    data = datagram([0.0, 0.0, 0.0], **{field: value})  # type: ignore[arg-type]
-    if not accepted:
-        assert_rejected(decoder, data, Rejection.RANGE)
-        return
-    message = decoder.decode(data)
+@pytest.mark.parametrize(("field", "most"), [("sequence", 2**63 - 1), ("t_ns", 2**62 - 1)])
+def test_a_number_beyond_the_records_range_is_rejected(field: str, most: int) -> None:
+    decoder, zeros = new_decoder(), [0.0, 0.0, 0.0]
+    assert_rejected(decoder, datagram(zeros, **{field: most + 1}), Rejection.RANGE)  # type: ignore
+    message = decoder.decode(datagram(zeros, **{field: most}))  # type: ignore[arg-type]
     assert message is not None
-    assert np.int64(getattr(message, field)) == value
+    assert np.int64(getattr(message, field)) == most
     # The number does not wrap: everything after the last number is old.
-    assert_rejected(decoder, datagram([0.0, 0.0, 0.0], sequence=0), Rejection.STALE)
+    assert_rejected(decoder, datagram(zeros), Rejection.STALE)
 
 
 FAULTS = [
@@ -336,12 +263,6 @@ def test_only_the_first_of_several_faults_is_counted(first: int) -> None:
     assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=9)) is not None
 
 
-@pytest.mark.parametrize("shape", [(0,), (65,), (2, 2), (1, 3)])
-def test_only_vectors_of_1_to_64_entries_can_be_sent(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
-        Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))
-
-
 def test_an_acknowledgement_carries_no_vector() -> None:
     with pytest.raises(ValueError, match=r"carries no vector of shape \(1,\)"):
         Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(1)))
@@ -353,8 +274,9 @@ def test_an_acknowledgement_carries_no_vector() -> None:
     assert (*message[:3], message.vector.size) == (Flow.ACKNOWLEDGEMENT, 7, 5, 0)
 
 
-@pytest.mark.parametrize("size", [0, 31, 33])
-@pytest.mark.parametrize("made", [Encoder, partial(Decoder, Flow.UPDATE, 3)])
-def test_a_key_has_32_bytes(made: Any, size: int) -> None:
-    with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
-        made(RUN, bytes(size))
+def test_a_key_or_a_vector_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="32 bytes, not 31"):
+        Encoder(RUN, bytes(31))
+    for shape in ((0,), (65,), (2, 2), (1, 3)):
+        with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
+            Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))

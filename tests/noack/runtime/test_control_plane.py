@@ -4,7 +4,6 @@ import json
 import tempfile
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,13 +18,13 @@ import noack.runtime.control_plane
 import noack.runtime.run_process
 from cosim.live.coordinator import Coordinator
 from noack.core.errors import NoAnswerError, PeerError
-from noack.protocol.topology import COORDINATOR, LOOP_ROLES
+from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.command_line import Signals
-from noack.runtime.control_messages import Admission, MissingRows, RunStart, parse_message
+from noack.runtime.control_messages import RunStart, parse_message
 from noack.runtime.control_plane import RUNS, ControlPlane, cause_of, label, run_name
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.private_folder import private_folder
-from noack.runtime.run_process import RunProcess, _admitted
+from noack.runtime.run_process import _admitted
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import needs_root, output_of_another_user
@@ -126,47 +125,6 @@ def test_a_process_without_a_coordinator_says_so(
     assert cause_of(error) == "Timeout!"
 
 
-def test_a_path_longer_than_a_sockets_may_be_works(
-    ticket: Ticket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / ("long" * 40)
-    folder.mkdir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
-    coordinator = Coordinator(ticket)
-    with ControlPlane(ticket, "plant") as plane:
-        meet(plane)
-    coordinator.close()
-
-
-def test_every_zenoh_session_is_opened_in_one_place() -> None:
-    root = Path(noack.__file__).parents[1]
-    rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
-    files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["control_plane.py"]
-
-
-@pytest.mark.parametrize(
-    ("answer", "kind", "line"),
-    [
-        ("", Admission, "not a valid admission: "),
-        (b"\xff\xfe", Admission, "not a valid admission: "),
-        ("[" * 100_000, Admission, "not a valid admission: "),
-        ('{"epoch_ns": -1, "addresses": {}}', RunStart, "epoch_ns: "),
-        ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', RunStart, "plant"),
-        ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', RunStart, "plant"),
-        ("null", MissingRows, "not a valid missing rows: "),
-        ('{"rows": {"plant_step": [[0]]}}', MissingRows, "plant_step"),
-        ('{"rows": {"plant_step": [[0, -5]]}}', MissingRows, "plant_step"),
-    ],
-)
-def test_an_invalid_message_gives_one_line(answer: str | bytes, kind: Any, line: str) -> None:
-    with pytest.raises(PeerError) as caught:
-        parse_message(kind, answer)
-    assert line in str(caught.value)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 500
-
-
 def test_a_request_is_sent_again_when_its_answer_was_lost_and_its_answer_arrives_unchanged(
     coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,31 +181,3 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
     else:
         with pytest.raises(NoAnswerError, match="cannot reach"):
             asking()
-
-
-def meet(plane: ControlPlane) -> None:
-    """Wait until a process has found the coordinator."""
-    everyone = plane.key("alive", COORDINATOR, "*")
-    wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
-
-
-def test_a_short_loss_of_the_coordinator_is_tolerated(ticket: Ticket) -> None:
-    """The machine did not run one end of the connection for longer than a lease."""
-    ticket = changed(ticket, launched=False)
-    first = Coordinator(ticket)
-    with ControlPlane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
-        process = RunProcess("plant", ticket, plane, Signals())
-        meet(plane)
-        assert not plane.coordinator_gone()
-        first.close()
-        wait_for(plane.coordinator_gone)
-        assert not plane.coordinator_gone(for_s=3600)
-        admission = pool.submit(process.request_admission)  # waits for the coordinator
-        second = Coordinator(ticket)
-        while not admission.done():
-            second.poll()
-        admission.result()
-        wait_for(lambda: not plane.coordinator_gone())
-        second.close()
-        wait_for(lambda: plane.coordinator_gone(for_s=0.2))
-        assert not plane.coordinator_gone(for_s=3600)

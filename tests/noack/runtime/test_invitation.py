@@ -1,10 +1,14 @@
-"""Invitations: who can read them, and what this host makes of them."""
+"""Invitations and tickets: who can read them, errors without the key, one ticket per session."""
 
 import json
 import os
 import stat
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from threading import Barrier
+from typing import Any
 
 import pytest
 
@@ -12,11 +16,18 @@ from noack.core.errors import CallerError, PeerError
 from noack.runtime.join_ticket import (
     RemoteAccess,
     Ticket,
+    find_ticket,
     invitation_file,
+    loads,
+    new_ticket,
     own_host,
+    published,
     read_invitation,
     write_invitation,
 )
+from noack.runtime.private_folder import private_folder
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from tests.fuzz.parsers.ticket import _TICKET
 
 REMOTE = RemoteAccess(
@@ -24,6 +35,7 @@ REMOTE = RemoteAccess(
     valid_until="2030-01-01T00:00:00+00:00",
 )  # fmt: skip
 INVITED: Ticket = _TICKET.model_copy(update={"remote": REMOTE, "run_dir": "/elsewhere/runs/one"})
+INVITED_AS = INVITED.model_dump_json()
 
 
 def test_an_invitation_is_for_its_owner_only_and_is_read_again(tmp_path: Path) -> None:
@@ -42,53 +54,31 @@ def _absent(path: Path) -> None:
     path.unlink()
 
 
-def _open_to_others(path: Path) -> None:
-    path.chmod(0o640)
-
-
-def _cut(path: Path) -> None:
-    path.write_text(path.read_text()[:100])
-
-
-def _no_text(path: Path) -> None:
-    path.write_bytes(b"\xff\xfe")
-
-
 def _fifo(path: Path) -> None:
     path.unlink()
     os.mkfifo(path, 0o600)
-
-
-def _too_large(path: Path) -> None:
-    os.truncate(path, 10**9)
-
-
-def _without_a_run(path: Path) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"run_dir": "runs/.."}))
-
-
-def _at_a_name(path: Path) -> None:
-    content = json.loads(path.read_text())
-    content["remote"]["host"] = "host.invalid"
-    path.write_text(json.dumps(content))
-
-
-def _of_this_host(path: Path) -> None:
-    path.write_text(_TICKET.model_dump_json())
 
 
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
         (_absent, "cannot be read: No such file or directory"),
-        (_open_to_others, "other users can read or change it; make it yours alone: chmod 600 "),
-        (_cut, "not an invitation: not a valid ticket: "),
-        (_no_text, "not an invitation: it is no text"),
+        (
+            lambda path: path.chmod(0o640),
+            "other users can read or change it; make it yours alone: chmod 600 ",
+        ),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "not an invitation: it is no text"),
+        (lambda path: path.write_text("{"), "not an invitation: not a valid ticket: "),
         (_fifo, "cannot be read: not a regular file"),
-        (_too_large, "not an invitation: larger than 64 MiB"),
-        (_without_a_run, "not an invitation: its run directory has no name"),
-        (_at_a_name, "not an invitation: not a valid ticket: "),
-        (_of_this_host, "not an invitation, but a ticket for this host"),
+        (lambda path: os.truncate(path, 10**9), "not an invitation: larger than 64 MiB"),
+        (
+            lambda path: path.write_text(INVITED_AS.replace("/elsewhere/runs/one", "runs/..")),
+            "not an invitation: its run directory has no name",
+        ),
+        (
+            lambda path: path.write_text(_TICKET.model_dump_json()),
+            "not an invitation, but a ticket for this host",
+        ),
     ],
 )
 def test_a_spoiled_invitation_is_refused_in_one_line(
@@ -133,16 +123,74 @@ def test_a_run_removes_its_own_invitation_only(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-@pytest.mark.parametrize("spoil", [_absent, _fifo, lambda path: (path.unlink(), path.mkdir())])
-def test_a_run_ends_whatever_became_of_its_invitation(
-    tmp_path: Path, spoil: Callable[[Path], None]
-) -> None:
-    path = tmp_path / "invitation.json"
-    with invitation_file(path, INVITED):
-        spoil(path)
-
-
 def test_the_own_address_is_that_of_the_route() -> None:
     assert own_host(("127.0.0.1", 9)) == "127.0.0.1"
     with pytest.raises(PeerError, match=r"cannot reach 255\.255\.255\.255:9"):
         own_host(("255.255.255.255", 9))
+
+
+KEY = "ab" * 32
+
+
+@pytest.fixture
+def fields(content: dict[str, Any]) -> dict[str, Any]:
+    scenario = resolve(validate(content, "small"))
+    ticket = new_ticket(scenario, Path("run"), launched=True)
+    return ticket.model_copy(update={"key": bytes.fromhex(KEY)}).model_dump(mode="json")
+
+
+def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
+    ticket = loads(json.dumps(fields))
+    assert ticket.key.hex() == KEY
+    assert json.loads(ticket.model_dump_json()) == fields
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("run_id", -1), ("run_id", 2**64), ("run_id", "7"), ("key", KEY[:-2]), ("key", KEY + "00"),
+        ("key", KEY.replace("a", "g")), ("key", f"{KEY} "), ("key", [KEY]), ("key", {KEY: KEY}),
+        ("run_dir", 3), ("launched", 1), ("launched", "yes"),
+        ("scenario", None), ("scenario", {}), ("more", 0),
+    ],
+)  # fmt: skip
+def test_an_invalid_ticket_gives_one_line_without_the_key(
+    fields: dict[str, Any], key: str, value: object
+) -> None:
+    with pytest.raises(CallerError) as caught:
+        loads(json.dumps(fields | {key: value}))
+    line = str(caught.value)
+    assert line.startswith(f"not a valid ticket: {key}")
+    assert "\n" not in line
+    assert KEY[:8] not in line
+
+
+@pytest.mark.parametrize("left_behind", [False, True])
+def test_exactly_one_of_many_concurrent_runs_opens_a_session(
+    fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    ticket, at_once = loads(json.dumps(fields)), 8
+    together = Barrier(at_once)
+    if left_behind:  # left by a process that was killed
+        with published(ticket, "lab") as path:
+            text = path.read_text()
+        path.write_text(text)
+
+    def opened(number: int, stack: ExitStack) -> str:
+        together.wait()
+        try:
+            stack.enter_context(published(ticket.model_copy(update={"run_id": number}), "lab"))
+        except CallerError as error:
+            return str(error)
+        return ""
+
+    with ExitStack() as stack, ThreadPoolExecutor(at_once) as pool:
+        errors = list(pool.map(lambda number: opened(number, stack), range(at_once)))
+        winner = errors.index("")
+        refusal = "session 'lab': another run is open in it; choose --session NAME"
+        assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
+        found = find_ticket("lab")
+        assert found is not None
+        assert found.run_id == winner
+    assert list(private_folder().iterdir()) == []

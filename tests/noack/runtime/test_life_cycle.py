@@ -36,15 +36,3 @@ def test_every_state_with_every_event(state: State, event: Event) -> None:
             life.apply(event, "why")
             assert life.state.name == expected
             assert life.reason == "why"
-
-
-def test_the_first_reason_stays_and_a_repeated_event_does_not_restart_the_time() -> None:
-    life = LifeCycle("plant", Side.COORDINATOR)
-    life.apply(Event.STOP, "first")
-    since_s = life.since_s
-    life.apply(Event.STOP, "second")
-    assert (life.reason, life.since_s) == ("first", since_s)
-    life.apply(Event.END, "third")
-    assert life.reason == "first"
-    assert life.is_over
-    assert life.since_s > since_s

@@ -5,7 +5,6 @@ It also runs with a core that has sanitizers (tests/native/test_sanitized.py).
 
 import errno
 import os
-import signal
 import socket
 import struct
 from collections.abc import Sequence
@@ -18,25 +17,10 @@ import pytest
 
 from noack.core.core_library import core
 from noack.protocol.machine_interface import Record
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
 from noack.runtime.live_driver import LiveDriver
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
-from tests.noack.runtime.live_loops import (
-    HOUR_NS,
-    Live,
-    Rows,
-    measurement,
-    plain,
-    received,
-    scenario,
-)
+from tests.noack.runtime.live_loops import HOUR_NS, Live, measurement, plain, received, scenario
 from tests.wire_decoder import NO_VECTOR
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -168,42 +152,6 @@ def test_ticks_are_done_in_order_and_never_early(
         assert len(sent) > loops
 
 
-def test_messages_and_ticks_of_a_controller_alternate(content: dict[str, Any]) -> None:
-    resolved = scenario(content, horizon_s=0.2)
-    with closing(Live("controller", [resolved])) as live:
-        for number in range(50):
-            live.send(Message(Flow.UPDATE, number, number, np.array([1.0, -1.0])))
-            live.drive_until_accepted(number + 1)
-        live.drive(lambda: live.driver.next_deadline_ns() is None)
-        assert [len(live.rows.tables[one]) for one in (CONTROLLER_DELIVERY, CONTROLLER_STEP)] == [
-            50, live.driver.core.sent,
-        ]  # fmt: skip
-
-
-@pytest.mark.parametrize("encrypted", [False, True])
-def test_slow_users_code_leaves_time_for_datagrams_and_housekeeping(
-    encrypted: bool, tmp_path: Path
-) -> None:
-    """Each step takes twice its time, so that the plant is late from the first step on."""
-    (tmp_path / "slow.py").write_text(
-        "import time\n"
-        "class Slow:\n"
-        "    def start(self, x0): self.x = x0\n"
-        "    def advance(self, u, t_s, dt_s): time.sleep(2 * dt_s)\n"
-    )
-    system = f'{{kind="python", file="{tmp_path / "slow.py"}", name="Slow"}}'
-    settings = [f"plant.system={system}", 'plant.draw="nominal"', "horizon_s=1.0"]
-    resolved = resolve(load(SCENARIOS / "lane_following.toml", settings))
-    with closing(Live("plant", [resolved], encrypted=encrypted)) as live:
-        inputs = np.zeros(resolved.message_sizes.entries(Flow.ACTUATION))
-        live.send(Message(Flow.ACTUATION, 0, 0, inputs))
-        live.driver.drive(live.clock.now_ns() + 10_000_000, live.rows)
-        steps = len(live.rows.tables[PLANT_STEP])
-        assert 0 < steps < 250  # of 500 until the horizon
-        assert live.driver.accepted == 1
-        assert len(received(live.peer)) == live.driver.core.sent == steps
-
-
 def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[str, Any]) -> None:
     network = content["network"] | {"protocol": "ack"}
     resolved = scenario(content, network=network)
@@ -225,54 +173,6 @@ def test_acknowledgements_have_a_socket_and_counters_of_their_own(content: dict[
         assert sorted(live.rows.tables) == ["sensor_acknowledgement", SENSOR_MEASUREMENT]
 
 
-def test_acknowledgements_that_come_together_are_received_though_measurements_fill_the_room(
-    content: dict[str, Any],
-) -> None:
-    """Measurements leave room for one message, which has several acknowledgements."""
-    content["network"] |= {"protocol": "ack"}
-    with closing(Live("sensor", [scenario(content)] * 20, acknowledged=True)) as live:
-        answers = [Message(Flow.ACKNOWLEDGEMENT, 10, 5, NO_VECTOR, loop) for loop in range(10)]
-        data = [live.encoder.encode(one) for one in answers]
-        head = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", len(data[0])))]
-        live.answers.connect(live.address)
-        live.send(*measurements(1, 14))
-        live.answers.sendmsg([b"".join(data)], head)
-        live.drive_until_accepted(14)
-        live.drive(lambda: live.driver.core.sources[1].received > 0)
-        assert live.driver.core.sources[1].received == len(answers)
-
-
-def test_measurements_do_not_keep_an_acknowledgement_waiting(content: dict[str, Any]) -> None:
-    """They fill all the room of a call; the other socket is read first the next time."""
-    content["network"] |= {"protocol": "ack"}
-    with closing(Live("sensor", [scenario(content)] * 20, acknowledged=True)) as live:
-        live.send(*measurements(3, 20))
-        live.send(Message(Flow.ACKNOWLEDGEMENT, 10, 5, NO_VECTOR, 0), by=live.answers)
-        live.drive_until_accepted(60)
-        table = "sensor_acknowledgement"
-        (at_ns,) = live.rows.of(table, columns(live, table), NOW)
-        times_ns = live.rows.of(SENSOR_MEASUREMENT, columns(live, SENSOR_MEASUREMENT), NOW)
-        assert sum(t_ns > at_ns for t_ns in times_ns) > 20
-
-
-def test_many_rows_are_passed_on_in_portions(content: dict[str, Any]) -> None:
-    """A portion fits into one fragment of a message of the control plane."""
-    portions: list[int] = []
-
-    class Portions(Rows):
-        def extend_table(self, table: str, rows: Any) -> None:
-            portions.append(rows.nbytes)
-            super().extend_table(table, rows)
-
-    with closing(Live("sensor", [scenario(content)] * 20)) as live:
-        live.rows = Portions()
-        live.send(*measurements(60, 20))
-        live.drive_until_accepted(1200)
-        assert len(live.rows.tables[SENSOR_MEASUREMENT]) == 1200
-    assert len(portions) > 1
-    assert max(portions) < 130_000
-
-
 def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
         live.driver.core.senders[0] = -1
@@ -283,68 +183,8 @@ def test_what_cannot_be_sent_is_counted(content: dict[str, Any]) -> None:
         assert (report["sent"], report["send_errors"]) == (0, {text: 1})
 
 
-def test_an_icmp_error_costs_no_datagram(content: dict[str, Any]) -> None:
-    """Nothing listens at the destination: each datagram makes the next call fail once."""
+def test_numbers_that_it_cannot_act_on_are_refused(content: dict[str, Any]) -> None:
     with closing(Live("sensor", [scenario(content)])) as live:
-        source = live.peer.getsockname()
-        live.peer.close()
-        for number in range(5):
-            data = live.encoder.encode(measurement(number, [100.0 * number, 0.0]))
-            live.driver.take(data, source, live.rows)
-        report = live.channel.report()
-        assert (report["sent"], report["send_errors"]) == (5, {})
-
-
-def test_messages_from_before_the_admission_are_stale(content: dict[str, Any]) -> None:
-    phases_ns = [0, 4_000_000]
-    loops = [scenario(content)] * 2
-    with closing(Live("sensor", loops, phases_ns, admitted_ns=10_000_000)) as live:
-        # In the run's time 9 and 10 ms; of the second loop 9 and 10 ms, too.
-        given = [measurement(k, [1.0, 0.0], loop) for loop in (0, 1)
-                 for k in (9 - 4 * loop, 10 - 4 * loop)]  # fmt: skip
-        live.send(*given)
-        live.drive(lambda: sum(live.driver.rejected.values()) + live.driver.accepted == 4)
-        assert live.driver.reports() == [{"accepted": 1, "rejected": {"stale": 1}}] * 2
-
-
-def test_it_returns_at_once_if_no_tick_is_near_and_after_a_near_one(
-    content: dict[str, Any],
-) -> None:
-    with closing(Live("controller", [scenario(content)], since_ns=-HOUR_NS)) as live:
-        live.driver.drive(live.clock.now_ns() - 1, live.rows)
-        assert live.rows.tables == {}
-    # The first tick, at 1 ms, is nearer than the time that housekeeping may take.
-    with closing(Live("controller", [scenario(content)], since_ns=600_000)) as live:
-        live.driver.drive(live.clock.now_ns() - 1, live.rows)
-        assert len(live.rows.tables[CONTROLLER_STEP]) >= 1
-
-
-def test_a_signal_ends_its_sleep(content: dict[str, Any]) -> None:
-    seen = list[int]()
-    before = signal.signal(signal.SIGALRM, lambda number, frame: seen.append(number))
-    try:
-        with closing(Live("sensor", [scenario(content)])) as live:
-            # Again and again: the first may come before it sleeps.
-            signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
-            live.driver.drive(live.clock.now_ns() + HOUR_NS, live.rows)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert seen
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("receiver_count", 3, "receiver_count: not from 0 to 2"),
-        ("spin_ns", -1, "spin_ns"),
-        ("rest_ns", 10**9, "rest_ns"),
-    ],
-)
-def test_numbers_that_it_cannot_act_on_are_refused(
-    content: dict[str, Any], field: str, value: int, message: str
-) -> None:
-    with closing(Live("sensor", [scenario(content)])) as live:
-        setattr(live.driver.core, field, value)
-        with pytest.raises(ValueError, match=message):
+        live.driver.core.receiver_count = 3
+        with pytest.raises(ValueError, match="receiver_count: not from 0 to 2"):
             LiveDriver._check(live.driver)

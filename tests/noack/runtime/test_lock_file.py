@@ -30,21 +30,6 @@ def names() -> list[str]:
         return sorted(folder.names())
 
 
-def test_a_file_is_stale_to_each_of_two_readers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second one looks while the first one has its lock."""
-    leave("lab.json")
-    found = []
-
-    def and_look(*arguments: Any, **how: Any) -> bool:
-        monkeypatch.setattr(private_folder, "lock", file_access.lock)
-        locked = file_access.lock(*arguments, **how)
-        found.extend(private_folder.live_lock_files("k"))
-        return locked
-
-    monkeypatch.setattr(private_folder, "lock", and_look)
-    assert private_folder.live_lock_files("k") == found == []
-
-
 def test_a_reader_that_was_stopped_removes_no_socket_of_a_new_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -1,12 +1,7 @@
 """The real-time loop: turns of housekeeping around a driver, priorities, locked memory."""
 
-import os
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from itertools import count
 from typing import Any
 
@@ -17,7 +12,7 @@ from numpy.typing import NDArray
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import real_time_loop
-from noack.runtime.real_time_loop import RecordSink, _fifo, run_loop
+from noack.runtime.real_time_loop import RecordSink, run_loop
 
 PERIOD_NS = 1_000_000
 STEPS = 200
@@ -126,15 +121,6 @@ def test_a_machine_that_is_late_at_its_end_catches_up_for_a_while(
     assert (one.served == STEPS) == (late_ns == 0) == (turns == 20)
 
 
-def test_a_deadline_after_the_end_is_not_late() -> None:
-    """The emulator may have packets in its queue for times after the end."""
-    # The next deadline is after the first period, which is the end.
-    one = Slow(10**10, served=1)
-    late_ns = run_loop(one, one, one.clock, Log(), end_ns=1, stop=never)
-    assert late_ns == 0
-    assert one.served < STEPS
-
-
 @pytest.mark.parametrize("others_turns", [0, 7, 10**9])
 def test_a_machine_that_is_done_waits_for_the_others_for_a_while(others_turns: int) -> None:
     told = list[bool]()
@@ -148,135 +134,10 @@ def test_a_machine_that_is_done_waits_for_the_others_for_a_while(others_turns: i
     assert told.count(True) == min(others_turns + 4, real_time_loop._TURNS_TO_WAIT + 1)
 
 
-_FIFO_PROGRAM = """
-import os, sys
-from noack.runtime.real_time_loop import realtime
-for place in range(4):
-    with realtime(True, int(sys.argv[1]), place) as applied:
-        if {applied["sched_fifo"], applied["affinity"]} != {"applied"}:
-            sys.exit("skip: SCHED_FIFO needs a privilege, pinning two cores")
-        print(os.sched_getparam(0).sched_priority, *os.sched_getaffinity(0))
-"""
-
-
-def _applied(priority: int) -> list[tuple[int, ...]]:
-    """Return the priority and the cores of each place."""
-    command = [sys.executable, "-c", _FIFO_PROGRAM, str(priority)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.stderr.startswith("skip"):
-        pytest.skip(done.stderr)
-    return [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux")
-def test_receiver_interrupts_its_sender_on_the_same_core() -> None:
-    (plant, *plant_cores), *others = _applied(50)
-    priorities = [plant, *(priority for priority, *_ in others)]
-    assert priorities == [47, 48, 49, 50]
-    assert len({tuple(cores) for _, *cores in others}) == 1
-    assert plant_cores != others[0][1:]
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="Linux")
-def test_lowest_priority_is_1() -> None:
-    assert [priority for priority, *_ in _applied(1)] == [1, 1, 1, 1]
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux")
-def test_other_threads_stay_normal_if_the_loop_may_not_be_real_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """RLIMIT_RTPRIO may permit their lower priority only."""
-    priorities = []
-
-    def limited(_thread: int, _policy: int, parameters: os.sched_param) -> None:
-        if parameters.sched_priority > 46:
-            raise PermissionError(1, "Operation not permitted")
-        priorities.append(parameters.sched_priority)
-
-    monkeypatch.setattr(os, "sched_setscheduler", limited)
-    ended = threading.Event()
-    other = threading.Thread(target=ended.wait)
-    other.start()
-    try:
-        with ExitStack() as undo, pytest.raises(PermissionError):
-            _fifo(50, 1, undo)
-    finally:
-        ended.set()
-        other.join()
-    assert priorities == []
-
-
-_LOCK_PROGRAM = """
-import mmap, resource, sys
-from pathlib import Path
-from noack.runtime.real_time_loop import lock_memory
-
-def resident_bytes():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
-
-def faults_of_writing(block):
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for place in range(0, len(block), mmap.PAGESIZE):
-        block[place] = 1
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-large, small = mmap.mmap(-1, 2**29), mmap.mmap(-1, 2**22)
-before = resident_bytes()
-try:
-    lock_memory()
-except OSError as error:
-    sys.exit(f"skip: {error}")
-grown = resident_bytes() - before
-status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-print(grown, faults_of_writing(small), int(status["VmLck"].split()[0]) * 1024)
-"""
-
-_FORKED = """
-import mmap, os, re, sys, threading
-from pathlib import Path
-from noack.runtime.real_time_loop import lock_memory
-
-def private_bytes():
-    text = Path("/proc/self/smaps_rollup").read_text()
-    return sum(int(kib) * 1024 for kib in re.findall("Private_Dirty: *([0-9]+) kB", text))
-
-inherited = mmap.mmap(-1, 2**23, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-inherited.write(b"x" * 2**23)
-if child := os.fork():
-    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-end = threading.Event()
-threads = [threading.Thread(target=end.wait, daemon=True) for _ in range(8)]
-for one in threads:
-    one.start()
-own = mmap.mmap(-1, 2**21, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-before = private_bytes()
-try:
-    lock_memory()
-except OSError as error:
-    sys.exit(f"skip: {error}")
-print(private_bytes() - before, flush=True)
-os._exit(0)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux")
-def test_a_forked_process_loads_its_own_memory_and_copies_none() -> None:
-    """2 MiB are its own; 8 MiB are its parent's, too, and 64 MiB are the stacks of threads."""
-    command = [sys.executable, "-c", _FORKED]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=150)
-    if "skip" in done.stderr:
-        pytest.skip(done.stderr)
-    assert 2**21 <= int(done.stdout) < 2**22
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux")
-def test_all_memory_is_locked_but_large_mappings_are_not_loaded() -> None:
-    command = [sys.executable, "-c", _LOCK_PROGRAM]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=150)
-    if done.stderr.startswith("skip"):
-        pytest.skip(done.stderr)
-    grown_bytes, faults, locked_bytes = map(int, done.stdout.split())
-    assert grown_bytes < 2**27
-    assert faults < 100  # of 1024 pages
-    assert locked_bytes > 2**29
+def test_a_deadline_after_the_end_is_not_late() -> None:
+    """The emulator may have packets in its queue for times after the end."""
+    # The next deadline is after the first period, which is the end.
+    one = Slow(10**10, served=1)
+    late_ns = run_loop(one, one, one.clock, Log(), end_ns=1, stop=never)
+    assert late_ns == 0
+    assert one.served < STEPS

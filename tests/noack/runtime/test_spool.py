@@ -1,14 +1,10 @@
-import itertools
 import shutil
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from cosim.record.spool_conversion import merged, spool_segments
 from noack.core.errors import MachineError
 from noack.runtime.spool import SpoolWriter, read_chunks
 
@@ -21,10 +17,6 @@ def spool(folder: Path, writer: str, table: str, *batches: tuple[int, bytes]) ->
         with_writer.append(table, first, payload)
     with_writer.close()
     return folder / f"{table}.{writer}"
-
-
-def numbers(first: int, end: int) -> bytes:
-    return np.arange(first, end, dtype="<i8").tobytes()
 
 
 def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
@@ -42,56 +34,6 @@ def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
         assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
     path.write_bytes(whole + struct.pack("<QQ", 11, 2**62))  # a damaged length takes no memory
     assert list(read_chunks(tmp_path, "plant_step")) == batches
-
-
-def test_tables_and_writers_are_stored_separately(tmp_path: Path) -> None:
-    spool(tmp_path, "recorder", "step", (0, b"a"))
-    spool(tmp_path, "recorder", "step_more", (0, b"b"))
-    spool(tmp_path, "plant", "step", (1, b"c"))
-    assert sorted(read_chunks(tmp_path, "step")) == [(0, b"a"), (1, b"c")]
-    assert list(read_chunks(tmp_path, "step_more")) == [(0, b"b")]
-    assert list(read_chunks(tmp_path, "nothing")) == []
-    assert list(read_chunks(tmp_path / "nowhere", "step")) == []
-
-
-@given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
-def test_rows_spooled_twice_are_merged(
-    tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
-) -> None:
-    """The recorder stored the first rows, the process all rows, in batches of other sizes."""
-    folder = tmp_path_factory.mktemp("spool")
-    for writer, cuts, end in (("recorder", cuts_a, 13), ("plant", cuts_b, 20)):
-        edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
-        batches = [(a, numbers(a, b)) for a, b in itertools.pairwise(edges)]
-        spool(folder, writer, "step", *batches)
-    rows = np.concatenate([*merged(spool_segments(folder, "step", ROW), ROW)])
-    assert rows["input"].tolist() == list(range(20))
-
-
-def test_a_removed_folder_is_a_machine_error_and_not_created_again(tmp_path: Path) -> None:
-    writer = SpoolWriter(tmp_path / "spool", "recorder")
-    (tmp_path / "spool").rmdir()
-    with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
-        writer.append("step", 0, b"a")
-    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
-        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
-    assert not (tmp_path / "gone").exists()
-
-
-def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) -> None:
-    """The next batch may never come, and its rows would follow an incomplete chunk."""
-    resource = pytest.importorskip("resource")
-    writer = SpoolWriter(tmp_path, "recorder")
-    writer.append("step", 0, bytes(100))
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # the disk has room for 34 more bytes
-    try:
-        with pytest.raises(MachineError, match=r"the record cannot be written: File too large$"):
-            writer.append("step", 100, bytes(100))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        writer.close()
-    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])

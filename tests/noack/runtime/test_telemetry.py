@@ -1,8 +1,6 @@
 """Rows on their way to the recorder: batches, losses, memory, and the handing over at the end."""
 
 import json
-from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import NoAnswerError
-from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.machine_interface import Record
 from noack.runtime import telemetry
-from noack.runtime.spool import NOTICES, kept_run_name, lines_in, notices_of
+from noack.runtime.spool import kept_run_name
 from noack.runtime.telemetry import (
     OwnSpool,
     ReceivedRows,
@@ -55,31 +53,6 @@ def fill(buffer: TelemetryBuffer, numbers: range) -> None:
             buffer.flush()
 
 
-def test_rows_of_a_table_may_be_added_at_once() -> None:
-    wire = Wire()
-    buffer = TelemetryBuffer(TABLES, wire)
-    rows = np.array([row(number) for number in range(BATCH)], ROW)
-    buffer.append(Record("two", row(0)))
-    for part in (rows[:100], rows[100:BATCH], rows[:1], rows):
-        buffer.extend_table("one", part)
-    buffer.flush()
-    assert [(table, count) for table, _, count, _ in wire.batches] == [
-        ("one", BATCH), ("two", 1), ("one", 1), ("one", BATCH),
-    ]  # fmt: skip
-    sent = np.concatenate([found for _, found in wire.rows("one")])
-    assert sent["number"].tolist() == [*range(BATCH), 0, *range(BATCH)]
-
-
-def test_a_row_is_copied_when_it_is_appended() -> None:
-    wire, x = Wire(), np.array([1.0, 2.0])
-    buffer = TelemetryBuffer(TABLES, wire)
-    buffer.append(Record("one", (0, x)))
-    x[:] = 9.0
-    buffer.flush()
-    ((_, rows),) = wire.rows("one")
-    assert rows["x"].tolist() == [[1.0, 2.0]]
-
-
 @given(st.integers(1, 6 * BATCH), st.data())
 def test_missing_batches_are_sent_again(count: int, data: st.DataObject) -> None:
     wire = Wire()
@@ -110,33 +83,6 @@ def test_missing_batches_are_sent_again(count: int, data: st.DataObject) -> None
     assert rows["number"].tolist() == list(range(count))
 
 
-@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 8))), st.integers(0, 45))
-def test_received_rows_are_stored_as_disjoint_ranges(
-    parts: list[tuple[int, int]], total: int
-) -> None:
-    received, numbers = ReceivedRows(), set[int]()
-    for first, count in parts:
-        received.add(first, first + count)
-        numbers |= set(range(first, first + count))
-    assert {n for low, high in received.ranges for n in range(low, high)} == numbers
-    assert all(one[1] < other[0] for one, other in pairwise(received.ranges))
-    assert received.end == max(numbers, default=-1) + 1
-    missing = {n for low, high in received.missing(total) for n in range(low, high)}
-    assert missing == set(range(total)) - numbers
-
-
-def test_batches_on_disk_are_dropped() -> None:
-    confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
-    buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed[-1])
-    fill(buffer, range(30))
-    buffer.notice(Notice(0, "info", "hello"))
-    confirmed.append({"one": [(0, 10), (12, 30)], NOTICES: [(0, 1)]})
-    buffer.flush()
-    again = Wire()
-    assert buffer.resend({"one": [(0, 30)], NOTICES: [(0, 1)]}, again) == 1
-    assert again.batches[0][1:3] == (10, 10)
-
-
 def test_lost_batches_are_sent_again_during_the_run() -> None:
     confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
     wire = Wire()
@@ -154,53 +100,6 @@ def test_lost_batches_are_sent_again_during_the_run() -> None:
         buffer.flush()
         assert len(wire.batches) - before <= 8
     assert [first for _, first, _, _ in wire.batches[sent:]] == list(range(50, 250, 10))
-
-
-class CountedRanges(Sequence[tuple[int, int]]):
-    """Ranges (10k, 10k + 5), each read counted."""
-
-    def __init__(self, length: int) -> None:
-        self._length, self.reads = length, 0
-
-    def __len__(self) -> int:
-        return self._length
-
-    def __getitem__(self, place: Any) -> Any:
-        if not 0 <= place < self._length:
-            raise IndexError(place)
-        self.reads += 1
-        return 10 * place, 10 * place + 5
-
-
-def test_the_work_for_lost_batches_is_not_quadratic() -> None:
-    """Thousands of batches may be held; the loop looks through them between its steps."""
-    confirmed: list[dict[str, Any]] = []
-    buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed.pop() if confirmed else {})
-    fill(buffer, range(10_000))
-    ranges = CountedRanges(1000)
-    confirmed.append({"one": ranges})
-    buffer.flush()
-    assert buffer.resend({"one": ranges}, Wire()) == 1000  # batches of 10 rows, half of them there
-    assert ranges.reads < 40 * 1000
-
-
-def test_log_lines_are_published_in_numbered_batches() -> None:
-    wire = Wire()
-    buffer = TelemetryBuffer(TABLES, wire)
-    buffer.append(Record("one", row(0)))
-    for k in range(600):
-        buffer.notice(Notice(10 * k, "violation", f"line {k}"))
-    buffer.flush()
-    batches = [batch for batch in wire.batches if batch[0] == NOTICES]
-    assert [(first, rows) for _, first, rows, _ in batches] == [(0, 256), (256, 256), (512, 88)]
-    lines = [json.loads(line) for *_, payload in batches for line in lines_in(payload)]
-    assert lines[300] == {"t_ns": 3000, "level": "violation", "text": "line 300"}
-    assert [line["text"] for line in lines] == [f"line {k}" for k in range(600)]
-    assert buffer.totals() == {"one": 1, "two": 0, NOTICES: 600}
-    again = Wire()
-    buffer.resend({NOTICES: [(300, 301)]}, again)
-    assert again.batches == [batches[1]]
-    assert len({notices_of(role) for role in ("plant", "sensor", "netem")}) == 3
 
 
 def test_the_oldest_batch_is_stored_at_the_memory_limit(

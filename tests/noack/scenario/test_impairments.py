@@ -1,7 +1,6 @@
 """Settings of a link that depend on each other, or on files."""
 
 import json
-import math
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import pytest
 import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import Delay
@@ -26,27 +25,11 @@ from noack.scenario.scenario_file import dumps, load, validate
 from tests.oracles.link import Link
 
 
-def message(adapter: TypeAdapter[Any], content: Any) -> str:
-    with pytest.raises(ValidationError) as caught:
-        adapter.validate_json(json.dumps(content))
-    return "\n".join(error["msg"] for error in caught.value.errors())
-
-
-@pytest.mark.parametrize(
-    "before",
-    [
-        [],
-        [{"kind": "loss", "loss": {"model": "worst_case"}}],
-        [
-            {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}},
-            {"kind": "loss", "loss": {"model": "periodic", "period": 3}},
-        ],
-    ],
-)
-def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states(before: list[Any]) -> None:
+def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states() -> None:
+    before = [{"kind": "loss", "loss": {"model": "worst_case"}}]
     late = {"kind": "delay", "jitter_s": 0.1, "loss_correlation": 0.5}
-    refused = message(TypeAdapter(LinkSettings), {"impairments": [*before, late]})
-    assert f"impairments.{len(before)}.loss_correlation: needs a loss before it" in refused
+    with pytest.raises(ValidationError, match=r"impairments\.1\.loss_correlation: needs a loss"):
+        LinkSettings.model_validate_json(json.dumps({"impairments": [*before, late]}))
     loss = {"kind": "loss", "loss": {"model": "bernoulli", "probability": 0.1}}
     LinkSettings.model_validate_json(json.dumps({"impairments": [*before, loss, late]}))
 
@@ -85,7 +68,8 @@ def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("# from a ping\n0.01\n12.5ms\n\n300 us\n-5ns\n1e-3\n")
     delay = read_delay(tmp_path, delay_s=0.02, file="delays.txt")
     assert delay.samples_s == pytest.approx((0.01, 0.0125, 3e-4, -5e-9, 1e-3), rel=1e-15)
-    assert delay.file is None
+    assert (delay.file, delay.longest_s) == (None, pytest.approx(0.0325))
+    assert Delay(jitter_s=0.1, distribution="normal").shortest_s == 0.0
     assert delay.delay_s == 0.02
 
 
@@ -93,25 +77,6 @@ def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None
     (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
     delay = read_delay(tmp_path, delay_s=0.02, jitter_s=0.002, file="some.dist")
     assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
-    # The quantiles are those of the table, shifted by the constant delay.
-    link = Link(LinkSettings(impairments=(delay,)), 0, "test")
-    drawn = sorted(link.decide(0, 100, 0).release_ns for _ in range(4001))
-    for quantile, expected_s in ((0, 0.018), (1000, 0.019), (2000, 0.02), (3000, 0.022)):
-        # A quantile of n draws has the standard error √(q(1 − q)/n)/density; the density is flat
-        # between knots, at least 1/(4 · 2 ms).
-        error_s = 5 * math.sqrt(0.25 / 4001) * 0.008
-        assert abs(drawn[quantile] * 1e-9 - expected_s) < max(error_s, 2e-5)
-
-
-TABLE = Path("/usr/lib/x86_64-linux-gnu/tc/paretonormal.dist")
-
-
-@pytest.mark.skipif(not TABLE.exists(), reason="tc's tables are not installed")
-def test_a_distribution_table_shipped_with_tc_is_read() -> None:
-    samples_s = read_delay(Path(), jitter_s=8.192, file=str(TABLE)).samples_s
-    assert samples_s is not None
-    assert len(samples_s) == 4096
-    assert all(abs(t_s * 1000 - round(t_s * 1000)) < 1e-9 for t_s in samples_s)
 
 
 @pytest.mark.parametrize(
@@ -134,9 +99,6 @@ def test_a_mistake_in_a_trace_gets_one_line(
     assert str(caught.value).startswith(
         f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
     )
-    with pytest.raises(CallerError) as caught:
-        read_files(settings, tmp_path)
-    assert str(caught.value).startswith(f"t: {says}")
 
 
 @pytest.mark.parametrize(
@@ -185,17 +147,3 @@ def test_a_loaded_scenario_no_longer_needs_its_files(scenario_with_files: Path) 
     )
     for one in (scenario, resolve(scenario)):
         assert validate(tomllib.loads(dumps(one)), "copy") == one
-
-
-def test_an_error_in_a_file_names_the_scenario_key(scenario_with_files: Path) -> None:
-    (scenario_with_files.parent / "files/trace.txt").unlink()
-    with pytest.raises(CallerError) as caught:
-        load(scenario_with_files)
-    assert str(caught.value) == (
-        f'{scenario_with_files}: network.loss.file = "files/trace.txt": '
-        "cannot be read: No such file or directory"
-    )
-    table = '{kind="delay",distribution="empirical",file="x"}'
-    overrides = ['network.loss={model="worst_case"}', f"network.impairments=[{table}]"]
-    with pytest.raises(CallerError, match=r'network\.impairments\.0\.file = "x": cannot be read'):
-        load(scenario_with_files, overrides)

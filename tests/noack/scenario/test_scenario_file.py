@@ -1,23 +1,18 @@
 """Every mistake in a scenario gives one line: file, key, value, and the remedy."""
 
-import json
-import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tomli_w
-from hypothesis import given
-from hypothesis import strategies as st
 
 import noack
 from noack.core.errors import CallerError
 from noack.scenario.resolution import resolve, resolved_loops
-from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
@@ -49,12 +44,6 @@ plant = { initial_state = [1, 0] }
 trigger = { beta = 0.5, alpha_per_s = 0.25 }
 network = { mansd = 2, loss = { model = "worst_case" } }
 """
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    (tmp_path / "some.toml").write_text(LANE)
-    return tmp_path / "some.toml"
 
 
 def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
@@ -105,31 +94,10 @@ def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("key", "begins"),
-    [
-        ("name", "names the run's directory"),
-        ("model", "the model that"),
-        ("trigger.beta", ""),
-        ("network.mansd", "M − 1, the "),
-        ("network.loss", "loss of updates, "),
-    ],
-)
-def test_a_missing_key_is_named_with_its_purpose(
-    content: Content, key: str, begins: str, tmp_path: Path
-) -> None:
-    section, _, last = key.rpartition(".")
-    del (content[section] if section else content)[last]
-    (line,) = mistakes(tomli_w.dumps(content), tmp_path)
-    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \({begins}.{{10,}}\)", line)
-
-
-@pytest.mark.parametrize(
     ("settings", "expected"),
     [
         (["trigger.beta=-1"], ["--set trigger.beta = -1: should be greater than 0"]),
         (["network.loss={model='bernoulli'}"], ["--set network.loss.probability: missing "]),
-        (["trigger.bet=1"], ["--set trigger.bet = 1: unknown key; did you mean beta?"]),
-        (["plant.initial_state=[1,2]"], ["--set plant.initial_state = [1, 2]: "]),
         (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
         (["trigger.beta=1"], ["FILE: name = 1: "]),  # the settings themselves are valid
         # The file alone is valid, but not with these settings.
@@ -139,6 +107,13 @@ def test_a_missing_key_is_named_with_its_purpose(
             ["FILE with --set network.loss.model: network.loss.probability = 0.8: unknown key; "],
         ),
         (["mode=zoh", "observer.kind=kalman"], ["FILE with --set observer.kind: observer."]),
+        (["trigger.beta"], ["--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"]),
+        (["trigger.beta.x=1"], ["--set trigger.beta.x=1: trigger.beta is not a table"]),
+        (['mode="zoh'], ["--set mode: not valid TOML: Unterminated string (at end of document)"]),
+        (
+            ["plant.initial_state.4=1"],
+            ["--set plant.initial_state.4=1: plant.initial_state has the entries 0 to 3, not 4"],
+        ),
     ],
 )
 def test_an_error_in_a_setting_is_not_attributed_to_the_file(
@@ -152,18 +127,10 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
         assert line.startswith(begins), line
 
 
-def test_a_long_value_is_shortened(tmp_path: Path) -> None:
-    (line,) = mistakes(LANE, tmp_path, [f'mode="{"x" * 500}"'])
-    assert len(line) < 200
-    assert "xxx..." in line
-    assert "should be 'model' or 'zoh'" in line
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("name = \n", "Invalid value (at line 1, column 8)"),
-        ("name = 'a'\nname = 'b'", "line 2: name is already defined in line 1"),
         (
             "[trigger]\nbeta = 1\nnorm = '='\nbeta = 2\n",
             "line 4: trigger.beta is already defined in line 2",
@@ -177,59 +144,15 @@ def test_a_long_value_is_shortened(tmp_path: Path) -> None:
             "[[loops]]\na = 1\n[[loops]]\na = 1\na = 2",
             "line 5: loops.a is already defined in line 4",
         ),
-        ("seeds.loss = 1\n[seeds]\nloss = 2", "line 2: seeds is already defined in line 1"),
         ("loss = { model = 'a', model = 'b' }", "line 1: loss.model is defined twice"),
         ("x = [{ a = 1 },\n{ b = 1, b.c = 2 }]", "line 1: x is a table with a key twice"),
         ("[plant\n", "line 1"),
-        ("just words", "line 1"),
     ],
 )
 def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: Path) -> None:
     (line,) = mistakes_with(text, tmp_path, ())
     assert line.startswith("FILE: not valid TOML: ")
     assert says in line
-
-
-def test_a_missing_file_is_reported_with_a_similar_one_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "lane.toml").write_text(LANE)
-    with pytest.raises(CallerError) as caught:
-        load(tmp_path / "lan.toml")
-    near = f"did you mean {tmp_path}/lane.toml?"
-    assert str(caught.value) == f"{tmp_path}/lan.toml: no such file; {near}"
-    for other in (tmp_path / "nowhere" / "lan.toml", tmp_path / "other.toml"):
-        with pytest.raises(CallerError) as caught:
-            load(other)
-        assert str(caught.value) == f"{other}: no such file"
-
-
-def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
-    for path in (tmp_path, tmp_path / "bytes.toml"):
-        with pytest.raises(CallerError, match=r"^[^\n]*: cannot be read: [^\n]*$"):
-            load(path)
-
-
-@pytest.mark.parametrize(
-    ("setting", "read"),
-    [
-        ("trigger.beta=0.3", lambda s: s.trigger.beta == 0.3),
-        (" trigger.beta = 0.3 ", lambda s: s.trigger.beta == 0.3),
-        ("mode=zoh", lambda s: s.mode == "zoh"),
-        ('mode="zoh"', lambda s: s.mode == "zoh"),
-        ("description=a = b", lambda s: s.description == "a = b"),
-        ("plant.initial_state=[1, 2, 3, 4]", lambda s: s.plant.initial_state == (1, 2, 3, 4)),
-        ('network.loss={model="worst_case"}', lambda s: s.network.loss.model == "worst_case"),
-        ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that is missing from the file
-        ("realtime.enabled=false", lambda s: not s.realtime.enabled),
-    ],
-)
-def test_settings_replace_values_of_the_file(
-    setting: str, read: Callable[[Scenario], bool], path: Path
-) -> None:
-    assert not read(load(path))
-    changed = load(path, [setting])
-    assert read(changed)
-    assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
 def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
@@ -243,49 +166,13 @@ def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
         load(path, ["loops.1.name=a"])
 
 
-@pytest.mark.parametrize(
-    ("setting", "says"),
-    [
-        ("trigger.beta", "--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"),
-        (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
-        ("trigger.beta.x=1", "--set trigger.beta.x=1: trigger.beta is not a table"),
-        ("plant.initial_state=[1,2",
-         "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)"),
-        ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
-        ("plant.initial_state.4=1",
-         "--set plant.initial_state.4=1: plant.initial_state has the entries 0 to 3, not 4"),
-        ("plant.initial_state.x=1",
-         "--set plant.initial_state.x=1: plant.initial_state has the entries 0 to 3, not x"),
-    ],
-)  # fmt: skip
-def test_a_setting_that_cannot_be_applied_is_reported(
-    setting: str, says: str, tmp_path: Path
-) -> None:
-    assert mistakes_with(LANE, tmp_path, [setting]) == [says]
-
-
 class Car:
     """A user's plant class; only its name is used."""
 
 
-@pytest.mark.parametrize("key", ["plant.system", "plant.system.name", "plant.system.file"])
-def test_class_is_converted_to_its_file_and_name(
-    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    content: dict[str, Any] = {"plant.system": {"kind": "python", "name": "Car"}}
-    with pytest.raises(CallerError) as caught:
-        noack.load("double_integrator", content | {key: Car})
-    _, found, written = str(caught.value).partition(
-        "Car: a class is given by its file and its name: "
-    )
-    assert found
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "my_plant.py").write_text("class Car: pass")
-    scenario = tomllib.loads(DOUBLE)
-    loaded = noack.load(scenario, {"plant.system": json.loads(written)})
-    assert (loaded.plant.system.kind, loaded.plant.system.name) == ("python", "Car")
-    with pytest.raises(CallerError, match=r"a value of type Car is no value of a setting$"):
-        noack.load("double_integrator", {"plant.system": Car()})
+def test_a_class_is_given_by_its_file_and_name() -> None:
+    with pytest.raises(CallerError, match="Car: a class is given by its file and its name: "):
+        noack.load("double_integrator", {"plant.system": Car})
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -296,67 +183,3 @@ def test_shipped_scenarios_are_unchanged_by_writing_and_reading(path: Path, tmp_
         copy.write_text(dumps(scenario), encoding="utf-8")
         assert load(copy) == scenario
     assert resolve(load(copy)) == resolved[-1]
-
-
-LOSSES = [
-    {"model": "worst_case"},
-    {"model": "bernoulli", "probability": 1 / 3},
-    {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
-]
-numbers = st.floats(-1e3, 1e3)  # a step with larger values may overflow to infinity
-
-
-@st.composite
-def contents(draw: st.DrawFn) -> Content:
-    n, m = draw(st.integers(1, 4)), draw(st.integers(1, 2))
-
-    def rows(r: int, c: int, entries: st.SearchStrategy[float] = numbers) -> list[list[float]]:
-        row = st.lists(entries, min_size=c, max_size=c)
-        return draw(st.lists(row, min_size=r, max_size=r))
-
-    plant: Content = {"draw": draw(st.sampled_from(["nominal", "uniform", "vertex", "given"]))}
-    if plant["draw"] == "given":
-        plant |= {"A": rows(n, n), "B": rows(n, m)}
-    else:
-        plant |= {
-            "uncertainty_A": rows(n, n, st.floats(0, 1e3)),
-            "uncertainty_B": rows(n, m, st.floats(0, 1)),
-        }
-    plant["initial_state"] = rows(1, n)[0]
-    return {
-        "name": draw(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", fullmatch=True)),
-        "description": draw(st.text(st.characters(codec="utf-8"))),
-        "mode": draw(st.sampled_from(["model", "zoh"])),
-        "horizon_s": draw(st.floats(0.01, 1e7)),
-        "speed": draw(st.floats(1e-6, 1000)),
-        "model": {
-            "A": rows(n, n),
-            "B": rows(n, m),
-            "gain": rows(m, n, st.floats(-1, 1)),
-            "allow_unstable": True,
-            "state_names": [draw(st.text(st.characters(codec="utf-8"))) for _ in range(n)],
-        },
-        "plant": plant,
-        "trigger": {
-            "beta": draw(st.floats(5e-324, 1e300)),
-            "alpha_per_s": draw(st.floats(1e-9, 1e9)),
-            "weight": [[2.0 * (i == j) for j in range(n)] for i in range(n)],
-        },
-        "network": {
-            "mansd": draw(st.integers(0, 1_000_000)),
-            "loss": draw(st.sampled_from(LOSSES)),
-        },
-        "seeds": {"plant": draw(st.integers(0, 2**64 - 1))},
-    }
-
-
-@given(contents())
-def test_any_scenario_survives_being_resolved_written_and_read(content: Content) -> None:
-    scenario = validate(content, "here")
-    resolved = resolve(scenario)
-    for one in (scenario, resolved):
-        text = dumps(one)
-        assert validate(tomllib.loads(text), "there") == one
-    assert resolve(resolved) == resolved
-    assert math.isfinite(sum(resolved.plant.initial_state))
-    assert json.loads(resolved.model_dump_json()) == resolved.model_dump(mode="json")

@@ -57,20 +57,6 @@ def test_long_key_is_refused_before_it_is_parsed(text: str) -> None:
         toml_file.parsed(text, "here")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"{key(MOST)} = 1",
-        f"x = '{LONG}' # {LONG} = 1",
-        f'x = """\n{LONG} = 1\n"""\n# """\ny = 1.5',
-        *(f"x = [{string}, '{LONG}']" for string in TRICKY),
-        "x = [" + "0.5, " * 1000 + "]",
-    ],
-)
-def test_dots_outside_keys_are_not_taken_for_a_long_key(text: str) -> None:
-    assert toml_file.parsed(text, "here") == tomllib.loads(text)
-
-
 @pytest.mark.parametrize("part", ["a", "a ", "a.b ", '"""\\', '"', "'''\\"])
 def test_text_without_long_keys_is_checked_in_linear_time(part: str) -> None:
     """Quadratic time would need 2.5 · 10¹¹ steps and exceed the test's time limit."""
@@ -154,15 +140,6 @@ def test_the_number_of_further_mistakes_is_given() -> None:
     assert lines[-1] == "here: 56 more mistakes"  # 6 required keys are missing, too
 
 
-def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    for name in ("/dev/zero", "fifo"):
-        file = NamedFile(name, tmp_path, "run.toml: network.loss")
-        for read in (file.content, file.sha256):
-            with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
-                read()
-
-
 class _Named(ScenarioSection):
     name: str
     note: str = ""
@@ -177,3 +154,10 @@ def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
         toml_file.read(tmp_path / "none.toml", _Named)
     near = f"did you mean {tmp_path}/one.toml?"
     assert str(caught.value) == f"{tmp_path}/none.toml: no such file; {near}"
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    file = NamedFile("/dev/zero", tmp_path, "run.toml: network.loss")
+    for read in (file.content, file.sha256):
+        with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
+            read()

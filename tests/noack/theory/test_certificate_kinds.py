@@ -1,8 +1,15 @@
 """Certificates of random loops: no bound is exceeded, and those of each broken copy are."""
 
+import numpy as np
 import pytest
 
+from noack.theory.bounds.terms import NetworkConditions
 from tests.noack.theory.certificate_kinds.comparison import KINDS, examine
+from tests.noack.theory.certificate_kinds.continuous import (
+    CONTINUOUS,
+    constants_of,
+    dominated_by_errors,
+)
 
 FEW, MOST = 6, 60
 LOOPS = dict.fromkeys(KINDS, FEW) | {"decaying": 40, "continuous time": 20}
@@ -28,3 +35,15 @@ def test_each_broken_copy_is_detected(name: str, mistake: str) -> None:
             assert examine(kind, range(seed, seed + 1), true).violated[""] == 0
             return
     pytest.fail("no run exceeds it")
+
+
+def test_the_flow_makes_the_bounds_much_smaller_and_runs_come_close_to_them() -> None:
+    system, conditions = dominated_by_errors(np.ones((4, 2)), far=True), NetworkConditions(3)
+    sharp = system.certify(conditions)
+    plain = system.certify(conditions, structured=False)
+    assert sharp.state < 0.6 * plain.state
+    assert sharp.mismatch < 0.6 * plain.mismatch
+    assert (sharp.inter_event_s or 0.0) > 1.3 * (plain.inter_event_s or 0.0)
+    worst = CONTINUOUS.simulate(system, np.random.default_rng(1)).worst
+    bounds = constants_of(sharp, system.beta)
+    assert {name for name, bound in bounds.items() if worst[name] < 0.6 * bound} == set()

@@ -6,33 +6,11 @@ from typing import Any
 
 import pytest
 
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.rate import Rate
-from noack.impairments.link_settings import LinkSettings
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import MOST_S, largest
-
-
-@pytest.mark.parametrize(
-    ("impairments", "longest_s", "bounded"),
-    [
-        ((), 0.0, True),
-        ((Delay(delay_s=0.01, jitter_s=0.002),), 0.012, True),
-        ((Delay(delay_s=0.01), Delay(delay_s=0.02)), 0.03, True),
-        ((Delay(delay_s=0.01, jitter_s=0.002, distribution="normal"),), 0.018, False),
-        ((Delay(distribution="empirical", samples_s=(0.001, 0.005)),), 0.005, True),
-        ((Rate(rate_bps=1_200_000, queue=10),), 0.1, False),
-    ],
-)
-def test_the_longest_delay_of_a_network_follows_from_its_settings(
-    impairments: tuple[Any, ...], longest_s: float, bounded: bool
-) -> None:
-    settings = LinkSettings(impairments=impairments)
-    assert settings.longest_delay_s == pytest.approx(longest_s, rel=1e-12)
-    assert settings.delay_is_bounded is bounded
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])
@@ -52,17 +30,6 @@ def test_the_networks_delay_adds_to_the_delay_of_updates(
     # The input does not pass through this network.
     assert delayed.hold_s == at_once.hold_s
     assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
-
-
-def test_the_certified_delay_replaces_the_longest_one(content: dict[str, Any]) -> None:
-    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02}]
-    longest = nominal_conditions(resolve(validate(content, "here")), 2)
-    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 3.0}]
-    content["certificate"] = {"network_delay_s": 0.02}
-    resolved = resolve(validate(content, "here"))
-    assert nominal_conditions(resolved, 2) == longest
-    why = "; ".join(assumption.why for assumption in assumptions(resolved))
-    assert "up to 3000 ms; the certificates allow for 20 ms" in why
 
 
 GAINS: dict[str, Callable[[float], float]] = {
@@ -94,9 +61,3 @@ def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s
 def test_all_times_or_none_may_have_a_certificate() -> None:
     assert largest(lambda value_s: 0.5, 0.01) == MOST_S
     assert largest(lambda value_s: math.inf, 0.01) == 0.0
-
-
-def test_a_smooth_gain_needs_few_certificates() -> None:
-    tried: list[float] = []
-    largest(lambda value_s: tried.append(value_s) or 0.2 + 20 * value_s, 0.004)  # type: ignore[func-returns-value]
-    assert len(tried) <= 10

@@ -2,9 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from decimal import Decimal, localcontext
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -15,14 +13,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.bounds.contraction import find_decay, spectral_norms
-from noack.theory.bounds.enclosure import (
-    KernelBounds,
-    NotDecayingError,
-    norm_bounds,
-    response,
-    response_until,
-)
+from noack.theory.bounds.contraction import find_decay
+from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, response
 
 Rng = np.random.Generator
 
@@ -146,74 +138,6 @@ def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(
     assert kernel.integral() <= 1.01 * float(areas.sum())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_tail_bounds_all_times_beyond_the_grid(kind: str) -> None:
-    """The grid ends before any mode has decayed."""
-    G, everything = KINDS[kind](np.random.default_rng(4), 4), np.eye(4)
-    whole = response(G, everything)
-    end = 40
-    cut = replace(whole, edges_s=whole.edges_s[: end + 1], states=whole.states[: end + 1])
-    kernel, end_s = cut.through(everything), float(whole.edges_s[end])
-    later_s = np.concatenate([[end_s], end_s + times(G, float(whole.edges_s[-1]))])
-    found = values(everything, G, everything, later_s)
-    bounds = kernel.tail_highest * np.exp(-kernel.tail_rate_per_s * (later_s - end_s))
-    assert (bounds + 1e-13 * found.max() >= found * ROUNDING).all()
-    np.testing.assert_allclose(kernel.sups(later_s), bounds, rtol=1e-12)
-    assert kernel.tail_area >= whole.through(everything).area[end:].sum() / 1.01
-
-
-@settings(max_examples=12)
-@given(
-    st.integers(1, 5), st.integers(0, 2**32), st.sampled_from([0.1, 1.0, 10.0, 100.0]),
-    st.sampled_from([1, 16, 64]), st.booleans(),
-)  # fmt: skip
-def test_over_a_finite_time_growing_systems_are_enclosed_too(
-    n: int, seed: int, reach: float, cells: int, grows: bool
-) -> None:
-    """On any grid: if a cell spans 100 time constants, the bound is valid but far off."""
-    rng = np.random.default_rng(seed)
-    G, D, C = (rng.normal(size=(n, n)) for _ in range(3))
-    if not grows:
-        G -= (spectral_abscissa(G) + 0.5) * np.eye(n)
-    until_s = reach / float(np.linalg.norm(G, 2))
-    kernel = response_until(G, D, until_s, cells).through(C)
-    assert len(kernel.area) == cells
-    t_s = np.linspace(0, until_s, 200)
-    found = values(C, G, D, t_s)
-    assert (kernel.highest[np.minimum(cell_of(kernel, t_s), cells - 1)] >= found * ROUNDING).all()
-    expected = float(np.trapezoid(found, t_s))
-    error = 1e-4 if reach <= 10 else 0.05  # of 200 trapezoids over the fastest rotations of F
-    assert kernel.integral_on_grid() >= expected * (1 - error)
-    if reach <= cells / 16:
-        assert kernel.sup_on_grid() <= 1.01 * found.max()
-    assert kernel.tail_highest == kernel.tail_area == math.inf  # not requested
-
-
-def test_a_maximum_within_a_single_cell_is_enclosed() -> None:
-    """The first six derivatives of t⁷e^{−t}/7! at 0 are 0; it decays within the cell."""
-    G = np.diag(np.ones(7), 1) - np.eye(8)
-    C, D = np.eye(8)[:1], np.eye(8)[:, -1:]
-    for until_s in (10.0, 40.0):
-        kernel = response_until(G, D, until_s, 1).through(C)
-        assert kernel.sup_on_grid() >= 7.0**7 * math.exp(-7) / math.factorial(7)
-        assert kernel.integral_on_grid() >= 0.77  # ∫₀¹⁰; over all times it is 1
-
-
-@settings(max_examples=12)
-@given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
-def test_the_rounding_of_a_product_is_covered(seed: int, n: int, columns: int) -> None:
-    """Products with cancelling terms, against rational numbers."""
-    rng = np.random.default_rng(seed)
-    C = rng.normal(size=(2, n)) * 10.0 ** rng.uniform(-8, 8, n)
-    Y = rng.normal(size=(n, columns)) / np.abs(C[:1]).T
-    Y[-1] = -(C[0, :-1] @ Y[:-1]) / C[0, -1]
-    C, Y = C[:1], Y[:, :1] if columns == 1 else Y
-    fractions = np.vectorize(Fraction, otypes=[object])
-    exact = float(np.linalg.norm((fractions(C) @ fractions(Y)).astype(np.float64)))
-    bound = float(norm_bounds(C, Y[None])[0])
-    assert exact <= bound <= exact + 1e-12
-
-
 def test_a_system_that_does_not_decay_is_refused() -> None:
     with pytest.raises(NotDecayingError, match=r"a mode of the loop grows at 2 /s"):
         response(np.diag([-1.0, 2.0]), np.eye(2))
@@ -268,35 +192,3 @@ def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condit
         exact = exactly(W, G, D, t_s)
         assert kernel.highest[node] >= exact
         assert kernel.sups(np.array([t_s]))[0] >= exact
-
-
-def test_many_states_take_little_memory_and_are_enclosed() -> None:
-    n = 40
-    rng = np.random.default_rng(2)
-    modes = np.diag(-np.logspace(-2, 3, n))  # with so few cells the slowest modes have not decayed
-    generator = modes + np.triu(rng.normal(size=(n, n)), 1) * 0.01
-    everything = np.eye(n)
-    followed = response(generator, everything)
-    assert followed.states.size < 6_000_000
-    kernel = followed.through(everything)
-    end_s = float(kernel.edges_s[-1])
-    for t_s in (0.0, 0.3 * end_s, end_s, 3 * end_s, 100.0):
-        assert np.linalg.norm(expm(generator * t_s), 2) <= kernel.sup(t_s) * (1 + 1e-12)
-    assert math.isfinite(kernel.integral())
-
-
-@pytest.mark.parametrize("rows", range(1, 6))
-@pytest.mark.parametrize("columns", range(1, 6))
-@pytest.mark.parametrize("scale", [1e-100, 1.0, 1e100, 1e200])
-def test_spectral_norms_are_the_largest_singular_values(
-    rows: int, columns: int, scale: float
-) -> None:
-    """Also of matrices of a low rank, of equal singular values, and where squares overflow."""
-    rng = np.random.default_rng(rows * columns)
-    stack = rng.normal(size=(300, rows, columns)) * 10 ** rng.uniform(-8, 8, (300, rows, 1))
-    stack[:100] = stack[:100, :, :1] * rng.normal(size=(100, 1, columns))
-    stack[0], stack[1] = 0.0, np.eye(rows, columns)
-    stack[2:9] = np.eye(rows, columns) + 1e-9 * rng.normal(size=(7, rows, columns))
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = spectral_norms(scale * stack)
-    assert found == pytest.approx(np.linalg.norm(scale * stack, 2, axis=(1, 2)), rel=1e-14)

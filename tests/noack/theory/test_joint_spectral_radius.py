@@ -1,19 +1,24 @@
-"""The bounds of joint spectral radii, against published values, closed forms and brute force."""
+"""The bounds of joint spectral radii, against published values, closed forms and brute force.
 
+The enclosures that they are computed with contain the exact results of rational arithmetic.
+"""
+
+from fractions import Fraction
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.margins.exact_matrices import IntervalMatrix, exactly
-from noack.theory.margins.invariant_polytopes import InvariantPolytopes
-from noack.theory.margins.joint_spectral_radius import (
-    joint_spectral_radius,
-    norms_above,
-    quadratic_norms,
-    remembering,
+from noack.theory.margins.exact_matrices import (
+    IntervalMatrix,
+    exactly,
+    exponential,
+    inverse,
 )
+from noack.theory.margins.invariant_polytopes import InvariantPolytopes
+from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
 from noack.theory.margins.switched_system import Edge, spectral_radius_bounds, strongly_connected
 
 GOLDEN_RATIO = (1 + 5**0.5) / 2
@@ -62,27 +67,6 @@ def test_closed_forms(matrices: list[Matrix], value: float) -> None:
     assert found.upper >= value
     assert found.lower == pytest.approx(value, rel=1e-7)
     assert found.upper == pytest.approx(value, rel=6e-3)  # the defective one needs many vertices
-
-
-def test_nilpotent_systems_do_not_grow() -> None:
-    shift = np.diag([1.0, 1.0], k=1)
-    found = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
-    assert found.lower == 0
-    assert found.upper < 0.01
-
-
-def test_durations_count_and_dimensions_may_differ() -> None:
-    # Around the two nodes, x grows by 16 in 1 + 3 units of time.
-    found = joint_spectral_radius(
-        [edge(0, 1, [[2.0], [0.0], [1.0]]), edge(1, 0, [[8.0, 7.0, 0.0]], 3)]
-    )
-    assert found.lower == pytest.approx(2, rel=1e-12)
-    assert 2 <= found.upper <= 2.001
-
-
-def test_paths_that_end_do_not_count() -> None:
-    edges = [edge(0, 0, [[0.5]]), edge(0, 1, [[100.0]]), edge(1, 2, [[100.0]])]
-    assert joint_spectral_radius(edges).upper < 0.51
 
 
 def random_graph(rng: np.random.Generator) -> list[Edge]:
@@ -135,51 +119,6 @@ def test_no_polytopes_prove_too_much(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_no_quadratic_norms_prove_too_much(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    (system,) = strongly_connected(random_graph(rng))
-    exact = joint_spectral_radius(system.edges, accuracy=1e-3)
-    upper = quadratic_norms(system).upper
-    remembered = quadratic_norms(remembering(system, 2)).upper
-    assert exact.lower <= upper <= 1.5 * exact.upper  # at most √n times as large, n ≤ 3, but for d
-    assert exact.lower <= remembered <= upper * (1 + 1e-2)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_many_edges_between_two_nodes(seed: int) -> None:
-    """A rotation that lasts longer and longer, and a decay: no cycle is faster than the slowest."""
-    rng = np.random.default_rng(seed)
-    turns = [rng.uniform(0.5, 0.9) * _rotation(angle) for angle in rng.uniform(0, 7, 90)]
-    edges = [edge(0, 0, turn, k % 3 + 1) for k, turn in enumerate(turns)]
-    change = rng.normal(size=(2, 2))
-    moved = [one._replace(matrix=exactly(change @ one.matrix.middle @ np.linalg.inv(change)))
-             for one in edges]  # fmt: skip
-    value = max(np.abs(np.linalg.det(turn)) ** (0.5 / (k % 3 + 1)) for k, turn in enumerate(turns))
-    found = joint_spectral_radius(moved)
-    assert found.vertices == 0
-    assert found.lower == pytest.approx(value, rel=1e-9)
-    assert value * (1 - 1e-12) <= found.upper <= value * 1.001
-
-
-def _rotation(angle: float) -> Matrix:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_norms_above_holds_for_every_matrix_of_an_enclosure(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    middle = rng.normal(size=(3, *rng.integers(1, 7, 2))) * 10.0 ** rng.integers(-9, 9)
-    sharp = np.linalg.norm(middle, 2, axis=(1, 2))
-    np.testing.assert_allclose(norms_above(exactly(middle)), sharp, rtol=1e-11)
-    assert (norms_above(exactly(middle)) >= sharp).all()
-    radius = np.abs(middle) * 1e-3
-    above = norms_above(IntervalMatrix(middle, radius))
-    for _ in range(50):
-        end = middle + radius * rng.choice([-1, 1], middle.shape)
-        assert (np.linalg.norm(end, 2, axis=(1, 2)) <= above).all()
-
-
-@pytest.mark.parametrize("seed", range(20))
 def test_spectral_radius_bounds_hold_for_every_matrix_of_an_enclosure(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 7))
@@ -210,9 +149,57 @@ def test_a_graph_with_one_cycle_is_decided(seed: int) -> None:
     assert sorted(found.cycle) == list(range(length))
 
 
-def test_one_cycle_that_forgets_or_has_one_direction() -> None:
-    nilpotent = joint_spectral_radius([edge(0, 0, np.diag([1e-3, 1e3], k=1))])
-    assert (nilpotent.lower, nilpotent.cycle) == (0, ())
-    assert 0 < nilpotent.upper < 1e-9
-    defective = joint_spectral_radius([edge(0, 0, [[0.7, 1e5, 3], [0, 0.7, 1e5], [0, 0, 0.7]])])
-    assert defective.lower <= 0.7 <= defective.upper < 0.7 * (1 + 1e-9)
+def rational(matrix: Matrix) -> Any:
+    return np.vectorize(Fraction, otypes=[object])(matrix)
+
+
+def contains(enclosure: IntervalMatrix, exact: Any) -> bool:
+    distance = abs(rational(enclosure.middle) - exact)
+    return bool((distance <= rational(enclosure.radius)).all())
+
+
+def matrix(rng: np.random.Generator, *shape: int) -> Matrix:
+    return rng.normal(size=shape) * 10.0 ** rng.integers(-8, 9, shape)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_products_and_differences_contain_the_exact_ones(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, B, C = matrix(rng, 3, 5), matrix(rng, 5, 4), matrix(rng, 3, 4)
+    R = np.abs(matrix(rng, 3, 5)) * 1e-9
+    end = rational(A) + rational(R) * rng.choice([-1, 1], R.shape)
+    found = IntervalMatrix(A, R) @ exactly(B)
+    assert contains(found, end @ rational(B))
+    assert contains(found - exactly(C), end @ rational(B) - rational(C))
+    sharp = exactly(A) @ exactly(B)
+    assert contains(sharp, rational(A) @ rational(B))
+    assert (sharp.radius <= 1e-14 * (np.abs(A) @ np.abs(B))).all()
+    assert not contains(sharp._replace(radius=0 * sharp.radius), rational(A) @ rational(B))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_inverse_contains_the_exact_one(seed: int) -> None:
+    A = np.random.default_rng(seed).normal(size=(2, 2))
+    (a, b), (c, d) = rational(A)
+    found = inverse(A)
+    assert found is not None
+    assert contains(found, np.array([[d, -b], [-c, a]]) / (a * d - b * c))
+
+
+def test_singular_matrices_have_no_inverse() -> None:
+    assert inverse(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
+    assert inverse(np.array([[1.0, 2.0], [2.0, 4.0 + 1e-15]])) is None
+
+
+def test_exponentials_in_closed_form() -> None:
+    shear = exponential(np.array([[0.0, 3.0], [0.0, 0.0]]), 2_500_000_000).interval()
+    assert contains(shear, rational(np.array([[1.0, 7.5], [0.0, 1.0]])))
+    assert shear.radius.max() < 1e-14
+    # cos 1 and sin 1 to 50 digits (OEIS A049470, A049469)
+    cos = Fraction("0.54030230586813971740093660744297660373231042061792")
+    sin = Fraction("0.84147098480789650665250232163029899962256306079837")
+    turn = exponential(np.array([[0.0, 1000.0], [-1000.0, 0.0]]), 1_000_000)
+    exact = np.array([[cos, sin], [-sin, cos]])
+    assert contains(turn.interval(), exact)
+    deviation = np.abs(turn.entries - exact * 2**384).max() / 2**384
+    assert deviation < 1e-49

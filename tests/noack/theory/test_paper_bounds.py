@@ -11,14 +11,17 @@ from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.scenario.resolution import LoopMatrices
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
-from tests.noack.theory.exact_loops import loop_of, observe
+from tests.noack.theory.certificate_kinds.policies import INSTANT
+from tests.oracles.continuous_loops import simulate_continuous_time
 from tests.oracles.lossy_loops import (
     ROUNDING,
     SEARCH,
     System,
     certified_or_skipped,
+    networks,
     seeds,
     systems,
+    times_s,
 )
 
 
@@ -28,7 +31,12 @@ def norm(matrix: Matrix) -> float:
 
 def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     """Theorem 2 with the uniform Δ from (I1)."""
-    loop = loop_of(system)
+    names = tuple(f"x_{i}" for i in range(len(system.A)))
+    loop = LoopMatrices(
+        A_model=system.H - system.B @ system.K, B_model=system.B, K=system.K, H=system.H,
+        A=system.A, B=system.B, x0=system.x0, weight=None,
+        state_names=names, input_names=names[: len(system.K)],
+    )  # fmt: skip
     delta = certified_or_skipped(system, NetworkConditions(system.mansd)).delta
     found = theorem_2(loop, system.beta, system.alpha, delta)
     assert found is not None
@@ -65,24 +73,14 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
         assert found.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
 
 
-def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
-    one = np.ones((1, 1))
-    names = ("x",)
-    loop = LoopMatrices(one, one, -3 * one, -2 * one, one, one, np.ones(1), None, names, names)
-    assert theorem_2(loop, 0.1, 1.99, 1.0) is not None
-    assert theorem_2(loop, 0.1, 2.0, 1.0) is None
-    assert theorem_2(loop, 0.1, 0.0, 1.0) is None
-
-
 @settings(SEARCH, max_examples=3)
-@given(systems(weighted=False), seeds)
+@given(systems(weighted=False, **INSTANT), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
     _, found = of(system)
-    for run, samples in observe(system, 12.0, seed):
-        bound = found.state(samples.t_s, system.alpha)
-        assert (np.linalg.norm(samples.x, axis=1) <= bound * ROUNDING).all()
-        if len(run.before) > 1:
-            assert np.diff(run.event_s).min() >= found.inter_event_s / ROUNDING
+    trace, t_s = simulate_continuous_time(system, *networks(seed, system)), times_s(system)
+    bounds = np.exp(system.alpha * t_s) * found.state(t_s, system.alpha)
+    assert trace.state.max() <= bounds.max() * ROUNDING
+    assert trace.inter_event_s >= found.inter_event_s / ROUNDING
 
 
 @pytest.mark.parametrize("alpha", [0.1, 2.0])

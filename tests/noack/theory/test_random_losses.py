@@ -1,18 +1,14 @@
 """Loops under random losses: moments and growth, by closed forms, all patterns, Monte Carlo."""
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from noack.impairments.loss_prediction import LossProcess
 from noack.impairments.markov_chain import Array
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
 from noack.theory.bounds.gains import ErrorGains, PlantGains
-from noack.theory.bounds.terms import NetworkConditions, NoCertificateError
-from noack.theory.margins.loss_margin import LossMargin
+from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.random_losses.mean_square_growth import (
     mean_square_growth,
     sure_growth,
@@ -54,15 +50,6 @@ def test_moments_of_a_scalar_loop_are_those_of_the_inequalities_solved_by_hand()
     assert found.controller_error == pytest.approx(e_c, rel=0.02)
     assert found.state == pytest.approx(x, rel=0.02)
     assert found.input_error == pytest.approx(gain * e_c, rel=0.02)
-
-
-def test_too_many_losses_have_no_moments() -> None:
-    plant = scalar(1.0, 3.0, 0.5)
-    with pytest.raises(NoCertificateError):
-        moments(plant.error, plant, NetworkConditions(0), 0.1, 0.9, 1)
-
-
-LANE = Path(__file__).parents[3] / "scenarios" / "lane_periodic.toml"
 
 
 def losses(start: list[float], moves: list[list[float]], lost: list[float]) -> LossProcess:
@@ -128,20 +115,3 @@ def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
             size = float(np.linalg.norm(z))
             z, total = z / size, total + np.log(size)
         assert np.exp(total / periods) <= bound * 1.03  # of 4,000 periods
-
-
-@pytest.mark.parametrize("delay_s", [0.0, 0.1])
-def test_the_maps_of_single_periods_compose_to_those_between_deliveries(delay_s: float) -> None:
-    delay = f'network.impairments=[{{kind="delay", delay_s={delay_s}}}]'
-    loop = LossMargin(resolve(load(LANE, (delay,)))).loop
-    n, m = 4, 2
-    x, x_c, u = np.eye(n), np.zeros((n, n)), np.zeros((m, n))
-    start = np.vstack([x, x if delay_s == 0 else x_c, u, u])
-    if delay_s:  # u belongs to x_c = 0, and the transmitted x is that of z
-        expected = loop.map(0, 2).middle[: 2 * n, :n]
-        kept = [*range(2 * n)]
-    else:
-        expected = loop.map(0, 2).middle[:, :n]
-        kept = [*range(n), *range(2 * n, 2 * n + m)]
-    steps = loop.period(0, False) @ loop.period(0, False) @ loop.period(0, True)
-    assert (steps @ start)[kept] == pytest.approx(expected, rel=1e-9, abs=1e-12)

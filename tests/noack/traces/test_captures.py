@@ -2,10 +2,7 @@
 
 import io
 import random
-import shutil
 import struct
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -131,14 +128,6 @@ def test_captures_that_do_not_say_what_was_lost() -> None:
             trace_of(*files)
 
 
-def test_what_precedes_a_cut_is_used() -> None:
-    sent, arrived, delays = network()
-    data = pcap_of(*(one for one in arrived))
-    trace = trace_of(pcap_of(*sent), data[:-1], clocks_differ=False)
-    assert delays_in(trace) == delays  # the last packet was a duplicate
-    assert any("is cut off after packet" in line for line in trace.notes)
-
-
 families = st.one_of(
     *(
         st.builds(
@@ -186,31 +175,6 @@ def test_every_datagram_is_found_again(
         assert str(flow) == (
             f"{source}:{one.source_port} → {destination}:{one.destination_port} on interface 0"
         )
-
-
-@pytest.mark.parametrize("link_type", [link for link in LINKS if link != 0])
-def test_tshark_finds_the_same_datagrams(link_type: int, tmp_path: Path) -> None:
-    if shutil.which("tshark") is None:
-        pytest.skip("needs tshark")
-    rng = random.Random(1)
-    sent = [
-        Sent(10**18 + rng.randrange(10**12), rng.randbytes(rng.randrange(1, 60))) for _ in range(20)
-    ]
-    sent += [one._replace(source="2001:db8::1", destination="2001:db8::2") for one in sent[:5]]
-    path = tmp_path / "a.pcap"
-    path.write_bytes(pcap_of(*sent, link_type=link_type, vlans=link_type == 1))
-    names = ("frame.time_epoch", "ip.src", "ipv6.src", "udp.srcport", "udp.payload")
-    fields = [word for name in names for word in ("-e", name)]
-    # tshark must not take the payloads for another protocol.
-    command = ["tshark", "-r", str(path), "-T", "fields", "-d", "udp.port==5000,data", *fields]
-    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
-    found = [line.split("\t") for line in lines]
-    for (time, v4, v6, port, payload), (t_ns, flow, data, _) in zip(
-        found, read(path.read_bytes()), strict=True
-    ):
-        assert time.replace(".", "") == str(t_ns)
-        assert str(flow).startswith(f"{v4 or f'[{v6}]'}:{port} ")
-        assert payload == data.hex()
 
 
 def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:

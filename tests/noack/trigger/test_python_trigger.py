@@ -10,9 +10,8 @@ from cosim.analysis.replay import replay
 from cosim.record.run_directory import write_scenario
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
-from cosim.simulation.exact_simulation import OK, setting_of
+from cosim.simulation.exact_simulation import setting_of
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
@@ -82,13 +81,6 @@ def test_a_run_keeps_the_file_and_replays_with_it(tmp_path: Path) -> None:
         simulate(resolved)
 
 
-def test_a_sampled_campaign_accepts_a_user_trigger(tmp_path: Path) -> None:
-    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
-    rows = SampledWork(in_virtual_time(resolved), 1, None, None, 0.5, 1000).run(range(2))
-    assert (rows["status"] == OK).all()
-    assert np.isfinite(rows["sup_e_c_scaled"]).all()
-
-
 def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path) -> None:
     resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     for refuses in (continuous_loop_of, setting_of):
@@ -108,7 +100,6 @@ def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path)
     ("code", "expected"),
     [
         ("x = 1", "LookupError: own.py has no Delta"),
-        ("class Delta: pass", "TypeError: it has no method start"),
         ("class Delta:\n  def start(self, t_s, x): pass", "TypeError: it has no method test"),
         ("class Delta:\n  def __init__(self, gain): pass", "TypeError: Delta.__init__() missing 1"),
         ("class Delta:\n  def start(self, t_s, x): x[0] = 1\n  def test(self, *given): return True",
@@ -138,15 +129,3 @@ def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:
     found = np.diff(events(simulate(scenario(tmp_path, code))))
     assert len(found) > 5
     assert set(found) == {500_000_000}
-
-
-def test_the_shipped_trigger_keeps_to_its_grid_and_threshold() -> None:
-    record = simulate(resolve(load(SCENARIOS / "lane_python_trigger.toml", ["horizon_s=6.0"])))
-    rows = record[SENSOR_MEASUREMENT]
-    of_events = rows[rows["event"] > 0]  # the first update is sent without a test
-    assert len(of_events) > 3
-    assert (of_events["t_ns"] % 20_000_000 == 0).all()
-    levels = 0.5 * np.exp(-0.25 * of_events["t_ns"] * 1e-9)
-    since_ns = np.diff(of_events["t_ns"], prepend=0)
-    levels[since_ns < 500_000_000] *= 0.5
-    assert (of_events["e_s_norm"] > levels).all()

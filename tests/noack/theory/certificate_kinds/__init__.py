@@ -52,16 +52,12 @@ class Tally:
     """Number of loops without a certificate, which were drawn again."""
     violated: Counter[str]
     """Number of loops that exceed a bound, by its name; "": any bound."""
-    closest: Mapping[str, float]
+    closest: Counter[str]
     """The largest observed value divided by its bound."""
 
     def plus(self, other: "Tally") -> "Tally":
         """Return both together."""
-        names = self.closest.keys() | other.closest.keys()
-        closest = {
-            name: max(self.closest.get(name, 0.0), other.closest.get(name, 0.0)) for name in names
-        }
         return Tally(
             self.loops + other.loops, self.runs + other.runs, self.refused + other.refused,
-            self.violated + other.violated, closest,
+            self.violated + other.violated, self.closest | other.closest,
         )  # fmt: skip

@@ -6,7 +6,7 @@ have an event. Then random settings of each policy, and the broken copies, which
 of what a trigger does.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -14,15 +14,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.linear_systems import Matrix
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import ComparisonBound, TriggerBounds
-from noack.theory.certificates import scenario_certificates, solution
+from noack.theory.certificates import scenario_certificates
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-from noack.theory.certificates.inequalities import ErrorInequalities
 from noack.theory.certificates.scenario_certificates import certify, trigger_bounds
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
 from tests.noack.theory.certificate_kinds.decaying import search
@@ -42,15 +41,17 @@ from tests.oracles.lossy_loops import (
 
 @dataclass
 class Compare:
-    """‖W e_s‖² > (share ‖W x‖)² + threshold²; send-on-delta without a share."""
+    """‖W e_s‖² > (share ‖W x‖)² + (threshold e^{−decay k})² in step k."""
 
     weight: Matrix
     threshold: float
     share: float = 0.0
+    decay: float = 0.0
 
     def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
         size, error = (np.linalg.norm(v @ self.weight.T, axis=1) for v in (x, e_s))
-        return np.asarray(error > np.hypot(self.share * size, self.threshold))
+        threshold = self.threshold * np.exp(-self.decay * step)
+        return np.asarray(error > np.hypot(self.share * size, threshold))
 
 
 @dataclass
@@ -109,20 +110,6 @@ class NotBefore:
 
     def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
         return self.rule(step, since, x, e_s) & (since >= self.steps)
-
-
-@dataclass
-class Decaying:
-    """The paper's rule."""
-
-    weight: Matrix
-    beta: float
-    alpha_per_s: float
-    step_s: float
-
-    def __call__(self, step: int, since: Steps, x: Reals, e_s: Reals) -> Flags:
-        threshold = self.beta * np.exp(-self.alpha_per_s * step * self.step_s)
-        return np.asarray(np.linalg.norm(e_s @ self.weight.T, axis=1) > threshold)
 
 
 @dataclass
@@ -205,7 +192,7 @@ def _periodic(system: System, rng: Rng) -> PolicyCase:
 
 def _decaying(system: System) -> PolicyCase:
     rule = {"beta": system.beta, "alpha_per_s": system.alpha}
-    return rule, Decaying(system.weight, system.beta, system.alpha, system.step_s)
+    return rule, Compare(system.weight, system.beta, decay=system.alpha * system.step_s)
 
 
 def _deadline(system: System, rng: Rng) -> PolicyCase:
@@ -262,22 +249,24 @@ def policy_case(
     if rng.uniform() < 1 / 3:
         system = replace(system, H=np.zeros_like(system.H))
     settings, rule = POLICY_KINDS[kind](system, rng)
-    return scenario_with(system, settings, push), rule, system
+    rate_hz = 1 / (system.sample_steps * system.step_s)
+    return scenario_with(system, settings, push, rate_hz=rate_hz), rule, system
 
 
-def scenario_with(system: System, trigger: dict[str, Any], push: float) -> Scenario:
+def scenario_with(
+    system: System, trigger: dict[str, Any], push: float = 0.0, **plant: float
+) -> Scenario:
     """The system's matrices with a trigger; the rates have no effect where conditions are given."""
     mode = "model" if system.H.any() else "zoh"
     model: Matrix = system.H - system.B @ system.K if mode == "model" else system.A
     weighted = trigger.get("rule", trigger)
     weighted["weight"] = system.weight.tolist()
-    test_s = system.sample_steps * system.step_s
     content: dict[str, Any] = {
         "name": "random", "horizon_s": 1.0, "mode": mode,
         "model": {"A": model.tolist(), "B": system.B.tolist(), "gain": system.K.tolist()},
         "plant": {
             "draw": "given", "A": system.A.tolist(), "B": system.B.tolist(),
-            "initial_state": system.x0.tolist(), "rate_hz": 1 / test_s,
+            "initial_state": system.x0.tolist(), **plant,
         },
         "trigger": trigger,
         "network": {"mansd": system.mansd, "loss": {"model": "worst_case"}},
@@ -372,20 +361,6 @@ def without_one_loss(resolved: Scenario, conditions: Conditions) -> ScenarioCert
     return certify(resolved, conditions._replace(dropouts=conditions.dropouts - 1))
 
 
-def with_own_ways(resolved: Scenario, conditions: Conditions) -> ScenarioCertificate:
-    """Each part bounds e_c in the way that is tighter for it, and the bounds are added."""
-
-    true = solution._smallest
-
-    def smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> solution._Smallest:
-        found = [true([step], spacing_s) for step in steps]
-        exists = np.all([one.exists for one in found], axis=0)
-        return found[0]._replace(parts=[one.parts[0] for one in found], exists=exists)
-
-    with patch.object(solution, "_smallest", smallest):
-        return certify(resolved, conditions)
-
-
 INSTANT = {"delay_steps": 0, "hold_steps": 0, "known_start": True, "window": (1, 1), "recovery": 0}
 FAR = {"n": 1, "m": 1, "mismatch": 0.5, "step_share": 0.01, "sample_steps": 1, **INSTANT}
 
@@ -394,10 +369,6 @@ BROKEN_POLICIES: dict[str, tuple[str, Callable[[Scenario, Conditions], Any], dic
         f"{kind}, one loss less": (kind, without_one_loss, {**FAR, "mansd": 1, "beta": 0.01})
         for kind in ("absolute", "mixed", "quadratic", "deadline", "self_triggered")
     },
-    "absolute, each part its own bound of e_c": (
-        "absolute", with_own_ways,
-        {**FAR, "mansd": 0, "beta": 0.01, "delay_steps": 4, "step_share": 0.002},
-    ),
     "relative, no share": ("relative", with_trigger(NoShares), {**FAR, "mansd": 0}),
     "mixed, no share": ("mixed", with_trigger(NoShares), {**FAR, "mansd": 0, "beta": 0.01}),
     "quadratic, no cross term": (

@@ -9,15 +9,13 @@ known at it is read independently.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
 
 from noack.theory.bounds.enclosure import NotDecayingError
-from noack.theory.bounds.gains import Output
-from noack.theory.bounds.terms import Constants, NoCertificateError
+from noack.theory.bounds.terms import NoCertificateError
 from noack.theory.certificates.certified_bounds import (
     KnownStateBounds,
     KnownStatePart,
@@ -35,7 +33,17 @@ from tests.noack.theory.disturbed_loops import (
     simulate_disturbed,
     worst_shares,
 )
-from tests.oracles.lossy_loops import RUNS, STEPS, System, Trace, random_system, simulate, times_s
+from tests.oracles.lossy_loops import (
+    RUNS,
+    STEPS,
+    Steps,
+    System,
+    Trace,
+    Vector,
+    random_system,
+    simulate,
+    times_s,
+)
 
 _NONE = 10**6
 """More missing events than any certificate allows."""
@@ -43,13 +51,9 @@ _NONE = 10**6
 
 @dataclass(frozen=True)
 class KnownStateLoop:
-    """A loop with or without disturbances, and how its runs are read."""
+    """A loop with or without disturbances."""
 
     loop: System | DisturbedLoop
-    lost_are_received: bool = False
-    """Mistake: every event counts as received by the controller."""
-    events_late: int = 0
-    """Mistake: the state is that of so many events before the newest one."""
 
     @property
     def system(self) -> System:
@@ -77,17 +81,11 @@ class KnownStateLoop:
         missing = number - trace.received
         if not system.known_start:
             missing[trace.received == 0] = _NONE
-        if self.lost_are_received:
-            missing[:] = 0
-        known_at = last[run, at]
-        for _ in range(self.events_late):
-            known_at = np.where(known_at > 0, last[run, known_at - 1], known_at)
-            run, at, age, known_at = (v[known_at >= 0] for v in (run, at, age, known_at))
         leap = expm((system.A + system.B @ system.K) * system.step_s)
         powers = [np.eye(len(leap))]
         for _ in range(STEPS):
             powers.append(leap @ powers[-1])
-        predicted = np.einsum("kij,kj->ki", np.array(powers)[age], trace.known[run, known_at])
+        predicted = np.einsum("kij,kj->ki", np.array(powers)[age], trace.known[run, last[run, at]])
         t_s, moved = times_s(system), np.linalg.norm(trace.x[run, at] - predicted, axis=1)
         most = bounds.state_deviation(t_s[at], age * system.step_s, missing[run, at])
         errors = bounds.controller_error(np.tile(t_s, len(trace.x)), missing.ravel())
@@ -105,65 +103,33 @@ def random_known_state_loop(rng: np.random.Generator, **fixed: Any) -> KnownStat
     return KnownStateLoop(draw(rng, **fixed))
 
 
-class Mistake(NamedTuple):
-    """How a broken copy changes the bounds, or how the runs are read; by default not at all."""
+class LostAreReceived(KnownStateBounds):
+    """Every event counts as received by the controller."""
 
-    bounds: Callable[[KnownStateBounds], KnownStateBounds] = lambda bounds: bounds
-    reading: Callable[[KnownStateLoop], KnownStateLoop] = lambda loop: loop
+    def state_deviation(self, t_s: Vector, age_s: Vector, missing: Steps) -> Vector:
+        return super().state_deviation(t_s, age_s, 0 * missing)
 
-
-def _misread(**changes: Any) -> Mistake:
-    return Mistake(reading=lambda loop: replace(loop, **changes))
-
-
-def _with_constants(**changes: float) -> Mistake:
-    return _with_parts(lambda part: part.constants._replace(**changes))
-
-
-def _with_parts(change: Callable[[KnownStatePart], Constants]) -> Mistake:
-    def changed(bounds: KnownStateBounds) -> KnownStateBounds:
-        parts = [replace(part, constants=change(part)) for part in bounds.parts]
-        return replace(bounds, parts=tuple(parts))
-
-    return Mistake(changed)
-
-
-def _without_age(part: KnownStatePart) -> Constants:
-    """u is K x_c: the input error is at most ‖KW^{−1}‖β̃."""
-    own = part.plant.error.now(Output.GAIN) * part.constants.overshoot * part.unit
-    return part.constants._replace(received_input_error=own)
+    def controller_error(self, t_s: Vector, missing: Steps) -> Vector:
+        return super().controller_error(t_s, 0 * missing)
 
 
 _INSTANT = {"disturbed": False, "beta": 0.01, "sample_steps": 1, "delay_steps": 0}
 _EVENTFUL = {"mismatch": 0.5, "step_share": 0.01, "hold_steps": 0, **_INSTANT}
 
-BROKEN: dict[str, tuple[Mistake, dict[str, Any]]] = {
+Change = Callable[[KnownStateBounds], KnownStateBounds]
+BROKEN: dict[str, tuple[Change, dict[str, Any]]] = {
     "a lost event counts as received": (
-        _misread(lost_are_received=True), {"mansd": 6, **_EVENTFUL},
+        lambda bounds: LostAreReceived(bounds.parts, bounds.delay_s, bounds.disturbances),
+        {"mansd": 6, **_EVENTFUL},
     ),
-    "x of one event before": (_misread(events_late=1), {"mansd": 0, **_EVENTFUL}),
     "no delay": (
-        Mistake(lambda bounds: replace(bounds, delay_s=0.0)),
+        lambda bounds: replace(bounds, delay_s=0.0),
         {"disturbed": False, "n": 1, "m": 1, "mansd": 0, "delay_steps": 4, "sample_steps": 1,
          "hold_steps": 0, "step_share": 0.03},
     ),
-    "no age of the input": (
-        _with_parts(_without_age),
-        {"n": 1, "m": 1, "mansd": 0, "hold_steps": 4, "lag_steps": 2, "step_share": 0.1,
-         **_INSTANT},
-    ),
-    "no start": (
-        _with_constants(start_error=0.0),
-        {"disturbed": False, "known_start": False, "delay_steps": 4, "beta": 0.01,
-         "step_share": 0.03},
-    ),
     "no disturbance": (
-        Mistake(lambda bounds: replace(bounds, disturbances=0 * bounds.disturbances)),
+        lambda bounds: replace(bounds, disturbances=0 * bounds.disturbances),
         {"disturbed": True, "push": 1.0, "beta": 0.01},
-    ),
-    "no noise": (
-        _with_constants(estimation_error=0.0),
-        {"disturbed": True, "noise": 0.1, "push": 0.02, "beta": 0.01},
     ),
 }  # fmt: skip
 
@@ -202,18 +168,21 @@ def _simulate_disturbed(case: Case, rng: np.random.Generator) -> Observed:
     return Observed(RUNS, found.shares(simulate_disturbed(case.loop, rng)))
 
 
-def _disturbed_bounds(certify: Callable[[DisturbedLoop], Sum]) -> Callable[[Case], Bounds | None]:
-    return shares_of(("e_s", "e_c", "x", "u − Kx", "δ"), lambda case: certify(case.loop))
+def _disturbed_bounds(
+    change: Callable[[DisturbedLoop], DisturbedLoop],
+) -> Callable[[Case], Bounds | None]:
+    names = ("e_s", "e_c", "x", "u − Kx", "δ")
+    return shares_of(names, lambda case: change(case.loop).certify())
 
 
 DISTURBED = Kind(
     "disturbed", drawn(disturbed_loops.random_disturbed_loop, {}),
-    _disturbed_bounds(DisturbedLoop.certify), _simulate_disturbed,
+    _disturbed_bounds(lambda loop: loop), _simulate_disturbed,
     {
         name: Broken(
-            _disturbed_bounds(certify), drawn(disturbed_loops.random_disturbed_loop, where)
+            _disturbed_bounds(change), drawn(disturbed_loops.random_disturbed_loop, where)
         )
-        for name, (certify, where) in disturbed_loops.BROKEN.items()
+        for name, (change, where) in disturbed_loops.BROKEN.items()
     },
 )  # fmt: skip
 
@@ -244,22 +213,12 @@ OBSERVED = Kind(
         "no disturbance": _luenberger(
             lambda loop: replace(loop, push=0.0), noise=0.01, push=0.3, beta=0.01
         ),
-        "the plant is the model": _luenberger(
-            lambda loop: replace(loop, A_model=loop.system.A, B_model=loop.system.B),
-            noise=0.001, push=0.002, differs=0.3, known_start=True,
-        ),
         "the first estimate is exact": _luenberger(
             lambda loop: replace(loop, system=replace(loop.system, known_start=True)),
             noise=0.01, push=0.02, known_start=False,
         ),
     },
 )  # fmt: skip
-
-
-def _known_state(mistake: Mistake, case: Case) -> KnownStateBounds:
-    found = mistake.bounds(case.loop.bounds())
-    case.loop = mistake.reading(case.loop)
-    return found
 
 
 def _simulate_known_state(case: Case, rng: np.random.Generator) -> Observed:
@@ -269,17 +228,17 @@ def _simulate_known_state(case: Case, rng: np.random.Generator) -> Observed:
     return search(loop.loop, rng, simulate, lambda _, trace: loop.shares(trace, found))
 
 
-def _known_state_bounds(mistake: Mistake) -> Callable[[Case], Bounds | None]:
-    return shares_of(("x", "e_c"), partial(_known_state, mistake))
+def _known_state_bounds(change: Change) -> Callable[[Case], Bounds | None]:
+    return shares_of(("x", "e_c"), lambda case: change(case.loop.bounds()))
 
 
 KNOWN_STATE = Kind(
     "known state", drawn(random_known_state_loop, {}),
-    _known_state_bounds(Mistake()), _simulate_known_state,
+    _known_state_bounds(lambda bounds: bounds), _simulate_known_state,
     {
         name: Broken(
-            _known_state_bounds(mistake), drawn(random_known_state_loop, where)
+            _known_state_bounds(change), drawn(random_known_state_loop, where)
         )
-        for name, (mistake, where) in BROKEN.items()
+        for name, (change, where) in BROKEN.items()
     },
 )  # fmt: skip
