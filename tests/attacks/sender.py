@@ -98,7 +98,7 @@ def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
         due_s += 1 / rate_hz
 
 
-def _enter(namespace: str) -> None:
+def enter_namespace(namespace: str) -> None:
     """Move this process to a network namespace."""
     with Path(f"/var/run/netns/{namespace}").open() as file:
         if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
@@ -108,7 +108,7 @@ def _enter(namespace: str) -> None:
 def carry_out(plan: Plan) -> Sent:
     """Attack; return the numbers of datagrams."""
     if plan.namespace is not None:
-        _enter(plan.namespace)
+        enter_namespace(plan.namespace)
     draw, sender, sent = random.Random(1), _Sender(plan.forge_addresses), Sent()
     every = [_arms(target, plan.forge_addresses, draw) for target in plan.targets]
     for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):

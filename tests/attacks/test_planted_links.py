@@ -60,24 +60,13 @@ values = [0.5]
 """
 
 
-def symbolic_link(path: Path, private: Path) -> None:
-    path.symlink_to(private)
-
-
-def hard_link(path: Path, private: Path) -> None:
-    path.hardlink_to(private)
-
-
-def fifo(path: Path, _: Path) -> None:
-    os.mkfifo(path)
-
-
-def folder(path: Path, _: Path) -> None:
-    path.mkdir()
-
-
-Plant = Callable[[Path, Path], None]
-PLANTS: Sequence[Plant] = (symbolic_link, hard_link, fifo, folder)
+PLANTS: dict[str, Callable[[Path, Path], None]] = {
+    "symbolic link": Path.symlink_to,
+    "hard link": Path.hardlink_to,
+    "FIFO": lambda path, _: os.mkfifo(path),
+    "folder": lambda path, _: path.mkdir(),
+}
+LINKS = ("symbolic link", "hard link")
 
 
 @pytest.fixture(scope="module")
@@ -103,14 +92,14 @@ def shared(tmp_path: Path) -> Path:
     return path
 
 
-def planted(plant: Plant, shared: Path, names: Sequence[Path], private: Path) -> None:
+def planted(plant: str, shared: Path, names: Sequence[Path], private: Path) -> None:
     for name in names:
         old = name.with_suffix(name.suffix + ".partial")
         for one in (name, old.with_name(f".{old.name}"), name.with_suffix(".partial")):
             path = shared / one
             path.parent.mkdir(parents=True, exist_ok=True)
             if not os.path.lexists(path):
-                plant(path, private)
+                PLANTS[plant](path, private)
 
 
 def untouched(private: Path) -> bool:
@@ -135,43 +124,20 @@ def test_a_command_follows_no_planted_name(
     names = [one.relative_to(shared) for one in shared.rglob("*") if one.is_file()]
     assert names
     # A FIFO or a folder ends a command at the first name; two commands show that.
-    for plant in PLANTS if command.startswith("certify") else (symbolic_link, hard_link):
+    for plant in PLANTS if command.startswith("certify") else LINKS:
         shutil.rmtree(shared)
         shared.mkdir()
         planted(plant, shared, names, private)
         status = invoke()
-        assert untouched(private), plant.__name__
+        assert untouched(private), plant
         if status == 0:
             assert not any((shared / name).is_symlink() for name in names)
             assert all((shared / name).stat().st_nlink == 1 for name in names)
 
 
-def save_of_a_probe(path: Path) -> None:
+def probe_rows(path: Path) -> None:
     with ProbeRows(path, print) as rows:
         rows.add(1, 2)
-
-
-def capture(path: Path) -> None:
-    CaptureWriter(path, [SPEC]).close()
-
-
-def fates(path: Path) -> None:
-    with FateRecorder(path, [SPEC]):
-        pass
-
-
-def recording(path: Path) -> None:
-    with RecordingFile(path, "a", rrb.Blueprint(), indexed=True):
-        pass
-
-
-def ending(path: Path) -> None:
-    with EndingFile(path.parent):
-        pass
-
-
-def spooled(path: Path) -> None:
-    SpoolWriter(path.parent, path.suffix[1:]).append(path.stem, 0, b"rows")
 
 
 def lock_file(path: Path) -> None:
@@ -179,34 +145,35 @@ def lock_file(path: Path) -> None:
         pass
 
 
-def invitation(path: Path) -> None:
-    write_invitation(path, INVITED)
-
-
-def matrices(path: Path) -> None:
-    write_matrices(path, {"A": np.eye(2)})
-
-
-WRITERS: Sequence[tuple[Callable[[Path], None], str]] = (
-    (save_of_a_probe, "trace.csv"), (capture, "a.pcapng"), (fates, "fates.parquet"),
-    (recording, "recording.rrd"), (ending, ENDING_FILE), (spooled, "plant_step.recorder"),
-    (lock_file, ".lock"), (invitation, "invitation.json"), (matrices, "a.npz"), (matrices, "a.mat"),
-)  # fmt: skip
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "trace.csv": probe_rows,
+    ".lock": lock_file,
+    "a.pcapng": lambda path: CaptureWriter(path, [SPEC]).close(),
+    "fates.parquet": lambda path: FateRecorder(path, [SPEC]).__exit__(),
+    "recording.rrd": lambda path: RecordingFile(path, "a", rrb.Blueprint(), indexed=True).close(),
+    ENDING_FILE: lambda path: EndingFile(path.parent).__enter__().__exit__(),
+    "plant_step.recorder": lambda path: SpoolWriter(path.parent, "recorder").append(
+        "plant_step", 0, b"rows"
+    ),
+    "invitation.json": lambda path: write_invitation(path, INVITED),
+    "a.npz": lambda path: write_matrices(path, {"A": np.eye(2)}),
+    "a.mat": lambda path: write_matrices(path, {"A": np.eye(2)}),
+}
 
 
 @needs_root
 @pytest.mark.parametrize("plant", PLANTS)
-@pytest.mark.parametrize(("write", "name"), WRITERS)
+@pytest.mark.parametrize("name", WRITERS)
 def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
-    write: Callable[[Path], None], name: str, plant: Plant, shared: Path, private: Path
+    name: str, plant: str, shared: Path, private: Path
 ) -> None:
     planted(plant, shared, [Path(name)], private)
     for one in shared.iterdir():
-        if plant is not hard_link:
+        if plant != "hard link":
             os.chown(one, NOBODY, NOBODY, follow_symlinks=False)
     with suppress(NoackError, OSError):
-        write(shared / name)
-        assert write is lock_file or not (shared / name).is_symlink()
+        WRITERS[name](shared / name)
+        assert name == ".lock" or not (shared / name).is_symlink()
     assert untouched(private)
 
 

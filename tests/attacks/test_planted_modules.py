@@ -48,13 +48,12 @@ def test_the_live_viewers_process_imports_no_planted_module(planted: Path) -> No
     assert status.startswith("live view: http://127.0.0.1:")
 
 
-@pytest.mark.parametrize("flag", [(), ("-P",)])
-def test_workers_import_no_planted_module(planted: Path, flag: tuple[str, ...]) -> None:
+def test_workers_import_no_planted_module(planted: Path) -> None:
     """The program ``noack`` starts them; its own folder is not the current folder."""
     program = planted.with_name("program.py")
     program.write_text(POOL)
     done = subprocess.run(
-        [sys.executable, *flag, program], capture_output=True, text=True, check=False,
+        [sys.executable, program], capture_output=True, text=True, check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert not planted.exists(), planted.read_text()

@@ -6,16 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
-from noack.core.core_library import LIBRARY, core, ffi, load_core
+from noack.core.core_library import core, ffi
 from noack.trigger.trigger_rule import TriggerRule
 from tests.cosim.simulation.batch.exact import random_population, random_setting
 from tests.trigger_rules import TABLES, area_rule, decaying_rule, random_rule
 
 ANY_DOUBLE = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
-
-
-def test_this_is_another_core_than_noacks() -> None:
-    assert core.noack_sources != load_core(LIBRARY).noack_sources
 
 
 @settings(max_examples=60)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.link_state import LinkState
-from noack.core.core_library import LIBRARY, core, ffi, load_core
+from noack.core.core_library import core, ffi
 from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import NEVER_NS, Decisions, LinkSettings, RecordedDecision
 from tests.netem.any_settings import capped, computable, harsh
@@ -31,10 +31,6 @@ packets = st.lists(
     max_size=60,
 )
 """Row of the flow, size, time since the packet before, and whether it leaves."""
-
-
-def test_this_is_another_core_than_noacks() -> None:
-    assert core.noack_sources != load_core(LIBRARY).noack_sources
 
 
 def test_a_queue_that_cannot_be_served_in_time() -> None:

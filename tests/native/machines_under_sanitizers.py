@@ -119,7 +119,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
         own.handle(Message(own.role.receives, number, t_ns, vector, loop), t_ns)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
@@ -132,15 +132,13 @@ def test_random_machines(
 
 
 @settings(max_examples=15)
-@given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
-def test_large_machines(
-    role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]
-) -> None:
+@given(roles, sizes(64), st.integers(0, 2**16), inputs)
+def test_large_machines(role: str, of: Sizes, seed: int, given_inputs: list[Any]) -> None:
     with np.errstate(all="ignore"):
-        drive(machines_of(role, [(of, seed)], scale), given_inputs)
+        drive(machines_of(role, [(of, seed)], 1e308), given_inputs)
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(roles, sizes(3), st.integers(0, 2**16), inputs, st.data())
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject

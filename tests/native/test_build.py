@@ -47,17 +47,16 @@ def files(native: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in core.iterdir()}
 
 
-@pytest.fixture
-def needs_compiler() -> None:
-    if not any(map(shutil.which, ("cc", "gcc", "clang"))):
-        pytest.skip("there is no C compiler")
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler"
+)
 
 
 def test_the_core_of_this_repository_is_that_of_its_sources() -> None:
     assert is_current(), "run `make setup`"
 
 
-@pytest.mark.usefixtures("needs_compiler")
+@needs_compiler
 def test_it_builds_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
     first = build(copy, "--library")
     assert (first.returncode, first.stderr) == (0, "")
@@ -77,7 +76,7 @@ def test_it_builds_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> 
     assert files(copy)[HEADER] != made[HEADER]
 
 
-@pytest.mark.usefixtures("needs_compiler")
+@needs_compiler
 def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
     build(copy)
     made = files(copy)
@@ -90,21 +89,17 @@ def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
     assert files(copy) == made
 
 
-@pytest.mark.usefixtures("needs_compiler")
-def test_what_a_killed_build_has_left_is_removed(copy: Path) -> None:
+@needs_compiler
+def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
+    """What a killed build has left is removed."""
     left = copy.parent / "core" / ".building-x"
     left.mkdir(parents=True)
     (left / LIBRARY).write_bytes(b"half of")
-    build(copy)
-    assert files(copy).keys() == {LIBRARY, HEADER}
-
-
-@pytest.mark.usefixtures("needs_compiler")
-def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
     with ThreadPoolExecutor() as pool:
         done = list(pool.map(build, [copy, copy]))
     assert [one.returncode for one in done] == [0, 0]
     assert sorted(len(one.stdout.splitlines()) for one in done) == [0, 1]
+    assert files(copy).keys() == {LIBRARY, HEADER}
 
 
 def test_without_a_compiler_it_says_what_to_install(copy: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from noack.core.core_library import (
     pointer_to,
 )
 from noack.core.errors import CallerError
-from noack.impairments.feature import Stage, StageTables
+from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters, RecordedDecision
 from noack.protocol.record_tables import Fate
 from tests.netem.feature_examples import IMPAIRED, names_file
@@ -48,34 +48,24 @@ def test_a_pointer_has_the_address_of_its_array() -> None:
         pointer_to(numbers[::2], "int64_t *")
 
 
-def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_broken_or_other_library_is_refused_in_one_line(tmp_path: Path) -> None:
     own = ffi.string(core.noack_sources())
-    (tmp_path / "other.so").write_bytes(LIBRARY.read_bytes().replace(own, own[::-1]))
-    with pytest.raises(CallerError, match="not of the same sources") as error:
-        load_core(tmp_path / "other.so")
-    assert "make setup" in str(error.value)
+    other = LIBRARY.read_bytes().replace(own, own[::-1])
+    for number, content in enumerate((None, b"", b"no library", other)):
+        path = tmp_path / f"{number}.so"
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(CallerError, match="not of the same" if number == 3 else "") as error:
+            load_core(path)
+        assert str(path) in str(error.value)
+        assert "make setup" in str(error.value)
+        assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no library"])
-def test_a_missing_or_broken_library_is_refused_in_one_line(
-    tmp_path: Path, content: bytes | None
-) -> None:
-    path = tmp_path / "libnoack.so"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(CallerError) as error:
-        load_core(path)
-    assert str(path) in str(error.value)
-    assert "make setup" in str(error.value)
-    assert str(error.value).isprintable()
-
-
-@pytest.mark.parametrize("missing", ["libnoack.so", "_core_header.py"])
-def test_a_command_says_so_without_a_traceback(tmp_path: Path, missing: str) -> None:
+def test_a_command_without_the_core_says_so_without_a_traceback(tmp_path: Path) -> None:
     for package in ("noack", "cosim", "netem", "plant_server", "sensor_node", "controller_node"):
-        ignored = shutil.ignore_patterns("__pycache__", missing if package == "noack" else "")
+        ignored = shutil.ignore_patterns("__pycache__", "_core_header.py")
         shutil.copytree(ROOT / package, tmp_path / package, ignore=ignored)
-    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
     done = subprocess.run(
         [sys.executable, "-c", "from cosim.cli import main; main()", "check", "lane_following"],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100,
@@ -91,11 +81,8 @@ def constants(name: str) -> dict[str, int]:
     return {word: number for number, word in ffi.typeof(f"enum {name}").elements.items()}
 
 
-def test_fates_have_the_same_numbers() -> None:
+def test_python_has_the_numbers_and_fields_of_c() -> None:
     assert constants("noack_fate") == {f"NOACK_{fate.name}": fate.value for fate in Fate}
-
-
-def test_records_have_the_same_fields_in_the_same_order() -> None:
     assert dtype_of("noack_counters").names == tuple(Counters.__dataclass_fields__)
     assert dtype_of("noack_recorded").names == RecordedDecision._fields
 
@@ -107,11 +94,5 @@ def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:
         if number != core.NOACK_STAGE_KINDS
     ]
     assert {path.stem for path in (ROOT / "native" / "impairments").glob("*.c")} == set(kinds)
-    made = {stage.kind for stage in stages()}
-    assert made == set(kinds)
-
-
-def stages() -> list[Stage]:
-    """Return the stages of all examples of the features."""
-    made = (one.stage(StageTables()) for one in IMPAIRED if not names_file(one))
-    return [stage for stage in made if stage is not None]
+    made = [one.stage(StageTables()) for one in IMPAIRED if not names_file(one)]
+    assert {stage.kind for stage in made if stage is not None} == set(kinds)

@@ -49,16 +49,10 @@ def test_it_does_what_the_plain_network_does(
     arriving: Sequence[tuple[int, int, int, bool]],
     number: int,
 ) -> None:
-    names = "update", "actuation"
-    forward, reverse = (
-        Link(one, 5, name, first_number=number)
-        for one, name in zip((first, second), names, strict=True)
-    )
+    named = (first, 5, "update"), (second, 5, "actuation")
+    forward, reverse = (Link(*one, first_number=number) for one in named)
     expected = Duplex(forward, reverse, first_number=number, loops=LOOPS)
-    links = [
-        LinkState(one, 5, name, rows=LOOPS)
-        for one, name in zip((first, second), names, strict=True)
-    ]
+    links = [LinkState(*one, rows=LOOPS) for one in named]
     channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))
     now_ns, rng = 0, np.random.default_rng(1)
     for k, (flow, size, step_ns, leaves) in enumerate(arriving):

@@ -20,8 +20,6 @@ from noack.impairments.loss_prediction import (
 )
 from noack.protocol.record_tables import Fate
 
-DECISIONS = 500_000
-
 
 @pytest.mark.parametrize(
     "words",
@@ -32,18 +30,8 @@ DECISIONS = 500_000
     ],
 )
 def test_the_realised_loss_is_the_asked_one(decide: Any, words: str) -> None:
-    fates = decide(words, DECISIONS, seed=3).fates
-    lost = float(np.mean(~np.isin(fates, (Fate.DELIVERED, Fate.FORCED))))
-    assert lost == pytest.approx(float(words.split("%")[0].split()[1]) / 100, abs=2e-3)
-
-
-def test_the_rate_is_continuous_with_a_correlation() -> None:
-    """The chain of a correlation has states that hardly ever occur."""
-    words = "loss {p}% 50% mansd 3 atmost 3 in 10 corrupt 5%"
-    rates = [expected_loss(settings_of(words.format(p=p))).rate or 0.0 for p in (45, 50, 55)]
-    steps = np.diff(rates)
-    assert (steps > 0).all()
-    assert steps.max() < 0.05
+    lost = ~np.isin(decide(words, 500_000, seed=3).fates, (Fate.DELIVERED, Fate.FORCED))
+    assert lost.mean() == pytest.approx(float(words.split("%")[0].split()[1]) / 100, abs=2e-3)
 
 
 def test_the_closed_form_is_inverted() -> None:
@@ -67,30 +55,24 @@ def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> N
             with_kept_loss(settings_of(other))
 
 
-@pytest.mark.parametrize("others", ["", "loss script 0,2,10,11 every 12", "corrupt 10%"])
+@pytest.mark.parametrize("others", ["loss script 0,2,10,11 every 12", "corrupt 10%"])
 def test_no_smaller_probability_gives_the_asked_rate(others: str) -> None:
     guarantee = "atmost 3 in 11 recover 3"
     (found,) = found_probabilities(settings_of(f"loss 26% keep {others} {guarantee}")).values()
-    smaller = np.linspace(0, found, 12)[:-1]
-    rates = [predict(settings_of(f"loss {100 * p}% {others} {guarantee}")).rate for p in smaller]
-    assert max(rate or 0.0 for rate in rates) < 0.26
+    for p in np.linspace(0, found, 12)[:-1]:
+        assert (predict(settings_of(f"loss {100 * p}% {others} {guarantee}")).rate or 0.0) < 0.26
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("loss 81% keep mansd 4", "impossible with this guarantee, which allows at most 80%"),
-        ("loss 41% keep mansd 2 recover 3", "with this guarantee, which allows at most 40%"),
         ("loss 10% keep loss 20%", "impossible, the other impairments lose 20% already"),
         ("loss 10% keep loss 10% keep", "only one loss of a direction can be kept"),
         ("loss 10% keep blackout 1s-2s", "cannot be predicted: losses in a blackout"),
-        ("loss 10% keep atmost 20 in 100", "cannot be predicted: impairments and guarantee"),
     ],
 )
 def test_what_is_impossible_is_refused_in_one_line(words: str, message: str) -> None:
-    with pytest.raises(CallerError) as refused:
-        read_files(settings_of(words), Path(), "links.toml: link.0.forward")
-    text = str(refused.value)
-    assert text.startswith("links.toml: link.0.forward: loss ")
-    assert message in text
-    assert "\n" not in text
+    where = "links.toml: link.0.forward: loss "
+    with pytest.raises(CallerError, match=f"^{where}.*{message}[^\n]*$"):
+        read_files(settings_of(words), Path(), where.removesuffix(": loss "))

@@ -9,7 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from netem import link_state
+from netem.link_state import LinkState
 from netem.tc_words import settings_of
+from noack.core.core_library import address_of
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -68,9 +72,6 @@ def drain(link: Link) -> list[tuple[int, Outputs]]:
     return found
 
 
-# Inputs that determine a flow's fates.
-
-
 @given(
     st.sampled_from([*LOSSES, ALL_TIMELESS]), st.none() | st.integers(0, 4),
     st.lists(st.tuples(st.integers(0, 3), st.integers(0, 10**12)), max_size=60),
@@ -97,21 +98,14 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
 
 @pytest.mark.parametrize("words", LOSSES[:-1])
 def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
+    """Which no other impairment changes."""
     sequences = [
         tuple(fates(Link(settings_of(words), seed, *name), flow, 100))
         for seed, name, flow in itertools.product((5, 6), (("a",), ("b",), ("a", "b")), (0, 1))
     ]
     assert len(set(sequences)) == 12
-    assert tuple(fates(Link(settings_of(words), 5, "a"), 0, 100)) == sequences[0]
-
-
-@pytest.mark.parametrize("cap", ["", "mansd 2"])
-@pytest.mark.parametrize("other", ["duplicate 50%", "delay 10ms 5ms", "corrupt 0%"])
-def test_adding_an_impairment_does_not_change_the_losses(cap: str, other: str) -> None:
-    loss = "loss 40% 70%"
-    alone = fates(new_link(f"{loss} {cap}"), 0, 300)
-    assert alone == fates(new_link(f"{other} {loss} {cap}"), 0, 300)
-    assert alone == fates(new_link(f"{loss} {other} {cap}"), 0, 300)
+    for one in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
+        assert tuple(fates(new_link(one), 0, 100)) == sequences[0]
 
 
 @pytest.mark.parametrize(
@@ -148,21 +142,6 @@ def test_another_probability_changes_no_other_randomness(
     assert all(count > 50 for name, count in compared.items() if name != its_own)
 
 
-def test_neither_payload_nor_size_changes_the_losses() -> None:
-    small, large = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
-    same, other = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
-    for k in range(100):
-        losses = [link.decide(0, size, 0).fate == 1 for link, size in ((small, 0), (large, 10 * k))]
-        assert losses[0] == losses[1]
-        (one,) = rows_of(same.handle(Datagram(0, bytes(k)), 0))
-        (two,) = rows_of(other.handle(Datagram(0, bytes([k]) * k), 0))
-        for name in ("fate", "release_ns", "copy_ns", "bit"):
-            assert one[name] == two[name]
-
-
-# The fate of a datagram.
-
-
 def test_a_stale_datagram_is_recorded_as_such() -> None:
     link = new_link("delay 10ms gap 2 mansd 3")
     link.handle(Datagram(0, b"first"), 0)
@@ -173,22 +152,20 @@ def test_a_stale_datagram_is_recorded_as_such() -> None:
     assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
 
 
-@pytest.mark.parametrize("copies", [False, True])
-def test_the_limit_bounds_the_datagrams_in_flight(copies: bool) -> None:
-    link = new_link(f"{'duplicate 100%' * copies} delay 10ms limit 5")
-    found = fates(link, 0, 20)
-    assert found.count(Fate.OVERFLOWED) == (17 if copies else 15)
+@pytest.mark.parametrize(
+    ("words", "overflowed"),
+    [
+        ("delay 10ms", 15),
+        ("duplicate 100% delay 10ms", 17),
+        ("duplicate 100% delay 10ms reorder 100% mansd 3", 0),  # only copies are delayed
+    ],
+)
+def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflowed: int) -> None:
+    link = new_link(f"{words} limit 5")
+    assert fates(link, 0, 20).count(Fate.OVERFLOWED) == overflowed
     assert link.counters.most_in_flight == 5
     assert len(drain(link)) == 5
     assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
-
-
-def test_the_limit_also_bounds_copies_of_undelayed_datagrams() -> None:
-    link = new_link("duplicate 100% delay 10ms reorder 100% mansd 3 limit 5")
-    for k in range(20):
-        link.handle(Datagram(0, b"x"), k)
-    assert link.counters.delivered == 20
-    assert link.counters.most_in_flight == 5
 
 
 @given(st.lists(st.integers(0, 2), max_size=60), st.none() | st.integers(0, 3))
@@ -204,9 +181,6 @@ def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> 
     assert list(counted) == [found.count(fate) for fate in Fate]
     assert of.received == len(order)
     assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
-
-
-# The link of a scenario.
 
 
 @pytest.mark.parametrize(
@@ -226,3 +200,18 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
     link = update_link_of(resolve(validate(content, "here")))
     found = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
     assert found == expected
+
+
+def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = LinkState(settings_of("delay 1ms"), 1, "any")
+    link.start_flow(0, 0)
+    begin = address_of(link.core.memory), address_of(link.core.stages)
+
+    def refuse(wrong: object) -> None:
+        raise ValueError("link: refused")
+
+    monkeypatch.setattr(link_state, "_require", refuse)
+    with pytest.raises(ValueError, match="refused"):
+        link.change(LinkSettings(), np.full(1, NEVER_NS))
+    assert (link._memory["memory"].ctypes.data, address_of(link._stages)) == begin
+    assert link.decide(0, 72, 0).release_ns == MS

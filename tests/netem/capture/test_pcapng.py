@@ -16,11 +16,6 @@ from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
 from tests.netem.capture.reader import Datagram, datagram, read
 
 
-def comment_of(**fields: Any) -> str:
-    (packet,) = read(file_of(fields)).packets
-    return packet.comment
-
-
 @given(st.lists(events, max_size=5))
 def test_an_independent_reader_finds_what_was_written(described: list[dict[str, Any]]) -> None:
     packets = read(file_of(*described)).packets
@@ -30,13 +25,8 @@ def test_an_independent_reader_finds_what_was_written(described: list[dict[str, 
         assert packet.t_ns == event["t_ns"]
         assert packet.original_bytes == len(packet.frame)
         assert packet.options[2] == [struct.pack("<I", 2 if event["departure"] else 1)]
-        assert datagram(packet.frame) == Datagram(
-            event["source"],
-            event["destination"],
-            event["source_port"],
-            event["destination_port"],
-            event["payload"],
-        )
+        names = ("source", "destination", "source_port", "destination_port", "payload")
+        assert datagram(packet.frame) == Datagram(*(event[name] for name in names))
         name = DIRECTIONS[event["direction"]]
         assert packet.comment.endswith(f"; {name}, flow {event['flow']}, packet {event['packet']}")
 
@@ -75,29 +65,20 @@ LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
 @pytest.mark.parametrize(
     ("fields", "comment"),
     [
-        ({}, "delivered"),
         (LOST, "dropped by the loss model, consecutive loss 2"),
         (LOST | {"mansd": 4}, "dropped by the loss model, consecutive loss 2, cap 4"),
-        (LOST | {"delay_ns": 10, "hold_back_ns": 10},
-         "dropped by the loss model, consecutive loss 2"),
-        ({"fate": Fate.FORCED}, "forced: delivered by the cap"),
         ({"fate": Fate.FORCED, "packet": 0, "mansd": 4},
          "forced: delivered as the first of its flow"),
         ({"fate": Fate.FORCED, "mansd": 4, "delay_ns": 10_000_000},
          "forced: delivered by the cap of 4 consecutive losses, delayed 10 ms"),
-        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "mansd": 4, "delay_ns": 1_000_000},
-         "corrupted in bit 513, consecutive loss 1, cap 4, delayed 1 ms"),
-        ({"fate": 4, "consecutive_losses": 1, "mansd": 1},
-         "dropped by a full queue, consecutive loss 1, cap 1"),
+        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "delay_ns": 1_000_000},
+         "corrupted in bit 513, consecutive loss 1, delayed 1 ms"),
+        ({"fate": 4, "consecutive_losses": 1}, "dropped by a full queue, consecutive loss 1"),
         ({"fate": 5, "consecutive_losses": 12}, "dropped in a blackout, consecutive loss 12"),
         ({"fate": 99}, "unknown fate"),
-        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "consecutive_losses": 1, "mansd": 4},
+        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "mansd": 4},
          "delivered, delayed 12.345 ms, held back 1.2 ms for the guarantee"),
-        ({"departure": 1, "delay_ns": 12_345_678}, "delivered, after 12.346 ms"),
         ({"departure": 1, "delay_ns": -5}, "delivered, after 0 ms"),
-        ({"departure": 1, "copy": 1, "delay_ns": 499}, "copy, delivered, after 0 ms"),
-        ({"departure": 1, "stale": 1, "delay_ns": 50_000},
-         "delivered out of order (stale), after 0.05 ms"),
         ({"departure": 1, "fate": 3, "bit": 0, "stale": 1, "delay_ns": 10**18},
          "corrupted in bit 0, delivered out of order (stale), after 1000000000000 ms"),
         ({"departure": 1, "copy": 1, "bit": 8, "delay_ns": 1000},
@@ -105,22 +86,8 @@ LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
     ],
 )  # fmt: skip
 def test_the_comment_describes_the_fate(fields: dict[str, Any], comment: str) -> None:
-    packet = fields.get("packet", 17)
-    assert comment_of(**fields) == f"{comment}; forward, flow 3, packet {packet}"
-
-
-def test_a_datagram_has_the_same_number_on_both_interfaces() -> None:
-    seen = [
-        {"interface": 0},
-        {"interface": 1, "departure": 1},
-        {"interface": 1, "departure": 1, "copy": 1},
-        {"interface": 1, "direction": 1},
-        {"interface": 0, "packet": 18},
-        {"interface": 0, "flow": 4},
-    ]
-    numbers = [packet.options[5][0] for packet in read(file_of(*seen)).packets]
-    assert numbers[0] == numbers[1] == numbers[2]
-    assert len(set(numbers)) == 4
+    (packet,) = read(file_of(fields)).packets
+    assert packet.comment == f"{comment}; forward, flow 3, packet {fields.get('packet', 17)}"
 
 
 def test_a_checksum_of_0_is_sent_as_ffff() -> None:

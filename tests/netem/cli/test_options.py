@@ -27,15 +27,11 @@ def specs(arguments: str) -> tuple[LinkSpec, ...]:
     ("arguments", "forward", "reverse", "more"),
     [
         ("", "", "", {}),
-        ("loss 5% mansd 4", "loss 5% mansd 4", "", {}),
         ("'loss 5%' 'mansd 4'", "loss 5% mansd 4", "", {}),
         ("rate 1mbit -14", "rate 1mbit -14", "", {}),
-        ("loss 5% --reverse delay 3ms", "loss 5%", "delay 3ms", {}),
         ("--reverse 'delay 3ms' --seed 3", "", "delay 3ms", {"seed": 3}),
         ("--both loss 5%", "loss 5%", "loss 5%", {}),
-        ("loss 5% --both", "loss 5%", "loss 5%", {}),
         ("loss 5% --seed 7 delay 1ms", "loss 5% delay 1ms", "", {"seed": 7}),
-        ("loss 5% seed 7", "loss 5%", "", {"seed": 7}),
         ("--one-way --idle 500ms", "", "", {"return_path": False, "idle_s": 0.5}),
     ],
 )
@@ -70,27 +66,18 @@ def test_addresses(listen: str, to: str, addresses: tuple[Any, Any]) -> None:
         ("loss 5%", "an emulator on its own needs --listen and --to, or --links"),
         ("--listen x --to :9", "--listen: expected HOST:PORT, e.g. 127.0.0.1:9000"),
         ("--listen :0 --to 'no such:9'", "--to: no such: no such host"),
-        ("-a --reverse lsos 5%", "lsos: no such word; did you mean loss?"),
         ("-a --reverse seed 5", "seed 5: belongs to the link"),
         ("-a --seed -1", "--seed -1: must be 0 or more"),
         ("-a --seed 1 seed 1", "--seed 1: the words have seed 1 already"),
         ("-a --both --reverse loss 5%", "--reverse and --both exclude each other"),
         ("-a --one-way --reverse loss 5%", "--one-way: no reverse direction"),
-        ("-a --idle 5", "--idle 5: expected a time in s, ms, us or ns"),
         ("-a --idle 0", "--idle 0: must be more than 0"),
         ("-a loss trace no.txt", "no.txt: cannot be read: No such file"),
         ("-a --loss bernoulli:0.3", "--loss: write words without the dashes, e.g. loss 30%"),
-        ("-a --mansd=4", "--mansd=4: write words without the dashes, e.g. mansd 4"),
-        ("-a --reverse --delay 5ms", "--delay: write words without the dashes"),
         ("-a -loss 5%", "-loss: write words without the dashes"),
         ("-a loss bernoulli:0.3", "loss bernoulli:0.3: no such word; here it is loss 30%"),
-        ("-a loss gilbert_elliott",
-         "loss gilbert_elliott: no such word; here it is loss gemodel 1% 10%"),
         ("--session x loss 5%", "--session joins a run and allows only --json"),
-        ("--session=noack --idle 5s", "--session joins a run and allows only --json"),
-        ("--links no.toml", "no.toml: no such file"),
         ("--links no.toml loss 5%", "words: with --links, set this in the file"),
-        ("--links no.toml --one-way", "--one-way: with --links, set this in the file"),
     ],
 )  # fmt: skip
 def test_a_mistake_gets_one_line(arguments: str, line: str) -> None:
@@ -103,7 +90,7 @@ def test_a_mistake_gets_one_line(arguments: str, line: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("-a lsos 5%", "lsos: no such word; did you mean loss?\n"),
+        ("-a lsos 5% --json", "lsos: no such word; did you mean loss?\n"),
         ("-a --capture - --json", "--capture -: --json and --stats"),
         ("-a --stats 0", "--stats 0: must be 0.01 s or more"),
         ("-a --record-fates a.parquet --replay-fates ./a.parquet", "--replay-fates "),
@@ -123,7 +110,7 @@ def test_a_mistake_ends_the_program(
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("columns", ["120", "80", "60"])
+@pytest.mark.parametrize("columns", ["120", "60"])
 def test_the_examples_of_the_help_are_valid(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: str
 ) -> None:
@@ -138,22 +125,13 @@ def test_the_examples_of_the_help_are_valid(
         assert specs(line.removeprefix("  noack netem "))
 
 
-def test_the_help_has_every_word() -> None:
+def test_every_word_is_in_the_help_and_has_an_example() -> None:
     text = parser().format_help()
     for word in (*KEYWORDS, *LOSS_WORDS):
         # The documentation lists these synonyms.
         assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
-
-
-@pytest.mark.parametrize(("word", "example"), EXAMPLES.items())
-def test_each_word_occurs_in_its_example(word: str, example: str) -> None:
-    assert parse(example)
     synonyms = {"drop": "loss", "random": "loss", "latency": "delay", "jitter": "delay"}
-    assert synonyms.get(word, word) in example.split()
-
-
-def test_each_word_except_options_has_an_example() -> None:
+    for word, example in EXAMPLES.items():
+        assert parse(example)
+        assert synonyms.get(word, word) in example.split()
     assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
-    options = {word for group in parser()._action_groups for action in group._group_actions
-               for word in action.option_strings}  # fmt: skip
-    assert not {f"--{word}" for word in EXAMPLES} & options

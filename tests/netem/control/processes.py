@@ -3,9 +3,7 @@
 import os
 import pty
 import select
-import signal
 import socket
-import subprocess
 import sys
 import termios
 import time
@@ -14,7 +12,6 @@ from contextlib import contextmanager
 
 import pytest
 
-Address = tuple[str, int]
 _PATIENCE_S = 60.0
 
 
@@ -30,45 +27,12 @@ def read_until(descriptor: int, done: Callable[[str], bool]) -> str:
     return text.decode(errors="replace")
 
 
-def address_in(text: str) -> Address | None:
-    """Return the listening address from an emulator's output, or None."""
-    for line in text.splitlines(keepends=True):
-        if "Ctrl-C ends\n" in line:
-            host, _, port = line.removeprefix("noack netem: ").split(" ")[0].rpartition(":")
-            return host, int(port)
-    return None
-
-
 @contextmanager
-def emulator(
-    to: Address, *arguments: str, status: int = 0
-) -> Iterator[tuple[Address, subprocess.Popen[bytes]]]:
-    """Run an emulator; yield its address and its process. SIGINT ends it."""
-    command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to"]
-    with subprocess.Popen(
-        [*command, f"{to[0]}:{to[1]}", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        try:
-            assert process.stderr is not None
-            text = read_until(process.stderr.fileno(), lambda text: address_in(text) is not None)
-            address = address_in(text)
-            assert address is not None
-            yield address, process
-            process.send_signal(signal.SIGINT)
-            assert process.wait(_PATIENCE_S) == status
-        finally:
-            process.kill()
-
-
-@contextmanager
-def udp_socket(to: Address | None = None) -> Iterator[socket.socket]:
+def udp_socket() -> Iterator[socket.socket]:
     """A socket on loopback with a long timeout."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.settimeout(_PATIENCE_S)
-        if to is None:
-            endpoint.bind(("127.0.0.1", 0))
-        else:
-            endpoint.connect(to)
+        endpoint.bind(("127.0.0.1", 0))
         yield endpoint
 
 

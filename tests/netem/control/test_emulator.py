@@ -11,17 +11,16 @@ from netem.control.control_server import running
 from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
-from tests.netem.control.processes import emulator, udp_socket
+from tests.netem.conftest import Emulate
+from tests.netem.control.processes import udp_socket
 from tests.netem.fates.links import spec_of
 
 
-def test_a_cap_set_at_runtime_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
     sent = [number.to_bytes(2) for number in range(320)]
-    with (
-        udp_socket() as server,
-        emulator(server.getsockname(), "--control", "lab") as (address, _),
-        udp_socket(address) as client,
-    ):
+    with udp_socket() as server, udp_socket() as client:
+        emulator = emulate("{}:{}".format(*server.getsockname()), "--control", "lab")
+        client.connect((emulator.host, emulator.port))
         assert running() == ["lab"]
         for payload in sent[:20]:
             client.send(payload)
@@ -52,7 +51,7 @@ def test_a_cap_set_at_runtime_is_kept(capsys: pytest.CaptureFixture[str]) -> Non
             "noack netem set: relay forward no longer has mansd 2; the words replaced "
             "all settings\n"
         )
-
+        emulator.finish()
     assert running() == []
 
 

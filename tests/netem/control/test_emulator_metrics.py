@@ -45,7 +45,8 @@ class Fixed:
 def test_metrics_are_the_statistics(relay: FakeRelay) -> None:
     counters = relay.counters["up", "forward"]
     counters.received, counters.dropped, counters.delivered = 10, 3, 7
-    found = statistics(CommandQueue(relay).look())
+    commands = CommandQueue(relay)
+    found = statistics(commands.look())
     values = values_of(exposed(Fixed(lambda: metrics(found))))
     assert values["noack_netem_received_datagrams_total,forward,up"] == 10
     assert values["noack_netem_datagrams_total,dropped,forward,up"] == 3
@@ -57,12 +58,8 @@ def test_metrics_are_the_statistics(relay: FakeRelay) -> None:
     for cause, count in unintended.items():
         labels = ",".join(sorted([cause, "forward", "up"]))
         assert values[f"noack_netem_unintended_losses_total,{labels}"] == count
-
-
-def test_a_relay_that_has_ended_has_no_metrics(relay: FakeRelay) -> None:
-    commands = CommandQueue(relay)
     commands.close()
-    assert list(EmulatorMetrics(commands).collect()) == []
+    assert list(EmulatorMetrics(commands).collect()) == []  # of a relay that has ended
 
 
 def test_an_emulator_serves_its_metrics_and_ends_beside_a_slow_reader(

@@ -9,27 +9,24 @@ from pathlib import Path
 import pytest
 
 from netem.control.control_server import running
+from netem.control.emulator_statistics import CommandQueue
 from netem.stand_alone import attached
-from noack.core.errors import CallerError
+from netem.tc_words import settings_of
+from noack.core.errors import CallerError, PeerError
 from tests.netem.control.processes import press_q, read_until, terminal
 from tests.netem.control.relays import FakeRelay, options
 
 
-@pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "0.001"])
-def test_an_invalid_period_is_refused(period: str) -> None:
-    with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):
-        options("--stats", period)
-
-
-def test_json_lines_and_view_on_one_terminal_are_refused() -> None:
+def test_invalid_options_are_refused_before_the_relay_runs(relay: FakeRelay) -> None:
+    for period in ("0", "-1", "nan", "inf", "0.001"):
+        with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):
+            options("--stats", period)
     with pytest.raises(CallerError, match="both use standard output"):
         options("--stats", "1", "--view")
-
-
-def test_an_unwritable_file_is_reported_before_the_relay_runs(relay: FakeRelay) -> None:
+    nowhere = options("--stats-file", "/nowhere/x")
     with (
         pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
-        attached(relay, options("--stats-file", "/nowhere/x")),
+        attached(relay, nowhere),
     ):
         pass
 
@@ -86,3 +83,40 @@ def test_the_view_shows_the_relay_and_later_messages_until_q(
             assert drawn.exception() is None
         read_until(user, lambda text: "forward →" in text.partition("\x1b[?1049l")[2])
     assert capsys.readouterr().err == "a message\n"
+
+
+def test_commands_run_in_the_thread_of_the_relay(relay: FakeRelay, commands: CommandQueue) -> None:
+    """Their errors are raised at their callers."""
+    commands.snapshot()
+    commands.change("up", ["forward"], settings_of("loss 50%"))
+    (thread,) = relay.threads
+    assert thread != threading.get_ident()
+    for error in (CallerError("no"), TimeoutError("its own")):
+
+        def refuse(error: Exception = error) -> None:
+            raise error
+
+        with pytest.raises(type(error), match=str(error)):
+            commands.submit(refuse)
+    assert commands.submit(lambda: 7) == 7
+
+
+def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> None:
+    commands = CommandQueue(relay)
+    with ThreadPoolExecutor() as threads:
+        asked = threads.submit(commands.snapshot)
+        while not asked.done():
+            commands.close()  # before or after the thread submits its command
+    assert str(asked.exception()) == "the emulator has ended"
+    assert commands.look().links[0].name == "up"
+
+
+def test_a_command_to_a_stuck_relay_times_out(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("netem.control.emulator_statistics._PATIENCE_S", 0.01)
+    commands = CommandQueue(relay)
+    with pytest.raises(PeerError, match="has not answered for"):
+        commands.snapshot()
+    commands.run_pending()  # commands that have timed out do not run
+    assert relay.threads == set()

@@ -1,6 +1,7 @@
 """Fate traces that are damaged or not written by an emulator give one error line."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,16 @@ def with_values(column: str, values: Callable[[list[Any]], list[Any]]) -> pa.Tab
     return TABLE.set_column(at, field, pa.array(values(TABLE[column].to_pylist()), field.type))
 
 
-def test_the_undamaged_trace_is_accepted(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     assert len(read_fates(write(tmp_path / "a", TABLE)).decisions["up", "forward"]) == 2
+    assert re.search(r"cannot be read \(.*No such file", refused(tmp_path / "none"))
+    assert "cannot be read" in refused(tmp_path)
+    (tmp_path / "a").write_text("fates")
+    assert "not a fate trace, or incomplete" in refused(tmp_path / "a")
+    pq.write_table(pa.table({"a": [1]}), tmp_path / "a")
+    assert "not a fate trace of this program" in refused(tmp_path / "a")
+    other = write(tmp_path / "a", TABLE, {"format": 9, "version": "9.9"})
+    assert "has the format of noack 9.9; record it again" in refused(other)
 
 
 @pytest.mark.parametrize(
@@ -63,24 +72,10 @@ def test_an_impossible_decision_is_refused(column: str, value: int, tmp_path: Pa
     assert f"{column} {value}" in line
 
 
-@pytest.mark.parametrize(
-    ("packets", "message"),
-    [([0, 3], "expected packet 1, found 2"), ([0, 0], "expected packet 1, found 0")],
-)
-def test_a_missing_or_repeated_packet_is_refused(
-    packets: list[int], message: str, tmp_path: Path
-) -> None:
-    table = TABLE.take(packets)
-    assert f"up forward: flow 0: {message}; an incomplete trace" in refused(
-        write(tmp_path / "a", table)
-    )
-
-
-def test_another_format_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a", TABLE, {"format": 9, "version": "9.9"})
-    assert "has the format of noack 9.9; record it again" in refused(path)
-
-
-def test_a_missing_value_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_repeated_packet_or_value_is_refused(tmp_path: Path) -> None:
+    for packets, message in (([0, 3], "expected packet 1, found 2"), ([0, 0], "found 0")):
+        line = refused(write(tmp_path / "a", TABLE.take(packets)))
+        assert "up forward: flow 0: expected packet 1" in line
+        assert f"{message}; an incomplete trace" in line
     table = with_values("delay_ns", lambda values: [*values[:-1], None])
     assert "an incomplete trace cannot be replayed" in refused(write(tmp_path / "a", table))

@@ -22,7 +22,7 @@ from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 
 from netem.emulator_options import LINK_NAME
 from netem.tc_words import settings_of
-from tests.netem.programs.conftest import FORWARDED, Emulate
+from tests.netem.conftest import FORWARDED, Emulate
 from tests.oracles.link import Link
 
 TIMEOUT_S = 0.03
@@ -43,14 +43,6 @@ CASES = {
     "random": Case("loss 70% mansd 2", "loss 70% mansd 2", 3 * 3),
     "bursts": Case("loss gemodel 30% 20% mansd 2", "loss gemodel 30% 20% mansd 1", 3 * 2),
 }
-
-
-class Asked(NamedTuple):
-    """A question; tries are numbered from 0 over all questions."""
-
-    first: int
-    answered: int
-    """The try that was answered first."""
 
 
 class Zone(BaseResolver):
@@ -88,7 +80,8 @@ class Client:
         self._socket.connect((host, port))
         self.tries = 0
 
-    def ask(self, number: int) -> Asked:
+    def ask(self, number: int) -> tuple[int, int]:
+        """Return the first try of the question, and that which was answered first."""
         first = self.tries
         while True:
             question = DNSRecord.question(f"{number}.example")
@@ -100,7 +93,7 @@ class Client:
                     answer = DNSRecord.parse(self._socket.recv(512))
                     if answer.header.id >= first:
                         assert str(answer.a.rdata) == f"192.0.2.{number}"
-                        return Asked(first, answer.header.id)
+                        return first, int(answer.header.id)
 
     def close(self) -> None:
         self._socket.close()
@@ -120,8 +113,9 @@ def passes(link: Link) -> bool:
     return link.decide(0, 30, 0).fate in FORWARDED
 
 
-def ask(emulate: Emulate, case: Case) -> list[Asked]:
-    """Ask all questions; check that the answered tries are those that ``answered`` predicts."""
+def test_the_tries_of_a_client_reach_the_bound(emulate: Emulate) -> None:
+    """And the answered tries are those that ``answered`` predicts."""
+    case = CASES["worst"]
     with dns_server() as server:
         emulator = emulate(server, case.forward, "--reverse", case.reverse)
         with closing(Client(emulator.host, emulator.port)) as client:
@@ -129,18 +123,9 @@ def ask(emulate: Emulate, case: Case) -> list[Asked]:
         link = emulator.finish()
     assert link["forward"]["received"] == client.tries
     got = list(islice(answered(case), client.tries))
-    assert [one.answered for one in asked] == [got.index(True, one.first) for one in asked]
-    return asked
-
-
-def test_the_tries_of_a_client_reach_the_bound(emulate: Emulate) -> None:
-    needed = [one.answered - one.first + 1 for one in ask(emulate, CASES["worst"])]
-    assert max(needed) == needed[0] == CASES["worst"].most
-
-
-def test_without_a_cap_the_number_of_tries_exceeds_the_bound() -> None:
-    uncapped = Case("loss 85%", "loss 85%", 0)
-    assert list(islice(answered(uncapped), 100)).index(True) >= CASES["random"].most
+    assert [last for _, last in asked] == [got.index(True, first) for first, _ in asked]
+    needed = [last - first + 1 for first, last in asked]
+    assert max(needed) == needed[0] == case.most
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())

@@ -11,21 +11,19 @@ from asyncio.subprocess import PIPE
 from asyncio.subprocess import Process as AsyncProcess
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import pairwise
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import pytest
 from psutil import NoSuchProcess, Process
 
-from tests.netem.programs.conftest import FORWARDED, Emulate, Emulator
+from tests.netem.conftest import FORWARDED, Emulate, Emulator
 from tests.netem.programs.ports import HOST, open_server
 
 pytestmark = pytest.mark.skipif(shutil.which("iperf3") is None, reason="iperf3 is not installed")
 
 WORDS = "delay 20ms 8ms loss 5% duplicate 3% mansd 5 first"
 """The first datagram of a stream opens it, and iperf3 does not repeat it."""
-ATTEMPTS = 3
-"""Attempts to measure a jitter, because a stall of the machine adds jitter."""
 
 
 class Counts(NamedTuple):
@@ -37,37 +35,24 @@ class Counts(NamedTuple):
     out_of_order: int
 
 
-class Departure(NamedTuple):
-    """A departed datagram or copy."""
-
-    due_ns: int
-    packet: int
-    delay_ns: int
-
-
-def departures_of(fates: Iterable[dict[str, Any]]) -> list[Departure]:
-    """Return the departures in the order of their due times."""
-    departures = [
-        Departure(row["arrival_ns"] + row[field], row["packet"], row[field])
-        for row in fates
-        for field in ("delay_ns", "copy_delay_ns")
-        if row["fate"] in FORWARDED and row[field] >= 0
-    ]
-    return sorted(departures, key=lambda departure: departure.due_ns)  # a stable order
-
-
-def counted(departures: Iterable[Departure]) -> Iterator[Counts]:
+def counted(fates: Iterable[dict[str, Any]]) -> Iterator[Counts]:
     """Yield a receiver's counters after each datagram, by iperf3's manual and source.
 
     iperf3 counts a gap in the numbers as losses; a datagram out of order reduces this count by one.
     Datagram 0 of a flow only opens the stream.
     """
+    departures = [
+        (row["arrival_ns"] + row[field], row["packet"])
+        for row in fates
+        for field in ("delay_ns", "copy_delay_ns")
+        if row["fate"] in FORWARDED and row[field] >= 0
+    ]
     counts = Counts(0, 0, 0)
-    for departure in departures:
+    for _, packet in sorted(departures, key=itemgetter(0)):  # a stable order
         newest, lost, out_of_order = counts
-        if departure.packet > newest:
-            counts = Counts(departure.packet, lost + departure.packet - newest - 1, out_of_order)
-        elif departure.packet > 0:
+        if packet > newest:
+            counts = Counts(packet, lost + packet - newest - 1, out_of_order)
+        elif packet > 0:
             counts = Counts(newest, max(lost - 1, 0), out_of_order + 1)
         yield counts
 
@@ -141,30 +126,19 @@ async def measure(emulate: Emulate, *options: str) -> tuple[dict[str, Any], Emul
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_iperf3_reports_the_losses_order_and_jitter_of_the_emulator(
+def test_iperf3_reports_the_losses_and_the_order_of_the_emulator(
     emulate: Emulate, direction: str
 ) -> None:
-    for _ in range(ATTEMPTS):
-        options = ["--reverse"] if direction == "reverse" else []
-        report, emulator = asyncio.run(measure(emulate, *options))
-        link = emulator.finish()[direction]
-        assert link["longest_loss_burst"] <= 5
-        assert min(link["fates"]["dropped"], link["duplicated"]) > 0
-        departures = departures_of(emulator.fates(direction))
-        receiver = report if direction == "reverse" else report["server_output_json"]
-        udp = receiver["end"]["streams"][0]["udp"]
-        # The final report has the number sent; the intervals have increments of the newest number.
-        newest = sum(one["streams"][0]["packets"] for one in receiver["intervals"])
-        states = list(counted(departures))
-        # iperf3's receiver stops at the end message over TCP and may leave datagrams unread.
-        read = states.index(Counts(newest, udp["lost_packets"], udp["out_of_order"])) + 1
-        assert read > len(states) / 2
-        assert min(udp["lost_packets"], udp["out_of_order"]) > 0
-        # RFC 3550, A.8, for the decided delays; iperf3's own processing times add to them.
-        jitter_ns = 0.0
-        for before, after in pairwise(departures[1:read]):
-            jitter_ns += (abs(after.delay_ns - before.delay_ns) - jitter_ns) / 16
-        assert jitter_ns > 1e6
-        if abs(udp["jitter_ms"] * 1e6 - jitter_ns) <= 0.1 * jitter_ns:
-            return
-    pytest.fail(f"{ATTEMPTS} times another jitter: {udp['jitter_ms']} ms, not {jitter_ns / 1e6}")
+    options = ["--reverse"] if direction == "reverse" else []
+    report, emulator = asyncio.run(measure(emulate, *options))
+    link = emulator.finish()[direction]
+    assert link["longest_loss_burst"] <= 5
+    assert min(link["fates"]["dropped"], link["duplicated"]) > 0
+    receiver = report if direction == "reverse" else report["server_output_json"]
+    udp = receiver["end"]["streams"][0]["udp"]
+    # The final report has the number sent; the intervals have increments of the newest number.
+    newest = sum(one["streams"][0]["packets"] for one in receiver["intervals"])
+    states = list(counted(emulator.fates(direction)))
+    # iperf3's receiver stops at the end message over TCP and may leave datagrams unread.
+    assert Counts(newest, udp["lost_packets"], udp["out_of_order"]) in states[len(states) // 2 :]
+    assert min(udp["lost_packets"], udp["out_of_order"]) > 0

@@ -4,22 +4,24 @@ import errno
 import json
 import os
 import shutil
+import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
+from benchmarks.programs import TwoHosts, two_hosts
+from benchmarks.report import MeasurementError
 from noack.core.errors import ExitStatus
-from tests.netem.programs.conftest import Emulate
+from noack.runtime.address import text_of
+from noack.runtime.udp_sockets import enlarge_buffer
+from tests.attacks.attacked import unread_bytes
+from tests.attacks.sender import enter_namespace
+from tests.netem.conftest import Emulate
 
-COUNTER = Path(__file__).with_name("counter.py")
-EMULATOR, SERVER = (f"noack-{os.getpid()}-{role}" for role in ("emulator", "server"))
-HOSTS = {4: ("10.83.2.2/24", "10.83.2.1/24"), 6: ("fd83:2::2/64", "fd83:2::1/64")}
-"""Addresses of the emulator and of the server, by version of IP."""
-LOOPBACK = {4: "127.0.0.1", 6: "::1"}
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")
 """Its queue is smaller than the number of packets that arrive within milliseconds.
 
@@ -30,93 +32,64 @@ MANY = 400
 QUEUE_FULL = os.strerror(errno.ENOBUFS)
 
 
-def inside(name: str, *command: str) -> list[str]:
-    """Return a command that runs in a namespace."""
-    return ["ip", "netns", "exec", name, *command]
-
-
-def run(*command: str) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
-
-
-def make_namespaces() -> None:
-    for name in (EMULATOR, SERVER):
-        run("ip", "netns", "add", name)
-        run("ip", "-n", name, "link", "set", "lo", "up")
-    run("ip", "-n", EMULATOR, "link", "add", "line", "type", "veth", "peer", "line",
-        "netns", SERVER)  # fmt: skip
-    for k, name in enumerate((EMULATOR, SERVER)):
-        run("ip", "-n", name, "address", "add", HOSTS[4][k], "dev", "line")
-        run("ip", "-n", name, "address", "add", HOSTS[6][k], "dev", "line", "nodad")
-        run("ip", "-n", name, "link", "set", "line", "up")
-    run(*inside(EMULATOR, "tc", "qdisc", "add", "dev", "line", "root", *SLOW_LINE))
-
-
 @pytest.fixture(scope="module")
-def _namespaces() -> Iterator[None]:
-    if shutil.which("ip") is None or shutil.which("tc") is None:
-        pytest.skip("ip and tc (iproute2) are not installed")
+def hosts() -> Iterator[TwoHosts]:
+    if shutil.which("tc") is None:
+        pytest.skip("tc (iproute2) is not installed")
     try:
-        make_namespaces()
-        yield
-    except subprocess.CalledProcessError as error:
-        pytest.skip(f"no network namespaces here: {error.stderr.strip()}")
-    finally:
-        for name in (EMULATOR, SERVER):
-            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+        with two_hosts() as hosts:
+            run(hosts, "tc", "qdisc", "add", "dev", "line", "root", *SLOW_LINE)
+            yield hosts
+    except MeasurementError as error:
+        pytest.skip(f"no network namespaces here: {error}")
 
 
-def url(host: str, port: int) -> str:
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+def run(hosts: TwoHosts, *command: str) -> str:
+    done = subprocess.run(hosts.inside(0, *command), capture_output=True, check=True, timeout=60)
+    return done.stdout.decode()
 
 
-def queued() -> int:
-    """Return the number of packets in the slow line."""
-    show = run(*inside(EMULATOR, "tc", "-s", "-j", "qdisc", "show", "dev", "line"))
-    return int(json.loads(show)[0]["qlen"])
+def bound_in(namespace: str, address: str) -> socket.socket:
+    """Return a bound socket in a network namespace, which a thread enters for this."""
+
+    def bound() -> socket.socket:
+        enter_namespace(namespace)
+        family = socket.AF_INET6 if ":" in address else socket.AF_INET
+        endpoint = socket.socket(family, socket.SOCK_DGRAM)
+        endpoint.bind((address, 0))
+        enlarge_buffer(endpoint)
+        return endpoint
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(bound).result()
 
 
-def unread(version: int, port: int) -> int:
-    """Return the number of received bytes that the emulator has not read yet from a port."""
-    rows = run(*inside(EMULATOR, "cat", "/proc/net/udp" if version == 4 else "/proc/net/udp6"))
-    for row in rows.splitlines()[1:]:
-        _, local, _, _, queues, *_ = row.split()
-        if int(local.rpartition(":")[2], 16) == port:
-            return int(queues.partition(":")[2], 16)
-    raise AssertionError(rows)
-
-
-@pytest.mark.usefixtures("_namespaces")
-@pytest.mark.parametrize(("version", "options"), [(4, ["--segment"]), (6, ["--one-way"])])
+@pytest.mark.parametrize(("version", "options"), [(0, ["--segment"]), (1, ["--one-way"])])
 def test_packets_refused_by_a_full_output_queue_are_counted(
-    emulate: Emulate, version: int, options: Sequence[str]
+    emulate: Emulate, hosts: TwoHosts, version: int, options: Sequence[str]
 ) -> None:
     """Every datagram is in one counter, and the emulator does not claim the guarantee."""
-    here, server = LOOPBACK[version], HOSTS[version][1].partition("/")[0]
-    with subprocess.Popen(
-        inside(SERVER, sys.executable, str(COUNTER), "count", server),
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    ) as counting:  # fmt: skip
-        try:
-            assert counting.stdout is not None
-            emulator = emulate(
-                url(server, int(counting.stdout.readline())), "loss 20% mansd 2", *options,
-                listen=url(here, 0), inside=inside(EMULATOR),
-            )  # fmt: skip
-            port = str(emulator.port)
-            run(*inside(EMULATOR, sys.executable, str(COUNTER), "send", here, port, str(MANY)))
-            while unread(version, emulator.port):
-                time.sleep(0.02)
-            link, status, stderr = emulator.end()
-            while queued():
-                time.sleep(0.02)
-            printed, _ = counting.communicate(timeout=60)
-        finally:
-            counting.kill()
+    here, there = ("127.0.0.1", "::1")[version], hosts.addresses[1][version]
+    with bound_in(hosts.names[1], there) as server, bound_in(hosts.names[0], here) as client:
+        to, listen = text_of((there, server.getsockname()[1])), text_of((here, 0))
+        words = ("loss 20% mansd 2", *options)
+        emulator = emulate(to, *words, listen=listen, inside=hosts.inside(0))
+        for _ in range(MANY):
+            client.sendto(bytes(500), (here, emulator.port))
+        while unread_bytes(emulator.process.pid)[emulator.port]:
+            time.sleep(0.02)
+        link, status, stderr = emulator.end()
+        while json.loads(run(hosts, "tc", "-s", "-j", "qdisc", "show", "dev", "line"))[0]["qlen"]:
+            time.sleep(0.02)
+        server.settimeout(0.3)  # longer than the last datagram travels after the queue
+        received = 0
+        with suppress(TimeoutError):
+            while server.recv(2048):
+                received += 1
     forward = link["forward"]
     kernel, queue = (forward["unintended"][key] for key in ("lost_in_kernel", QUEUE_FULL))
     assert forward["received"] + kernel == MANY
-    assert forward["forwarded"] == int(printed) + queue
+    assert forward["forwarded"] == received + queue
     assert queue > 0
     assert "queue on the way out was full" in stderr
     assert status == ExitStatus.UNINTENDED_LOSSES

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from tests.netem.programs.conftest import Emulate
+from tests.netem.conftest import Emulate
 from tests.netem.programs.ports import HOST, open_server
 
 WORDS = "delay 5ms 2ms loss 5% reorder 5% duplicate 2% corrupt 1% mansd 3 seed 1"

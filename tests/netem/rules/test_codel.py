@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.tc_words import settings_of, text_of
+from netem.tc_words import settings_of
 from noack.impairments.disciplines.codel import Codel
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_prediction import predict
 from tests.oracles.link import Link
 
 MS = 10**6
@@ -149,19 +147,6 @@ def emulated(
     return [None if t_ns < 0 else t_ns for t_ns in found]
 
 
-@pytest.mark.parametrize("share", [0.9, 1.1, 3.0])
-def test_packets_are_dropped_by_the_control_law(share: float) -> None:
-    """Packets of 100 to 1500 bytes that fill a share of the line, with pauses."""
-    rng, count, codel = np.random.default_rng(2), 6000, Codel()
-    sizes = rng.integers(100, 1501, count)
-    gaps = rng.exponential(800 * PER_BYTE_NS / share, count)
-    gaps[rng.integers(0, count, 16)] += 300 * MS
-    arrivals = list(zip(np.cumsum(gaps).astype(int).tolist(), sizes.tolist(), strict=True))
-    expected = reference(arrivals, codel, ahead(1500))
-    assert emulated(arrivals, codel) == expected
-    assert expected.count(None) > 20 or share < 1
-
-
 @given(
     st.lists(st.tuples(st.sampled_from([0, 1, 50_000, 10**6]), st.integers(1, 1500)), max_size=150),
     st.sampled_from([0.0001, 0.001, 0.005]),
@@ -178,6 +163,18 @@ def test_any_arrivals_and_any_cap(
     assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
 
 
+def test_random_arrivals_with_pauses() -> None:
+    """Packets of 100 to 1500 bytes that overload the line."""
+    rng, count, codel = np.random.default_rng(2), 6000, Codel()
+    sizes = rng.integers(100, 1501, count)
+    gaps = rng.exponential(800 * PER_BYTE_NS / 1.1, count)
+    gaps[rng.integers(0, count, 16)] += 300 * MS
+    arrivals = list(zip(np.cumsum(gaps).astype(int).tolist(), sizes.tolist(), strict=True))
+    expected = reference(arrivals, codel, ahead(1500))
+    assert emulated(arrivals, codel) == expected
+    assert expected.count(None) > 20
+
+
 def test_under_a_standing_queue_the_mtu_rule_is_that_of_the_rfc() -> None:
     """Until the burst ends; the RFC's rule does not drop the last packets of a burst."""
     arrivals, codel = [(k * 500_000, 1000) for k in range(4000)], Codel()
@@ -185,22 +182,6 @@ def test_under_a_standing_queue_the_mtu_rule_is_that_of_the_rfc() -> None:
     last = max(k for k in range(4000) if (of_rfc[k] or 0) <= arrivals[-1][0])
     assert found[: last + 1] == of_rfc[: last + 1]
     assert of_rfc[-1] is not None
-
-
-def test_words_and_their_meaning() -> None:
-    words = "rate 10mbit queue 500 codel target 2ms interval 50ms mtu 9000 loss 5%"
-    settings = settings_of(words)
-    assert text_of(settings) == words
-    assert settings.impairments[0] == Rate(
-        rate_bps=10_000_000, queue=500,
-        discipline=Codel(target_s=0.002, interval_s=0.05, mtu_bytes=9000),
-    )  # fmt: skip
-    assert settings_of("rate 1mbit codel").impairments == (
-        Rate(rate_bps=1_000_000, discipline=Codel()),
-    )
-    rate, note = predict(settings)
-    assert rate == pytest.approx(0.05)
-    assert note == "as long as no queue overflows or CoDel drops"
 
 
 def test_the_law_drops_copies_of_delivered_packets() -> None:

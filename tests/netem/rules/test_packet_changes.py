@@ -18,13 +18,10 @@ def test_every_bit_is_flipped_with_the_same_probability(
     assert ((decided.decisions["bit"] >= 0) == (decided.fates == 3)).all()
     assert bits.min() >= 0
     assert bits.max() < 8 * size_bytes
+    empty = decide("corrupt 100%", 100, sizes_bytes=np.arange(100) % 2)
+    assert empty.fates.tolist() == [0, 3] * 50
     counts = np.histogram(bits, min(8 * size_bytes, 800), (0, 8 * size_bytes))[0]
     assert stats.chisquare(counts).pvalue > 1e-4
-
-
-def test_an_empty_payload_is_not_corrupted(decide: Any) -> None:
-    decided = decide("corrupt 100%", 100, sizes_bytes=np.arange(100) % 2)
-    assert decided.fates.tolist() == [0, 3] * 50
 
 
 def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> None:
@@ -53,9 +50,7 @@ def test_reordered_packets_leave_at_once(
     turns = np.arange(1, 100_001) % gap == 0
     assert not at_once[~turns].any()
     share_is(at_once[turns], 0.3)
-
-
-def test_only_delays_before_the_reorder_are_skipped(decide: Any) -> None:
+    # Only delays before the reorder are skipped.
     assert (decide("delay 10ms reorder 100% delay 3ms", 10).delays_ns == 3_000_000).all()
 
 

@@ -78,13 +78,6 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     assert list(link.departures_ns[0:3]) == [0, 0, 0]
 
 
-def test_a_forced_packet_leaves_after_a_full_queue(decide: Any) -> None:
-    words = "rate 8kbit 0 queue 2 mansd 2"  # 1 s per packet
-    decided = decide(words, 8, sizes_bytes=1000, arrivals_ns=0)
-    assert decided.fates.tolist() == [0, 0, 4, 4, 2, 4, 4, 2]
-    assert decided.delays_ns.tolist() == [k * NS for k in (1, 2, 3, 4)]
-
-
 def test_packets_lost_before_the_queue_use_no_line_time(decide: Any) -> None:
     for words, last_s in (("loss worst rate 8kbit 0", 3), ("rate 8kbit 0 loss worst", 5)):
         decided = decide(f"{words} mansd 1 first", 5, sizes_bytes=1000, arrivals_ns=0)

@@ -52,24 +52,12 @@ def load(text: str, folder: Path) -> tuple[LinkSpec, ...]:
 
 def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
     uplink, video = load(TWO, tmp_path)
-    assert uplink == LinkSpec(
-        name="uplink",
-        listen=("127.0.0.1", 9000),
-        to=("127.0.0.1", 9001),
-        forward=settings_of("delay 10ms loss 5% mansd 4"),
-        reverse=LinkSettings(),
-        seed=7,
-    )
-    assert video == LinkSpec(
-        name="video",
-        listen=("::1", 0),
-        to=("::1", 9003),
-        forward=settings_of("loss burst 5% 3 delay 20ms"),
-        reverse=settings_of("loss script 1 every 3"),
-        return_path=False,
-        idle_s=5.0,
-        most_clients=10,
-    )
+    ends = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
+    words = settings_of("delay 10ms loss 5% mansd 4")
+    assert uplink == LinkSpec("uplink", *ends, words, LinkSettings(), seed=7)
+    both = settings_of("loss burst 5% 3 delay 20ms"), settings_of("loss script 1 every 3")
+    others = {"return_path": False, "idle_s": 5.0, "most_clients": 10}
+    assert video == LinkSpec("video", ("::1", 0), ("::1", 9003), *both, **others)
 
 
 @given(settings)
@@ -95,15 +83,10 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"reverse": {"mandsd": 3}}, "reverse.mandsd = 3: unknown key; did you mean mansd?"),
     ({"reverse": {"impairments": [{"kind": "dely"}]}}, 'reverse.impairments.0.kind = "dely": '
      "must be one of blackout, corrupt, delay, duplicate, loss, opportunities, rate, reorder, "),
-    ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
-      "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "),
-    ({"forward": {"impairments": [{"kind": "delay", "loss_correlation": 0.5}]}},
-     "forward.impairments.0.loss_correlation = 0.5: needs a loss before it, by model "),
     ({"forward": "loss trace nothing.txt"}, 'forward.impairments.0.loss.file = "nothing.txt": '
      "cannot be read: No such file or directory"),
     ({"name": "a b"}, 'name = "a b": use letters, digits, _ and -'),
     ({"listen": "9000"}, "listen: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or "),
-    ({"to": "no such.host.invalid:1"}, "to: no such.host.invalid: no such host ("),
     ({"idle_s": 0}, "idle_s = 0: should be greater than 0"),
 ]  # fmt: skip
 
@@ -113,7 +96,6 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     [
         *(({"link": [LINK | link]}, re.escape(f"link.0.{line}")) for link, line in MISTAKES),
         ({}, r"link: missing \(the links, \[\[link\]\] each\)"),
-        ({"link": []}, r"link = \[\]: needs at least one entry"),
         ({"links": [LINK], "link": [LINK]}, "links = .*: unknown key; did you mean link?"),
         ({"link": [LINK, LINK]}, 'link.1.name = "a": another link has this name already'),
         ({"link": [LINK, LINK | {"name": "b"}]}, 'link.1.listen = ":9000": link a listens '),
@@ -126,15 +108,12 @@ def test_a_mistake_gets_one_line(content: dict[str, Any], line: str, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
-def test_the_published_schema_matches_the_code() -> None:
+def test_the_published_schema_is_that_of_the_code() -> None:
     """``noack schema --netem > docs/netem.schema.json`` updates the published schema."""
     published = json.loads((ROOT / "docs/netem.schema.json").read_text(encoding="utf-8"))
     assert published == json_schema()
-
-
-def test_the_schema_accepts_what_the_code_accepts() -> None:
-    jsonschema.Draft202012Validator.check_schema(json_schema())
-    validator = jsonschema.Draft202012Validator(json_schema())
+    jsonschema.Draft202012Validator.check_schema(published)
+    validator = jsonschema.Draft202012Validator(published)
     assert [error.message for error in validator.iter_errors(tomllib.loads(TWO))] == []
     for wrong in ({}, {"link": []}, {"link": [LINK | {"reverse": 3}]}, {"link": [LINK | {"x": 3}]}):
         assert not validator.is_valid(wrong)
