@@ -6,8 +6,7 @@ import pytest
 
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection
-from tests.attacks.attacked import Attacked, attack, may_forge_addresses
-from tests.attacks.checks import CHECKS
+from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target
 from tests.attacks.sender import PEER, STRANGER
 from tests.wire_decoder import Decoder

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from netem.channel import Channel, Datagram, channel_of
 from netem.link_state import LinkState
 from noack.core.core_library import core, ffi
+from noack.impairments.kinds.opportunities import Opportunities
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Record
 from noack.scenario.resolution import resolve
@@ -98,3 +99,13 @@ def test_numbers_of_no_network_are_refused(content: dict[str, Any]) -> None:
         assert core.noack_channel_check(own) != ffi.NULL
         setattr(own, name, before)
         assert core.noack_channel_check(own) == ffi.NULL
+
+
+def test_a_queue_that_cannot_be_served_in_time() -> None:
+    served = Opportunities(times_ms=(0, 10**12), overhead_bytes=65_535, queue=2)
+    link = LinkState(LinkSettings(impairments=(served,), mansd=0), 1, "late")
+    link.start_flow(0, 0)
+    count = 250_000
+    rows, sizes = np.zeros(count, np.int64), np.full(count, 65_535, np.int64)
+    decisions = link.decide_many(rows, sizes, np.full(count, 2**61 - 10**9))
+    assert (decisions["fate"] <= core.NOACK_FORCED).all()

@@ -13,7 +13,6 @@ from noack.impairments import loss_prediction
 from noack.impairments.loss_prediction import (
     expected_loss,
     found_probabilities,
-    predict,
     read_files,
     remember,
     with_kept_loss,
@@ -53,14 +52,6 @@ def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> N
     for other in ("loss 10% keep loss 5% mansd 2", "loss 10% keep mansd 1"):
         with pytest.raises(TypeError):
             with_kept_loss(settings_of(other))
-
-
-@pytest.mark.parametrize("others", ["loss script 0,2,10,11 every 12", "corrupt 10%"])
-def test_no_smaller_probability_gives_the_asked_rate(others: str) -> None:
-    guarantee = "atmost 3 in 11 recover 3"
-    (found,) = found_probabilities(settings_of(f"loss 26% keep {others} {guarantee}")).values()
-    for p in np.linspace(0, found, 12)[:-1]:
-        assert (predict(settings_of(f"loss {100 * p}% {others} {guarantee}")).rate or 0.0) < 0.26
 
 
 @pytest.mark.parametrize(

@@ -151,17 +151,6 @@ def test_only_allowed_datagrams_are_not_delivered(
         assert all(is_allowed(observer.lost(*of_flow), in_force) for of_flow in sent.items())
 
 
-def test_the_outcomes_before_a_change_to_no_guarantee_are_final() -> None:
-    link = Link(settings_of("delay 10ms mansd 1"), 1, "a")
-    for packet in range(3):
-        link.handle(Datagram(0, bytes([packet])), packet * MS)
-    link.change(settings_of(""))
-    assert not any(isinstance(one, Datagram) for one in link.handle(Datagram(0, b"\3"), 3 * MS))
-    due = [one for _ in range(4) for one in link.on_timer(12 * MS)]
-    leaves = [one for one in due if isinstance(one, Datagram)]
-    assert [one.data[0] for one in leaves] == [0, 1, 2, 3]
-
-
 @settings(max_examples=50)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
 def test_the_guarantee_needs_no_clock(settings: LinkSettings, seed: int, count: int) -> None:
@@ -225,16 +214,6 @@ def test_a_restarted_link_keeps_the_guarantee_behind_any_history(words: str) -> 
     assert earlier == 0 or any(
         not is_allowed([*one, *[False] * earlier, True], settings) for one in before
     )
-
-
-# The cap forces and holds back no more datagrams than necessary.
-
-
-@pytest.mark.parametrize(("mansd", "first"), [(0, False), (1, True), (5, False)])
-def test_the_cap_forces_only_the_necessary_packets(decide: Any, mansd: int, first: bool) -> None:
-    for words in ("loss worst", "loss worst duplicate 100%", "corrupt 100%", "blackout 0s-1000s"):
-        passed = np.flatnonzero(decide(f"{words} mansd {mansd} {'first' * first}", 1000).fates == 2)
-        assert passed.tolist() == list(range(0 if first else mansd, 1000, mansd + 1))
 
 
 def lost_of(releases: Sequence[int | None]) -> list[bool]:

@@ -18,7 +18,12 @@ from tests.netem.capture.reader import Datagram, datagram, read
 
 @given(st.lists(events, max_size=5))
 def test_an_independent_reader_finds_what_was_written(described: list[dict[str, Any]]) -> None:
-    packets = read(file_of(*described)).packets
+    section, interfaces, packets, _ = read(file_of(*described))
+    assert section[4][0].startswith(b"noack netem ")
+    assert [(kind, snap) for kind, snap, _ in interfaces] == [(101, 262_144)] * 2
+    assert [options for _, _, options in interfaces] == [
+        {2: [name.encode()], 3: [at.encode()], 9: [b"\x09"]} for name, at in INTERFACES
+    ]
     assert len(packets) == len(described)
     for packet, event in zip(packets, described, strict=True):
         assert packet.interface == event["interface"]
@@ -44,19 +49,6 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
         section._out = np.full(300_000, 0xA5, np.uint8)
         parts += bytes(section.packets(table, data))
     assert parts + section.statistics() == whole
-
-
-def test_a_file_names_its_program_and_describes_the_interfaces() -> None:
-    section = PcapngSection([("link0 client", "[::]:5000 → here"), ("link0 server", "")])
-    file = read(section.header() + section.statistics())
-    assert file.section[4][0].startswith(b"noack netem ")
-    assert set(file.section) == {2, 3, 4}
-    assert file.packets == []
-    assert [(kind, snap) for kind, snap, _ in file.interfaces] == [(101, 262_144)] * 2
-    assert [options for _, _, options in file.interfaces] == [
-        {2: [b"link0 client"], 3: ["[::]:5000 → here".encode()], 9: [b"\x09"]},
-        {2: [b"link0 server"], 9: [b"\x09"]},
-    ]
 
 
 LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
@@ -118,8 +110,7 @@ def test_the_largest_datagram_fits(family: int, most: int) -> None:
     [
         ("interface", 2, "an interface that does not exist"), ("t_ns", -1, "before 1970"),
         ("family", 0, "neither of IPv4 nor of IPv6"), ("size_bytes", 8, "outside the data"),
-        ("size_bytes", 2**32 - 1, "too large"), ("offset", 19, "outside the data"),
-        ("offset", 2**63, "outside the data"), ("offset", 2**64 - 1, "outside the data"),
+        ("size_bytes", 2**32 - 1, "too large"), ("offset", 2**64 - 1, "outside the data"),
     ],
 )  # fmt: skip
 def test_an_impossible_event_is_refused(field: str, value: int, text: str) -> None:

@@ -43,19 +43,15 @@ def test_a_command_line_describes_a_link(
     assert specs(f"{ADDRESSES} {arguments}") == (link,)
 
 
-@pytest.mark.parametrize(
-    ("listen", "to", "addresses"),
-    [
+def test_addresses() -> None:
+    for listen, to, addresses in (
         ("127.0.0.1:0", "192.0.2.7:53", (("127.0.0.1", 0), ("192.0.2.7", 53))),
-        ("[::1]:9000", "[::1]:9001", (("::1", 9000), ("::1", 9001))),
         ("[::1]:9000", ":9001", (("::1", 9000), ("::1", 9001))),
         (":9000", "[::1]:9001", (("127.0.0.1", 9000), ("::1", 9001))),
         ("0.0.0.0:9000", "localhost:9001", (("0.0.0.0", 9000), ("127.0.0.1", 9001))),
-    ],
-)
-def test_addresses(listen: str, to: str, addresses: tuple[Any, Any]) -> None:
-    (link,) = specs(f"--listen {listen} --to {to}")
-    assert (link.listen, link.to) == addresses
+    ):
+        (link,) = specs(f"--listen {listen} --to {to}")
+        assert (link.listen, link.to) == addresses
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import os
 import pty
 import select
-import socket
 import sys
 import termios
 import time
@@ -25,15 +24,6 @@ def read_until(descriptor: int, done: Callable[[str], bool]) -> str:
         assert more, f"no more than this: {text.decode(errors='replace')}"
         text += more
     return text.decode(errors="replace")
-
-
-@contextmanager
-def udp_socket() -> Iterator[socket.socket]:
-    """A socket on loopback with a long timeout."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
-        endpoint.settimeout(_PATIENCE_S)
-        endpoint.bind(("127.0.0.1", 0))
-        yield endpoint
 
 
 @contextmanager

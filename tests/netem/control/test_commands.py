@@ -5,7 +5,6 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 
@@ -58,16 +57,6 @@ def test_a_link_is_set_in_words(
     out = capsys.readouterr().out.splitlines()
     assert {f"up {name}: loss 5% mansd 4" for name in changed} <= {*out[:2]}
     assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: no impairment"]
-
-
-@pytest.mark.usefixtures("server")
-def test_files_are_read_where_the_command_is_given(
-    relay: FakeRelay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "losses").write_text("0110")
-    monkeypatch.chdir(tmp_path)
-    assert run("set --link up loss trace losses once") == ExitStatus.OK
-    assert relay.settings["up", "forward"] == settings_of("loss script 1,2")
 
 
 MISTAKES = [

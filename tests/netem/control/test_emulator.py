@@ -12,13 +12,15 @@ from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import ExitStatus
 from tests.netem.conftest import Emulate
-from tests.netem.control.processes import udp_socket
+from tests.netem.engine.relays import endpoints
 from tests.netem.fates.links import spec_of
 
 
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
     sent = [number.to_bytes(2) for number in range(320)]
-    with udp_socket() as server, udp_socket() as client:
+    with endpoints(*["127.0.0.1"] * 2) as (server, client):
+        for endpoint in (server, client):
+            endpoint.settimeout(60)
         emulator = emulate("{}:{}".format(*server.getsockname()), "--control", "lab")
         client.connect((emulator.host, emulator.port))
         assert running() == ["lab"]
@@ -36,10 +38,7 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
         assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
         found = json.loads(capsys.readouterr().out)["links"][0]["forward"]
         assert (found["received"], found["forwarded"]) == (320, 120)
-        assert found["fates"] | {"delivered": 0} == {
-            "delivered": 0, "dropped": 200, "forced": 100, "corrupted": 0, "overflowed": 0,
-            "blacked_out": 0,
-        }  # fmt: skip
+        assert (found["fates"]["dropped"], found["fates"]["forced"]) == (200, 100)
         assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
         assert found["loss"]["realised"] == pytest.approx(2 / 3)
         assert found["loss"]["predicted"] == pytest.approx(2 / 3)
@@ -55,13 +54,11 @@ def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFi
     assert running() == []
 
 
-@pytest.mark.parametrize(("words", "cap"), [("loss 100%", 2), ("loss 100% mansd 4", 4)])
-def test_a_replay_uses_the_cap_of_its_trace_by_default(
-    tmp_path: Path, words: str, cap: int
-) -> None:
+def test_a_replay_uses_the_cap_of_its_trace_by_default(tmp_path: Path) -> None:
     path = tmp_path / "fates.parquet"
     with FateRecorder(path, [spec_of(settings_of("loss 60% mansd 2"), "relay")]):
         pass
-    (spec,) = stand_alone._replaying([spec_of(settings_of(words), "relay")], path)
-    assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
-    assert spec.decisions == {"forward": [], "reverse": []}
+    for words, cap in (("loss 100%", 2), ("loss 100% mansd 4", 4)):
+        (spec,) = stand_alone._replaying([spec_of(settings_of(words), "relay")], path)
+        assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
+        assert spec.decisions == {"forward": [], "reverse": []}

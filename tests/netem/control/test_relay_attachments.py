@@ -4,6 +4,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
@@ -52,18 +53,15 @@ def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> Non
     assert json.loads(last)["links"][0]["forward"]["received"] == 5
 
 
-def test_a_full_disk_is_reported_and_the_relay_continues(
-    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_reported_and_the_relay_continues(relay: FakeRelay) -> None:
     error = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", error)
-    with attached(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side:
+    with (
+        redirect_stderr(error),
+        attached(relay, options("--stats", "0.01", "--stats-file", "/dev/full")) as side,
+    ):
         while not error.getvalue().endswith("\n"):
             side.commands.run_pending()
-    assert error.getvalue() == (
-        "noack netem: statistics cannot be written to /dev/full "
-        "(No space left on device); the relay continues\n"
-    )
+    assert "cannot be written to /dev/full (No space left" in error.getvalue()
 
 
 def test_the_view_shows_the_relay_and_later_messages_until_q(

@@ -17,11 +17,11 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.control.statistics_view import History, plain_lines, render
-from netem.relay_links import FlowReport, LinkSpec
+from netem.relay_links import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.netem.control.relays import SETTINGS, FakeRelay, times
+from tests.netem.control.relays import FakeRelay, times
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
@@ -72,27 +72,6 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert json.loads(json.dumps(document, allow_nan=False)) == document
 
 
-def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
-    relay.counters["up", "forward"] = Counters(
-        received=50, received_bytes=5000, delivered=40, dropped=10, forwarded=40,
-        forwarded_bytes=4000,
-    )  # fmt: skip
-    relay.delays = times(1_000_000)
-    before = look(relay, 10)
-    relay.counters["up", "forward"] = Counters(
-        received=450, received_bytes=45_000, delivered=140, dropped=310, forwarded=140,
-        forwarded_bytes=14_000,
-    )  # fmt: skip
-    relay.delays = times(1_000_000, 5_000_000, 5_000_000)
-    recent = forward(statistics(look(relay, 12), before))["recent"]
-    assert recent is not None
-    assert recent["seconds"] == 2
-    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (200, 160_000)
-    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (50, 40_000)
-    assert recent["loss"] == pytest.approx(0.75)
-    assert recent["delay_ns"]["p50"] == pytest.approx(5_000_000, rel=0.03)
-
-
 def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) -> None:
     """And is at most 1, although late packets become stale."""
     relay.counters["up", "forward"] = Counters(received=300, delivered=150, dropped=150)
@@ -124,11 +103,22 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
                 counters.forwarded += received - received // 5
                 counters.forwarded_bytes += 100 * (received - received // 5)
                 counters.longest_loss_burst = 2
-        relay.delays = times(*[10_000_000] * 98, 20_000_000, 20_000_000)
+        relay.delays = relay.delays + times(*[10_000_000] * 98, 20_000_000, 20_000_000)
         snapshot = look(relay, second + 1)
         found.append(statistics(snapshot, before))
         before = snapshot
     return found
+
+
+def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
+    *_, last = documents(relay)
+    recent = forward(last)["recent"]
+    assert recent is not None
+    assert recent["seconds"] == 1
+    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (2000, 1_600_000)
+    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (1600, 1_280_000)
+    assert recent["loss"] == pytest.approx(0.2)
+    assert recent["delay_ns"]["p50"] == pytest.approx(10_000_000, rel=0.03)
 
 
 def text_of(relay: FakeRelay, width: int = 80, height: int | None = 24) -> list[str]:
@@ -142,11 +132,16 @@ def text_of(relay: FakeRelay, width: int = 80, height: int | None = 24) -> list[
 
 
 def test_a_link_is_shown_with_the_numbers_of_both_directions() -> None:
-    relay = FakeRelay("up")
+    """Words of any length, and names with brackets."""
+    relay = FakeRelay("[bold]up")
+    samples = settings_of("loss 10% delay 1ms samples " + ",".join(["1ms"] * 500))
+    relay.settings["[bold]up", "reverse"] = samples
+    assert len(text_of(relay)) <= 24
+    relay = FakeRelay("[bold]up")
     relay.unintended["lost_in_kernel"] = 1234
     text = " ".join(" ".join(text_of(relay)).replace("│", " ").split())
     for shown in (
-        "up 127.0.0.1:5000 → [::1]:6000 1 client", "loss 10% delay 10ms mansd 2", "no impairment",
+        "[bold]up 127.0.0.1:5000 → [::1]:6000 1 client", "loss 10% delay 10ms mansd 2", "no impairment",
         "received 2,000/s", "1.60 Mbit/s", "forwarded 1,600/s", "1.28 Mbit/s", "loss 20.0 %",
         "drawn 20.0 %, predicted 9.91 %", "lost 600 dropped 0", "burst 2, cap 2", "300 forced",
         "0, no cap", "in flight 5, max 0", "unintended losses: 1,234 lost in kernel (forward)",
@@ -168,17 +163,6 @@ def test_the_view_fits_into_any_width(width: int) -> None:
     for line in lines[2:-1]:
         assert all(number in line for number in ("2,000/s", "20.0 %", "2/2"))
     assert ("last minute" in lines[1]) == (width >= 120)
-
-
-def test_long_words_and_names_with_brackets_are_shown_correctly() -> None:
-    relay = FakeRelay("[bold]up")
-    words = settings_of("loss 10% delay 1ms samples " + ",".join(["1ms"] * 500))
-    relay.specs = [LinkSpec("[bold]up", ("::1", 5000), ("::1", 6000), words, SETTINGS)]
-    relay.settings = {("[bold]up", side): words for side in ("forward", "reverse")}  # type: ignore[misc]
-    lines = text_of(relay)
-    assert "[bold]up  [::1]:5000 → [::1]:6000" in lines[1]
-    assert len(lines) <= 24
-    assert " → [bold]up" in "\n".join(text_of(relay, height=5))
 
 
 def test_a_pipe_gets_one_line_per_direction_in_use() -> None:

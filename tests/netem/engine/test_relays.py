@@ -8,8 +8,6 @@ import socket
 import struct
 import sys
 import time
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 from netem import relay_memory
-from netem.relay_links import DirectionReport, raise_file_limit
+from netem.relay_links import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import RecordedDecision
-from noack.protocol.record_tables import Fate
 from noack.runtime import udp_sockets
 from tests.netem.engine.relays import (
     HOSTS,
@@ -52,16 +48,20 @@ def send_numbers(client: socket.socket, to: Any, begin: int, end: int) -> None:
 
 @IP_VERSIONS
 def test_both_directions_work_over_both_versions_of_ip(here: int, there: int) -> None:
-    with endpoints(HOSTS[there], HOSTS[here], HOSTS[here]) as (server, *clients):
+    """Only the server's answers reach a client."""
+    with endpoints(*[HOSTS[there]] * 2, *[HOSTS[here]] * 2) as (server, stranger, *clients):
         with running([link(name_of(server), host=HOSTS[here])]) as one:
             for client in clients:
                 client.sendto(b"question", one.address())
             for data, source in one.receive(server, 2):
                 assert data == b"question"
                 server.sendto(b"answer to %d" % source[1], source)
+                stranger.sendto(b"lie", source)
             answers = [one.receive(client)[0] for client in clients]
             assert {source for _, source in answers} == {one.address()}
             assert len({data for data, _ in answers}) == 2
+            one.settle(2, "reverse")
+            assert all(drain(client) == [] for client in clients)
             report = one.report()
         assert (report.clients, report.clients_ever) == (2, 2)
         assert {flow.client for flow in report.forward.flows} == set(map(name_of, clients))
@@ -117,19 +117,6 @@ def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
     assert sorted(arrived) == sorted(ports)
     counters = report.forward.counters
     assert (report.clients, counters.received, counters.dropped) == (700, 2100, 700)
-
-
-def test_only_answers_of_the_server_reach_the_client() -> None:
-    with (
-        endpoints(V4, V4, V4) as (server, client, stranger),
-        running([link(name_of(server))]) as one,
-    ):
-        client.sendto(b"question", one.address())
-        ((_, path),) = one.receive(server)
-        stranger.sendto(b"lie", path)
-        server.sendto(b"truth", path)
-        assert [data for data, _ in one.receive(client)] == [b"truth"]
-        assert one.report().reverse.counters.received == 1
 
 
 def test_an_absent_server_is_reported_and_causes_no_later_loss(
@@ -191,18 +178,6 @@ def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
         assert report.forward.flows[0].packets == 8
         with pytest.raises(CallerError, match="none of this name"):
             one.relay.change("another", "reverse", late)
-
-
-def test_idle_clients_are_forgotten_and_come_back_as_new_flows() -> None:
-    with relayed(THIRD_LOST, idle_s=0.05) as (server, client, one):
-        for flow in range(2):
-            send_numbers(client, one.address(), 0, 4)
-            one.settle(4 * (flow + 1))
-            assert numbers(drain(server)) == [1, 2]
-            report = one.report()
-            assert [(f.flow, f.packets) for f in report.forward.flows] in ([(flow, 4)], [])
-            one.until(lambda: one.report().clients == 0)
-            assert one.report().clients_ever == flow + 1
 
 
 def test_a_client_with_datagrams_in_flight_or_unread_is_not_idle() -> None:
@@ -364,30 +339,3 @@ def test_the_relay_continues_if_standard_error_is_unusable(monkeypatch: pytest.M
                 one.until(lambda one=one: one.report().refused == 1)
                 first.sendto(b"2", one.address())
                 assert [data for data, _ in one.receive(server, 2)] == [b"1", b"2"]
-
-
-def test_a_change_does_not_interrupt_a_replay() -> None:
-    lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
-    passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
-    record = [lost, passed, lost, lost, passed, lost]
-    with relayed(decisions={"forward": [record]}) as (server, client, one):
-        send_numbers(client, one.address(), 0, 3)
-        one.settle(3)
-        one.relay.change("test", "forward", settings_of("loss worst mansd 3"))
-        send_numbers(client, one.address(), 3, 10)
-        one.settle(10)
-        assert numbers(drain(server)) == [1, 4, 8]
-
-
-def test_file_descriptors_above_the_limit_of_select_work() -> None:
-    raise_file_limit()
-    with endpoints(V4, V4) as (server, client), ExitStack() as unused:
-        file = unused.enter_context(Path(os.devnull).open())
-        lowest = os.dup(file.fileno())
-        while (descriptor := os.dup(file.fileno())) < 1024:
-            unused.callback(os.close, descriptor)
-        unused.callback(os.close, descriptor)
-        os.close(lowest)
-        with running([link(name_of(server))]) as one:
-            client.sendto(b"hello", one.address())
-            assert one.receive(server)[0][0] == b"hello"

@@ -78,14 +78,11 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     assert list(link.departures_ns[0:3]) == [0, 0, 0]
 
 
-def test_packets_lost_before_the_queue_use_no_line_time(decide: Any) -> None:
+def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decide: Any) -> None:
     for words, last_s in (("loss worst rate 8kbit 0", 3), ("rate 8kbit 0 loss worst", 5)):
         decided = decide(f"{words} mansd 1 first", 5, sizes_bytes=1000, arrivals_ns=0)
         assert decided.fates.tolist() == [2, 1, 2, 1, 2]
         assert decided.delays_ns[-1] == last_s * NS
-
-
-def test_copies_use_line_time_unless_the_original_is_dropped(decide: Any) -> None:
     words, arrivals = "duplicate 100% rate 8kbit 0 queue 3", [0, 0, 0, NS, 10 * NS]
     decisions = decide(words, 5, sizes_bytes=1000, arrivals_ns=arrivals).decisions
     assert decisions["fate"].tolist() == [0, 0, 4, 0, 0]

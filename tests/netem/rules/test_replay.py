@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.tc_words import settings_of
@@ -76,25 +76,6 @@ def test_by_time_a_packet_gets_what_was_recorded_at_its_time(
         else:
             share = Fraction(t - sent_ns[k], sent_ns[k + 1] - sent_ns[k])
             assert 0 <= here + share * (following - here) - delay_ns < 1
-
-
-@given(records, st.lists(st.integers(0, 10**9), max_size=40), st.integers(0, 12))
-def test_by_time_a_network_that_kept_the_order_keeps_it(
-    steps: Any, arrivals: list[int], power: int
-) -> None:
-    """Also with gaps of hours, for which the interpolation ignores low bits."""
-    sent = np.cumsum([gap * 3**power for gap, _ in steps]).tolist()
-    fifo = np.maximum.accumulate([at + max(d, 0) for at, (_, d) in zip(sent, steps, strict=True)])
-    delays = fifo - np.array(sent)
-    assume(delays.max() <= 3600 * 10**9)
-    settings = Replay(
-        sent_ns=tuple(sent), delays_ns=tuple(delays.tolist()), by="time", repeat=False
-    )
-    arrivals = [at * 3**power % settings.length_ns for at in arrivals]
-    arrivals = sorted(arrivals + sent + [at - 1 for at in sent if at > 0])
-    found = outcomes(link_of(settings), arrivals)
-    leaving = [at + delay for at, delay in zip(arrivals, found, strict=True)]
-    assert leaving == sorted(leaving)
 
 
 def test_a_packet_that_must_pass_has_the_delay_of_the_last_that_was_received() -> None:
