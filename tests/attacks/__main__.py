@@ -16,7 +16,7 @@ def counts_at(run: Attacked, role: str) -> Counter[str]:
     """Return the datagrams at a port: sent by kind, rejected by reason, and accepted."""
     channel, peer_sent = run.channel(role), run.channel(sender_to(role, RECEIVES[role]))["sent"]
     counts: Counter[str] = Counter()
-    for (to, sender, kind, _), number in run.sent.items():
+    for (to, sender, kind), number in run.sent.items():
         if to == role:
             counts[f"sent, {sender}: {kind}"] += number
     counts.update({f"rejected: {reason}": n for reason, n in channel["rejected"].items()})

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-from tests.fuzz.harness import FOLDER, NAMES, harness, kept, to_line
+from tests.fuzz.harness import FOLDER, kept, parsers, to_line
 from tests.native import sanitized_core
 
 ROOT = FOLDER.parents[1]
@@ -25,7 +25,7 @@ _FINDINGS = ("crash-", "oom-", "timeout-")
 
 def fuzz(name: str, seconds: int) -> tuple[bool, str]:
     """Fuzz a parser; return whether it failed, and lines that say how the run went."""
-    under_test = harness(name)
+    under_test = parsers()[name]
     folder, corpus = OUT / name, OUT / name / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     for old in _findings_in(folder):
@@ -51,10 +51,9 @@ def fuzz(name: str, seconds: int) -> tuple[bool, str]:
     findings = _findings_in(folder)
     is_bad = bool(findings or done.returncode or not executions)
     found = f"status {done.returncode}, see {log}" if is_bad else "no finding"
-    said = [f"  {name}: {executions:,} executions, {features:,} features, {found}"]
-    for path in findings:
-        said.append(f"    python -m tests.fuzz show {name} {path.relative_to(ROOT)}")
-    return is_bad, "\n".join(said)
+    shown = [f"    python -m tests.fuzz show {name} {path.relative_to(ROOT)}" for path in findings]
+    said = f"  {name}: {executions:,} executions, {features:,} features, {found}"
+    return is_bad, "\n".join([said, *shown])
 
 
 def _findings_in(folder: Path) -> list[Path]:
@@ -68,20 +67,22 @@ def main() -> int:
     run = commands.add_parser("run", help="fuzz; exit status 1 if something was found")
     run.add_argument("--minutes", type=float, default=10.0, help="of wall time, for all (10)")
     run.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="parsers at a time")
-    run.add_argument("names", nargs="*", metavar="PARSER", help=f"of {', '.join(NAMES)}")
+    run.add_argument("names", nargs="*", metavar="PARSER", help=f"of {', '.join(parsers())}")
     show = commands.add_parser("show", help="run one input again")
-    show.add_argument("name", choices=NAMES)
+    show.add_argument("name", choices=parsers())
     show.add_argument("file", type=Path)
     options = parser.parse_args()
     if options.command == "show":
         data = options.file.read_bytes()
         print(to_line(data))
-        harness(options.name).run(data)
+        parsers()[options.name].run(data)
         print("nothing is wrong with this")
         return 0
-    names = options.names or NAMES
-    if wrong := set(names) - set(NAMES):
-        parser.error(f"no such parser: {', '.join(sorted(wrong))}; there are {', '.join(NAMES)}")
+    names = options.names or parsers()
+    if wrong := set(names) - set(parsers()):
+        parser.error(
+            f"no such parser: {', '.join(sorted(wrong))}; there are {', '.join(parsers())}"
+        )
     if importlib.util.find_spec("atheris") is None:
         print("the fuzzer, atheris, is not installed; it has wheels for Linux and few Pythons")
         return 2

@@ -8,8 +8,8 @@ import sys
 import atheris
 
 with atheris.instrument_imports(include=["noack", "netem", "cosim", "tests", "tomllib", "shlex"]):
-    from tests.fuzz.harness import harness
+    from tests.fuzz.harness import parsers
 
-    under_test = harness(sys.argv[1])
+    under_test = parsers()[sys.argv[1]]
 atheris.Setup([sys.argv[0], *sys.argv[2:]], under_test.run)
 atheris.Fuzz()

@@ -9,11 +9,11 @@ import sys
 import time
 from pathlib import Path
 
-from tests.fuzz.harness import harness
+from tests.fuzz.harness import parsers
 
 name, corpus, until, *flags = sys.argv[1:]
 (prefix,) = (flag.partition("=")[2] for flag in flags if flag.startswith("-artifact_prefix="))
-under_test, finding = harness(name), Path(f"{prefix}crash-input")
+under_test, finding = parsers()[name], Path(f"{prefix}crash-input")
 waiting = [path.read_bytes() for path in sorted(Path(corpus).iterdir())]
 end_s, count = time.monotonic() + int(until.partition("=")[2]), 0
 chosen = random.Random(time.time_ns())

@@ -5,6 +5,7 @@ import shlex
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,33 @@ import pytest
 
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
 from tests.netem.capture.batches import file_of
-from tests.netem.capture.conftest import Tshark
+
+Tshark = Callable[..., str]
+
+
+@pytest.fixture
+def tshark(tmp_path: Path) -> Tshark:
+    """Run tshark on a file and return its output; it must report no error."""
+    program = shutil.which("tshark")
+    if program is None:
+        pytest.skip("tshark is not installed")
+
+    def run(capture: Path, *arguments: str) -> str:
+        done = subprocess.run(
+            [
+                program, "-n", "-r", str(capture),
+                "-o", "udp.check_checksum:TRUE", "-o", "ip.check_checksum:TRUE", *arguments,
+            ],
+            env={"HOME": str(tmp_path), "LC_ALL": "C.UTF-8", "PATH": "/usr/bin:/bin"},
+            capture_output=True, text=True, check=False, timeout=60,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        complaints = [line for line in done.stderr.splitlines() if "dangerous" not in line]
+        assert complaints == []
+        return done.stdout
+
+    return run
+
 
 DOCS = Path(__file__).parents[3] / "docs"
 RUN = 0x0123_4567_89AB_CDEF

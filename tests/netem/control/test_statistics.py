@@ -1,14 +1,21 @@
-"""Statistics of constructed reports: as a document, as a view on a terminal, and as lines."""
+"""Statistics of constructed reports, as a document, on a terminal and as lines; and their page."""
 
 import io
 import json
+import re
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict
-from typing import Any, cast
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, cast, get_type_hints
 
 import pytest
 from rich.console import Console
 
+from netem.__main__ import main
+from netem.control import emulator_statistics
+from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import (
     AppliedSettings,
     DirectionStatistics,
@@ -17,11 +24,13 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.control.statistics_view import History, plain_lines, render
+from netem.fates import SCHEMA, FateRecorder
 from netem.relay_links import FlowReport
 from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.netem.control.relays import FakeRelay, times
+from tests.netem.control.relays import FakeRelay, running, times
+from tests.netem.fates.links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
@@ -141,7 +150,7 @@ def test_a_link_is_shown_with_the_numbers_of_both_directions() -> None:
     relay.unintended["lost_in_kernel"] = 1234
     text = " ".join(" ".join(text_of(relay)).replace("│", " ").split())
     for shown in (
-        "[bold]up 127.0.0.1:5000 → [::1]:6000 1 client", "loss 10% delay 10ms mansd 2", "no impairment",
+        "[bold]up 127.0.0.1:5000 → [::1]:6000 1 client", "loss 10% delay 10ms mansd 2",
         "received 2,000/s", "1.60 Mbit/s", "forwarded 1,600/s", "1.28 Mbit/s", "loss 20.0 %",
         "drawn 20.0 %, predicted 9.91 %", "lost 600 dropped 0", "burst 2, cap 2", "300 forced",
         "0, no cap", "in flight 5, max 0", "unintended losses: 1,234 lost in kernel (forward)",
@@ -200,3 +209,62 @@ def test_the_history_of_the_last_minute() -> None:
     every_ten.add(sample(50, 7, seconds=10))
     every_ten.add(sample(60, 9, seconds=10))
     assert series(every_ten, 12) == [None] * 8 + [7, 7, 9, 9]
+
+
+PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
+
+
+def rows(title: str) -> dict[str, str]:
+    """Return the table with this title as a mapping from first column to second column."""
+    (table,) = re.findall(rf"^\| {title} \| \|\n\|---\|---\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    return dict(row.strip("| \n").split(" | ", 1) for row in table.splitlines())
+
+
+def names(text: str) -> set[str]:
+    return set(re.findall("`([a-z0-9_]+)`", text))
+
+
+def explained() -> dict[str, Any]:
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main(["--explain", "--json", "loss 5%"]) == 0
+    (link,) = json.loads(out.getvalue())["links"]
+    return dict(link)
+
+
+@pytest.mark.parametrize(
+    ("title", "keys"),
+    [
+        ("document", get_type_hints(emulator_statistics.Statistics)),
+        ("link", get_type_hints(emulator_statistics.LinkStatistics)),
+        ("direction", get_type_hints(emulator_statistics.DirectionStatistics)),
+        ("recent", get_type_hints(emulator_statistics.RecentRates)),
+        ("column", dict.fromkeys(SCHEMA.names)),
+        ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
+        ("explained link", explained()),
+        ("explained direction", explained()["forward"]),
+    ],
+)
+def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) -> None:
+    assert set().union(*map(names, rows(title))) == set(keys)
+    text = rows("direction")
+    assert names(text["`loss`"]) == set(get_type_hints(emulator_statistics.LossStatistics))
+    assert names(text["`flows`"]) == set(get_type_hints(emulator_statistics.FlowStatistics))
+    assert names(text["`delay_ns`"]) == set(get_type_hints(emulator_statistics.DelayQuantiles))
+
+
+def test_the_documented_programs_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first controls an emulator, the second reads the metadata of a fate trace."""
+    relay = FakeRelay("relay")
+    change, read = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    with running(relay) as commands, ControlServer("lab", commands):
+        exec(change, {})
+    assert capsys.readouterr().out == "None\n"
+    assert relay.settings["relay", "reverse"].mansd == 2
+    with FateRecorder(tmp_path / "monday.parquet", [spec_of(settings_of("mansd 3"), "relay")]):
+        pass
+    monkeypatch.chdir(tmp_path)
+    exec(read, {})
+    assert capsys.readouterr().out.split() == [version("noack"), "0", "3"]

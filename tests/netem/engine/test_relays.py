@@ -1,7 +1,6 @@
 """The externally visible behaviour of the relay."""
 
 import errno
-import io
 import os
 import resource
 import socket
@@ -322,20 +321,3 @@ def test_taps_receive_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
     assert tap.departures == report.forward.counters.forwarded
     assert report.forward.delays.sum() == tap.departures
     assert report.forward.lateness.sum() == 0
-
-
-def test_the_relay_continues_if_standard_error_is_unusable(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Broken(io.TextIOBase):
-        def write(self, text: str, /) -> int:
-            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
-
-    with endpoints(V4, V4, V4) as (server, first, second):
-        for stderr in (Broken(), None):
-            monkeypatch.setattr(sys, "stderr", stderr)
-            with running([link(name_of(server), most_clients=1)]) as one:
-                first.sendto(b"1", one.address())
-                one.settle(1)
-                second.sendto(b"refused", one.address())
-                one.until(lambda one=one: one.report().refused == 1)
-                first.sendto(b"2", one.address())
-                assert [data for data, _ in one.receive(server, 2)] == [b"1", b"2"]

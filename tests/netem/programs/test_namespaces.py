@@ -19,7 +19,7 @@ from noack.core.errors import ExitStatus
 from noack.runtime.address import text_of
 from noack.runtime.udp_sockets import enlarge_buffer
 from tests.attacks.attacked import unread_bytes
-from tests.attacks.sender import enter_namespace
+from tests.attacks.kinds import enter_namespace
 from tests.netem.conftest import Emulate
 
 SLOW_LINE = ("tbf", "rate", "800kbit", "burst", "40kb", "limit", "40kb")

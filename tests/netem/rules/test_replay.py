@@ -86,15 +86,6 @@ def test_a_packet_that_must_pass_has_the_delay_of_the_last_that_was_received() -
     assert found == [15 * MS, -1, 15 * MS, 5 * MS // 2]
 
 
-def test_recorded_reordering_is_kept_as_far_as_the_guarantee_allows() -> None:
-    steps = [(0, 50 * MS), (10 * MS, 50 * MS), (10 * MS, 5 * MS), (10 * MS, 5 * MS)]
-    arrivals = [0, 10 * MS, 20 * MS, 30 * MS]
-    assert outcomes(link_of(replay(steps)), arrivals) == [50 * MS, 50 * MS, 5 * MS, 5 * MS]
-    # Packet 2 may make one of the packets 0 and 1 stale; it leaves at 50 ms, with packet 0.
-    found = outcomes(link_of(replay(steps), mansd=1), arrivals)
-    assert found == [50 * MS, 50 * MS, 30 * MS, 20 * MS]
-
-
 def test_a_random_place_is_drawn_by_the_seed_for_all_flows_uniformly() -> None:
     steps = [(0 if k == 0 else MS, k * MS) for k in range(10)]
     first = []
