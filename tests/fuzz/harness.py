@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 
 from noack.core.errors import NoackError
-from tests.fuzz.choices import SEEDS
+from tests.fuzz.edits import SEEDS
 
 FOLDER = Path(__file__).parent
 CORPUS = FOLDER / "corpus"

@@ -163,7 +163,7 @@ def test_machines_of_any_numbers_are_refused_or_run_clean(
 ANY_DOUBLE = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32), st.integers(1, 20), st.integers(1, 3), st.sampled_from([*TABLES, ""]))
 def test_random_batches(seed: int, n: int, m: int, policy: str) -> None:
     rng = np.random.default_rng(seed)
@@ -175,7 +175,7 @@ def test_random_batches(seed: int, n: int, m: int, policy: str) -> None:
     assert [len(one.event_s) for one in events] == rows["transmissions"].tolist()
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.data(), st.integers(1, 9), st.sampled_from(range(5)), st.booleans())
 def test_matrices_and_states_of_any_numbers(
     data: st.DataObject, n: int, measure: int, area: bool

@@ -128,6 +128,7 @@ OUT_OF_ORDER = "not counting packets delivered out of order (stale)"
     ("words", "note"),
     [
         ("loss 5% delay 10ms", ""),
+        ("loss 5% rate 1mbit codel", "as long as no queue overflows or CoDel drops"),
         ("delay 10ms 2ms loss 5%", OUT_OF_ORDER),
         ("delay 10ms 2ms mansd 0", ""),
         ("delay 0 samples 1ms,2ms", OUT_OF_ORDER),

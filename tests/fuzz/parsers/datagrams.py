@@ -11,7 +11,7 @@ from noack.core.errors import PeerError
 from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
 from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header
 from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
-from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness, refusal
 from tests.wire_decoder import Decoder
 

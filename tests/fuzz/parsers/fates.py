@@ -10,10 +10,8 @@ from netem.fates import METADATA, SCHEMA, description, read_fates
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import LinkSettings
-from tests.fuzz.choices import Choices
-from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.edits import Choices, Vocabulary, edited, edited_table, written
 from tests.fuzz.harness import Harness, refusal, workspace
-from tests.fuzz.tables import edited_table, written
 from tests.oracles.link import Link
 
 _LATEST_NS = 2**62

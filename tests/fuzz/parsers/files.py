@@ -34,8 +34,18 @@ from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, validate
 from noack.scenario.toml_file import json_schema
 from noack.settings.user_files import NamedFile
-from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import Vocabulary, bases, edited, key, quoted, value, vocabulary, write_named
+from tests.fuzz.edits import (
+    EDITS,
+    Choices,
+    Vocabulary,
+    bases,
+    edited,
+    key,
+    quoted,
+    value,
+    vocabulary,
+    write_named,
+)
 from tests.fuzz.harness import FOLDER, Harness, refusal, workspace
 from tests.oracles.capture_files import ETHERNET, LINKS, Sent, pcap_of, pcapng_of
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
-from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Choices
 from tests.fuzz.harness import Harness
 from tests.netem.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
 

@@ -16,11 +16,19 @@ from netem.tc_words import json_schema, load_links, parse, settings_of, tc_comma
 from noack.core.errors import CallerError
 from noack.impairments.kinds.delay import SHAPES
 from noack.impairments.link_settings import LinkSettings
-from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import NAMED, Vocabulary, edited, quoted, vocabulary, write_named
+from tests.fuzz.edits import (
+    EDITS,
+    NAMED,
+    Choices,
+    Vocabulary,
+    damaged,
+    edited,
+    quoted,
+    vocabulary,
+    write_named,
+)
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import Query
-from tests.fuzz.tables import damaged
 from tests.netem.any_settings import words_can_say
 from tests.netem.control.relays import FakeRelay
 from tests.netem.feature_examples import CONSTRAINED, IMPAIRED

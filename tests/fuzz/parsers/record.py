@@ -39,11 +39,9 @@ from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_o
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.summaries import alone
-from tests.fuzz.choices import Choices
-from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.fuzz.tables import damaged, edited_table, written
 
 SCENARIO = {
     "name": "short", "horizon_s": 0.05, "model": {"name": "double_integrator"},

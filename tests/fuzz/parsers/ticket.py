@@ -29,11 +29,9 @@ from noack.scenario.runtime_parameters import SHORT
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.scenario.toml_file import json_schema
-from tests.fuzz.choices import EDITS, Choices
-from tests.fuzz.edits import Vocabulary, bases, edited, vocabulary
+from tests.fuzz.edits import EDITS, Choices, Vocabulary, bases, damaged, edited, vocabulary
 from tests.fuzz.harness import Harness, refusal, workspace
 from tests.fuzz.plane import FakePlane, Query, Sample
-from tests.fuzz.tables import damaged
 
 _TICKET = join_ticket.new_ticket(
     resolve(validate(bases("scenarios")[0], "base")), Path("run"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
-from tests.netem.capture.batches import file_of
+from tests.netem.capture.reader import file_of
 
 Tshark = Callable[..., str]
 

@@ -19,8 +19,17 @@ from netem.capture import CaptureWriter, PcapngSection
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import Fate
-from tests.netem.capture.batches import INTERFACES, SPECS, T_NS, batch, events, file_of
-from tests.netem.capture.reader import Datagram, datagram, read
+from tests.netem.capture.reader import (
+    INTERFACES,
+    SPECS,
+    T_NS,
+    Datagram,
+    batch,
+    datagram,
+    events,
+    file_of,
+    read,
+)
 
 
 @given(st.lists(events, max_size=5))

@@ -68,6 +68,7 @@ def test_addresses() -> None:
         ("-a --seed 1 seed 1", "--seed 1: the words have seed 1 already"),
         ("-a --both --reverse loss 5%", "--reverse and --both exclude each other"),
         ("-a --one-way --reverse loss 5%", "--one-way: no reverse direction"),
+        ("-a --idle 5", "--idle 5: expected a time in s, ms, us or ns"),
         ("-a --idle 0", "--idle 0: must be more than 0"),
         ("-a loss trace no.txt", "no.txt: cannot be read: No such file"),
         ("-a --loss bernoulli:0.3", "--loss: write words without the dashes, e.g. loss 30%"),
@@ -135,8 +136,8 @@ def test_every_word_is_in_the_help_and_has_an_example() -> None:
 
 
 MUCH = (
-    "loss 5% 50% delay 10ms 11ms distribution normal lossrel 50% reorder 5% blackout 1s-2s "
-    "loss gemodel 1% 10% 70% 0.1% duplicate 1% rate 1mbit mansd 3 first limit 7"
+    "loss 5% 50% delay 10ms 11ms 5% delay 1ms 1ms distribution normal lossrel 50% reorder 5% "
+    "blackout 1s-2s corrupt 1% duplicate 1% rate 1mbit codel mansd 3 first limit 7"
 )
 
 

@@ -25,8 +25,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
 from tests.netem.conftest import Emulate
 from tests.netem.control import relays
-from tests.netem.control.processes import press_q, read_until, terminal
-from tests.netem.control.relays import FakeRelay
+from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal
 from tests.netem.engine.relays import endpoints
 from tests.netem.fates.links import spec_of
 

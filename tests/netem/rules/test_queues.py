@@ -344,16 +344,6 @@ def test_a_packet_that_must_pass_leaves_although_the_queue_is_full() -> None:
     assert decisions == [(0, 100), (4, -1), (2, 200), (4, -1), (2, 300)]
 
 
-def test_the_queue_survives_a_change_of_the_schedule() -> None:
-    """What waits has its departure; what arrives later leaves after it, by the new schedule."""
-    old, new = (Opportunities(times_ms=t, queue=3) for t in ((10,), (7,)))
-    link = Link(LinkSettings(impairments=(old,)), 0, "test")
-    assert [link.decide(0, 1472, 0).release_ns // MS for _ in range(3)] == [10, 20, 30]
-    link.change(LinkSettings(impairments=(new,)))
-    assert link.decide(0, 1472, 5 * MS).fate == 4  # the queue is still full
-    assert link.decide(0, 1472, 12 * MS).release_ns == 42 * MS  # 35 is the one after 30
-
-
 def test_the_longest_delay_is_that_of_a_full_queue() -> None:
     for times_ms, queue in (((7,), 1), ((0, 3, 4, 20), 5), ((1, 1, 1, 9, 30), 11)):
         settings = Opportunities(times_ms=times_ms, queue=queue)
