@@ -58,9 +58,10 @@ def test_a_missing_or_broken_or_other_library_is_refused_in_one_line(tmp_path: P
         path = tmp_path / f"{number}.so"
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(CallerError, match="not of the same" if number == 3 else "") as error:
+        with pytest.raises(CallerError) as error:
             load_core(path)
-        assert str(path) in str(error.value)
+        says = str(path) if number < 3 else "not of the same sources"
+        assert says in str(error.value)
         assert "make setup" in str(error.value)
         assert str(error.value).isprintable()
 

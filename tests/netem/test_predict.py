@@ -85,6 +85,7 @@ def test_losses_follow_the_closed_form() -> None:
         "delay 1ms 1ms loss 30% reorder 20% mansd 2",
         "loss 40% atmost 3 in 8 atmost 5 in 16 recover 2 mansd 2",
         "loss 30% 60% atmost 2 in 9",
+        "loss 60% mansd 3 recover 4",
         "loss burst 20% 4 mansd 3 recover 2",
         "loss gemodel 5% 2% 97% 10% atmost 4 in 12",
         "loss periodic 3/20 loss 20% atmost 2 in 7",

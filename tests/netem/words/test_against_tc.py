@@ -8,25 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import settings as example_settings
-from hypothesis import strategies as st
 
 from netem.tc_words import settings_of, tc_command
 from noack.core.errors import CallerError
-from noack.impairments.disciplines.tail_drop import TailDrop
-from noack.impairments.kinds import AnyImpairment
-from noack.impairments.kinds.corrupt import Corrupt
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.loss import LossOf
-from noack.impairments.kinds.rate import Rate
-from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.four_state import FourStateLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.lossless import NoLoss
 from tests.netem.any_settings import settings as any_settings
-from tests.netem.any_settings import varied
 
 _SHIM = """
 #include <sys/socket.h>
@@ -125,63 +113,6 @@ def test_words_that_only_tc_has_are_refused(tc: Tc) -> None:
         assert tc.request(words) is not None
         with pytest.raises(CallerError, match="this emulator"):
             settings_of(words)
-
-
-times_s = st.floats(3e-6, 200)
-"""From tc's smallest to its largest time, in 32 bits."""
-probabilities = st.floats(0, 1)
-correlations = st.floats(0, 1, exclude_max=True)
-tcs_losses = st.one_of(
-    [varied(model) for model in (NoLoss, BernoulliLoss, GilbertElliottLoss, FourStateLoss)]
-).filter(lambda loss: not loss.tc_lacks(()))
-tcs_delays = st.builds(
-    Delay,
-    delay_s=times_s,
-    jitter_s=times_s,
-    correlation=correlations,
-    distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
-)
-tcs_reorders = st.builds(
-    Reorder, probability=st.floats(1e-6, 1), correlation=correlations, gap=st.integers(1, 2**32 - 1)
-)
-
-
-@st.composite
-def tcs_settings(draw: st.DrawFn) -> LinkSettings:
-    """Settings that tc supports; a reorder comes after a delay, all others anywhere."""
-    chance = {"probability": probabilities}
-    chain: list[AnyImpairment] = draw(
-        st.lists(
-            st.one_of(
-                st.builds(LossOf, loss=tcs_losses),
-                st.builds(Duplicate, **chance),
-                st.builds(Corrupt, **chance, correlation=correlations),
-                varied(Rate).filter(lambda rate: isinstance(rate.discipline, TailDrop)),
-            ),
-            unique_by=lambda one: one.kind,
-        )
-    )
-    if draw(st.booleans()):
-        place = draw(st.integers(0, len(chain)))
-        chain.insert(place, draw(tcs_delays))
-        if draw(st.booleans()):
-            chain.insert(draw(st.integers(place + 1, len(chain))), draw(tcs_reorders))
-    return LinkSettings(impairments=tuple(chain), limit=draw(st.integers(1, 1_000_000)))
-
-
-@example_settings(max_examples=40)
-@given(settings=tcs_settings())
-def test_tc_understands_the_command_that_it_is_given(tc: Tc, settings: LinkSettings) -> None:
-    command = tc_command(settings)
-    assert command.words is not None
-    assert command.lacks == ()
-    assert tc.request(command.words) is not None
-    again = settings_of(with_overhead(ETHERNET_BYTES, command.words))
-    assert tc_command(again) == command
-    assert again.limit == settings.limit
-    assert [one.kind for one in again.impairments] == [
-        one.kind for one in settings.impairments if one.tc_text()
-    ]
 
 
 @example_settings(max_examples=40)

@@ -122,6 +122,7 @@ def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> 
         ("loss periodic 2", "loss periodic 2: expected losses per packets, e.g. 2/100"),
         ("loss script 3,x", "loss script 3,x: expected the numbers of the lost packets"),
         ("delay", "delay: a value is missing: a time in s, ms, us or ns, e.g. 10ms"),
+        ("loss 1e999%", "loss 1e999%: no such word"),
         ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 1ms lossrel 5%", "lossrel: needs a loss before it"),
         ("delay 4000s", "delay 4000s: delay_s should be less than or equal to 3600"),
@@ -238,6 +239,8 @@ CONTRADICTIONS = [
     (one("replay", sent_ns=[0], delays_ns=[1], clocks_differ=True), "clocks_differ"),
     (loss("four_state", p13=0.6, p31=0.1, p14=0.6), "p13"),
     (loss("gilbert_elliott", mean_loss=0.1, mean_burst=2.0, state="link"), "step_s"),
+    (loss("gilbert_elliott", mean_loss=0.1, mean_burst=2.0, loss_in_bad=0.5), "mean_loss"),
+    (loss("periodic", period=2, burst=3), "burst"),
 ]
 
 
