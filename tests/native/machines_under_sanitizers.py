@@ -134,10 +134,12 @@ def test_random_machines(
 
 
 @settings(max_examples=15)
-@given(roles, sizes(64), st.integers(0, 2**16), inputs)
-def test_large_machines(role: str, of: Sizes, seed: int, given_inputs: list[Any]) -> None:
+@given(roles, sizes(64), st.integers(0, 2**16), st.sampled_from([1.0, 1e308]), inputs)
+def test_large_machines(
+    role: str, of: Sizes, seed: int, scale: float, given_inputs: list[Any]
+) -> None:
     with np.errstate(all="ignore"):
-        drive(machines_of(role, [(of, seed)], 1e308), given_inputs)
+        drive(machines_of(role, [(of, seed)], scale), given_inputs)
 
 
 @settings(max_examples=150)

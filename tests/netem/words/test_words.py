@@ -122,7 +122,7 @@ def test_all_settings_survive_being_written_and_read(settings: LinkSettings) -> 
         ("loss periodic 2", "loss periodic 2: expected losses per packets, e.g. 2/100"),
         ("loss script 3,x", "loss script 3,x: expected the numbers of the lost packets"),
         ("delay", "delay: a value is missing: a time in s, ms, us or ns, e.g. 10ms"),
-        ("loss 1e999%", "loss 1e999%: no such word"),
+        ("loss 1e999%", "loss 1e999%: expected a percentage from 0% to 100%"),
         ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 1ms lossrel 5%", "lossrel: needs a loss before it"),
         ("delay 4000s", "delay 4000s: delay_s should be less than or equal to 3600"),
