@@ -189,9 +189,7 @@ COMMANDS = (
     "archive {run} --out {out}/a.noack.zip",
     "export {run} --format mat --out {out}/run.mat",
     "export {run} --format mcap --out {out}/run.mcap",
-    "export {run} --format csv --out {out}/tables",
     "compare {run} {run} --out {out}/compare.html",
-    "fidelity {run} --out {out}/fidelity.svg",
     "measure rural_n8_10kmh --out {out}/page.html --format svg --write {out}/network.toml",
     "campaign {campaign} --workers 1 --out {out}/campaign",
 )
