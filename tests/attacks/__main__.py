@@ -7,35 +7,23 @@ from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from benchmarks.programs import two_hosts
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
-from tests.attacks.attacked import Attacked, attack, may_forge_addresses
-from tests.attacks.checks import CHECKS
-
-_WIDTH = 120
+from tests.attacks.attacked import CHECKS, Attacked, attack, may_forge_addresses
 
 
-def table_of(run: Attacked) -> Table:
-    """Return a table by port: datagrams sent by kind, rejected by reason, and accepted."""
-    table = Table("", *LOOP_ROLES, title="Hostile datagrams at each port")
-    columns = []
-    for role in LOOP_ROLES:
-        channel, peer_sent = run.channel(role), run.channel(sender_to(role, RECEIVES[role]))["sent"]
-        column: Counter[str] = Counter()
-        for (to, sender, kind, _), number in run.sent.items():
-            if to == role:
-                column[f"sent, {sender}: {kind}"] += number
-        column.update({f"rejected: {reason}": n for reason, n in channel["rejected"].items()})
-        column["lost in the kernel, of the peer's"] = channel["kernel_drops"]
-        column["accepted, of the peer's"] = run.accepted(role)
-        column["accepted, others"] = run.accepted(role) - peer_sent
-        columns.append(column)
-    for label in dict.fromkeys(label for column in columns for label in column):
-        table.add_row(label, *(f"{column[label]:,}" for column in columns))
-    return table
+def counts_at(run: Attacked, role: str) -> Counter[str]:
+    """Return the datagrams at a port: sent by kind, rejected by reason, and accepted."""
+    channel, peer_sent = run.channel(role), run.channel(sender_to(role, RECEIVES[role]))["sent"]
+    counts: Counter[str] = Counter()
+    for (to, sender, kind), number in run.sent.items():
+        if to == role:
+            counts[f"sent, {sender}: {kind}"] += number
+    counts.update({f"rejected: {reason}": n for reason, n in channel["rejected"].items()})
+    counts["lost in the kernel, of the peer's"] = channel["kernel_drops"]
+    counts["accepted, of the peer's"] = run.accepted(role)
+    counts["accepted, others"] = run.accepted(role) - peer_sent
+    return counts
 
 
 def main() -> int:
@@ -56,10 +44,10 @@ def main() -> int:
         hosts = stack.enter_context(two_hosts()) if options.hosts else None
         run = attack(Path(folder), options.number, options.rate, forge_addresses=forge, hosts=hosts)
         # The record is read from the folder.
-        console = Console()
-        if not console.is_terminal:
-            console.width = _WIDTH
-        console.print(table_of(run))
+        for role in LOOP_ROLES:
+            print(f"hostile datagrams at the port of {role}")
+            for label, number in counts_at(run, role).items():
+                print(f"  {label}: {number:,}")
         held = sum(claim["verdict"] == "held" for claim in run.summary["loops"][0]["claims"])
         number = len(run.summary["loops"][0]["claims"])
         print(f"claims: {held} of {number} held, the others void with their reason")

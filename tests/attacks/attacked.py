@@ -1,4 +1,7 @@
-"""A run under attack, one process at a time, so that this user can read its ticket and key."""
+"""A run under attack, one process at a time, so that this user can read its ticket and key.
+
+The checks of such a run each yield one line per failure.
+"""
 
 import json
 import os
@@ -6,7 +9,7 @@ import socket
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,12 +28,12 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES, RECEIVES, sender_to
-from noack.protocol.wire_format import Flow
+from noack.protocol.wire_format import Flow, Rejection
 from noack.runtime.address import LOOPBACK
 from noack.runtime.join_ticket import Ticket, loads
+from noack.runtime.udp_sockets import SHED
 from noack.scenario.resolution import loop_of
-from tests.attacks.kinds import Target
-from tests.attacks.sender import Plan, Sent, carry_out
+from tests.attacks.kinds import Plan, Sent, Target, carry_out
 from tests.integration.conftest import PATIENCE_S, starting, wait_for
 
 AWAY = "controller"
@@ -57,15 +60,13 @@ class Attacked:
         relayed = len(self.record[NETEM_PACKET])
         return int(self.channel(role).get("accepted", relayed))
 
-    def sent_to(self, role: str) -> Counter[str]:
-        """Return how many hostile datagrams a process must reject, by reason."""
+    def sent_to(self, role: str, sender: str | None = None) -> Counter[str]:
+        """Return how many hostile datagrams were sent to a process, by kind."""
         total: Counter[str] = Counter()
-        for (to, _, _, reason), number in self.sent.items():
-            total[reason] += number * (to == role)
+        for (to, by, kind), number in self.sent.items():
+            if to == role and sender in (None, by):
+                total[kind] += number
         return total
-
-    def kinds_sent(self, role: str, sender: str) -> set[str]:
-        return {kind for to, by, kind, _ in self.sent if (to, by) == (role, sender)}
 
 
 def may_forge_addresses() -> bool:
@@ -173,7 +174,7 @@ def attack(
         pool.submit(carry_out, Plan((), 0, 1.0, False, 0.0)).result()  # the process has started
         for attempt in range(_ATTEMPTS):
             (folder / str(attempt)).mkdir()
-            horizon_s = 3**attempt * speed * (1.5 * sending_s + 7.0)
+            horizon_s = 3**attempt * speed * (1.5 * sending_s + 4.0)
             options = ("--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}")
             with ExitStack() as stack:
                 run = Run(stack, folder / str(attempt), hosts, *options)
@@ -205,12 +206,87 @@ def have_read(targets: list[Target], processes: Mapping[str, "subprocess.Popen[s
 def unread_bytes(pid: int) -> dict[int, int]:
     """Return the bytes that wait in the UDP sockets of a process's host, by port."""
     found: dict[int, int] = {}
-    for line in Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]:
-        _, local, _, _, queues, *_ = line.split()
-        port, waiting_bytes = (int(word.rpartition(":")[2], 16) for word in (local, queues))
-        found[port] = found.get(port, 0) + waiting_bytes
+    for name in ("udp", "udp6"):
+        for line in Path(f"/proc/{pid}/net/{name}").read_text().splitlines()[1:]:
+            _, local, _, _, queues, *_ = line.split()
+            port, waiting_bytes = (int(word.rpartition(":")[2], 16) for word in (local, queues))
+            found[port] = found.get(port, 0) + waiting_bytes
     return found
 
 
 def _addresses(hosts: TwoHosts) -> tuple[str, str]:
     return hosts.addresses[0][0], hosts.addresses[1][0]
+
+
+_TAKEN = {
+    "plant": PLANT_ACTUATION,
+    "sensor": SENSOR_MEASUREMENT,
+    "netem": NETEM_PACKET,
+    "controller": CONTROLLER_DELIVERY,
+}
+
+
+def ends_well(run: Attacked) -> Iterator[str]:
+    """The run reaches its horizon, and every process exits normally."""
+    if run.status != 0:
+        yield f"exit status {run.status}: {run.stderr.strip()}"
+    if run.summary["exit"]["reason"] != "horizon":
+        yield f"ended: {run.summary['exit']['reason']}"
+
+
+def nothing_is_accepted(run: Attacked) -> Iterator[str]:
+    """Each process accepted exactly as many datagrams as its peer sent."""
+    for role in LOOP_ROLES:
+        sent = run.channel(sender_to(role, RECEIVES[role]))["sent"]
+        taken = len(run.record[_TAKEN[role]])
+        if not sent == run.accepted(role) == taken:
+            yield f"{role}: {sent} from its peer, {run.accepted(role)} accepted, {taken} acted on"
+
+
+def all_are_accounted_for(run: Attacked) -> Iterator[str]:
+    """Each hostile datagram was rejected, for a reason that occurs."""
+    for role in LOOP_ROLES:
+        sent, rejected = run.sent_to(role).total(), run.channel(role)["rejected"]
+        if sum(rejected.values()) != sent:
+            yield f"{role}: {sent} sent, {rejected}"
+        if role == "netem" and not rejected.keys() <= {Rejection.SOURCE.value, SHED}:
+            yield f"the emulator verifies addresses only, {rejected}"
+
+
+def nothing_is_lost(run: Attacked) -> Iterator[str]:
+    """All datagrams of the loop arrive, and the record is complete."""
+    (loop,) = run.summary["loops"]
+    for key in ("unintended_losses", "missing_samples"):
+        if loop[key]:
+            yield f"{key}: {loop[key]}, {loop['unintended_losses_by_leg']}"
+    for role in LOOP_ROLES:
+        if run.channel(role)["kernel_drops"] not in (0, None):
+            yield f"{role}: {run.channel(role)['kernel_drops']} lost in the kernel"
+
+
+def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
+    """Replay gives the recorded outputs, and (I1) holds to rounding."""
+    (loop,) = run.summary["loops"]
+    if not (loop["replay"]["bit_exact"] and loop["replay"]["complete"]):
+        yield f"replay: {loop['replay']}"
+    if not loop["identity_residual_max"] < 1e-11:
+        yield f"identity residual {loop['identity_residual_max']}"
+
+
+def no_claim_is_violated(run: Attacked) -> Iterator[str]:
+    """No claim is violated; claims may be void because of deadlines missed on a busy machine."""
+    claims = run.summary["loops"][0]["claims"]
+    if not any("state" in claim["what"] and claim["certified"] is not None for claim in claims):
+        yield "no envelope of the state is claimed"
+    yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
+    violations = run.summary["loops"][0]["assumption_violations"]
+    yield from (str(one) for one in violations if one["cause"] == "dropouts")
+
+
+CHECKS: Mapping[str, Callable[[Attacked], Iterator[str]]] = {
+    check.__name__: check
+    for check in (
+        ends_well, nothing_is_accepted, all_are_accounted_for, nothing_is_lost,
+        the_loop_computes_what_it_should, no_claim_is_violated,
+    )
+}  # fmt: skip

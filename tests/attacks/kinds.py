@@ -1,10 +1,14 @@
-"""Hostile datagrams: one function per kind; no process may accept its datagrams.
+"""Hostile datagrams, one function per kind; the attacker sends each kind to each port in turn."""
 
-The attacker has the run's ports and id. To replay and misdirect datagrams, it also has the key.
-"""
-
+import ctypes
 import random
-from collections.abc import Callable, Mapping
+import socket
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +20,8 @@ from noack.protocol.wire_format import (
     Encoder,
     Flow,
     Message,
-    Rejection,
 )
 from noack.runtime.address import LOOPBACK
-from tests.wire_decoder import Decoder
 
 FUTURE = 2**40
 """A sequence number that no run reaches: greater than every accepted number."""
@@ -138,25 +140,97 @@ FROM_THE_PEER: Mapping[str, Make] = {
 """Kinds for the peer's address; with address and key, a sender cannot be told from the peer."""
 
 
-class Expected:
-    """The reason for which a target rejects a datagram; the network emulator rejects unknown
-    sources by their address alone."""
+STRANGER, PEER = "stranger", "forged address"
+_LONGEST_BURST_S = 0.02
+_DISTINCT = 5000
+"""Number of distinct datagrams per kind, sender and port."""
+_CLONE_NEWNET = 0x40000000
+_UDP_HEADER = struct.Struct("!HHHH")
 
-    def __init__(self, target: Target) -> None:
-        self._target = target
-        self._decoder = Decoder(target.flow, target.dimension, target.run_id, target.key)
-        assert self._decoder.decode(replayed(target, random.Random(0))) is not None
+Sent = Counter[tuple[str, str, str]]
+"""Numbers of datagrams by role, sender and kind."""
 
-    def reason(self, data: bytes, *, from_peer: bool) -> Rejection:
-        """Return the rejection reason.
 
-        Raises:
-            AssertionError: the target would accept the datagram.
-        """
-        if self._target.role == "netem":
-            assert not from_peer
-            return Rejection.SOURCE
-        before = dict(self._decoder.rejected)
-        assert self._decoder.decode(data, from_peer=from_peer) is None
-        (reason,) = (r for r, n in self._decoder.rejected.items() if n != before[r])
-        return reason
+@dataclass(frozen=True)
+class Plan:
+    """An attack."""
+
+    targets: Sequence[Target]
+    per_port: int
+    rate_hz: float
+    """Datagrams per second to each port."""
+    forge_addresses: bool
+    until_s: float
+    """Latest end on the monotonic clock, even if datagrams are left."""
+    namespace: str | None = None
+    """Network namespace of the attacker."""
+
+
+class _Sender:
+    """Sends from its own address or, if permitted, from a peer's address."""
+
+    def __init__(self, forge_addresses: bool) -> None:
+        self._plain = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
+        raw = (socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_UDP)
+        self._raw = socket.socket(*raw) if forge_addresses else None
+
+    def send(self, target: Target, sender: str, number: int, data: bytes) -> None:
+        if sender == STRANGER:
+            self._plain[number % 4].sendto(data, (target.host, target.port))
+            return
+        assert self._raw is not None
+        size = _UDP_HEADER.size + len(data)
+        header = _UDP_HEADER.pack(target.peer_port, target.port, size, 0)
+        self._raw.sendto(header + data, (target.host, target.port))
+
+
+def _datagrams(make: Make, target: Target, draw: random.Random) -> Iterator[bytes]:
+    """Yield datagrams of a kind; some repeat, because making them takes time."""
+    made: list[bytes] = []
+    while True:
+        if len(made) < _DISTINCT:
+            made.append(make(target, draw))
+        yield made[-1] if len(made) < _DISTINCT else draw.choice(made)
+
+
+def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
+    """Count at a steady rate; after a long stall, do not catch up in one burst."""
+    due_s = time.monotonic()
+    for number in range(count):
+        now_s = time.monotonic()
+        if now_s > until_s:
+            return
+        if due_s > now_s:
+            time.sleep(due_s - now_s)
+        due_s = max(due_s, now_s - _LONGEST_BURST_S)
+        yield number
+        due_s += 1 / rate_hz
+
+
+def enter_namespace(namespace: str) -> None:
+    """Move this process to a network namespace."""
+    with Path(f"/var/run/netns/{namespace}").open() as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), _CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns failed")
+
+
+def carry_out(plan: Plan) -> Sent:
+    """Attack; return the numbers of datagrams."""
+    if plan.namespace is not None:
+        enter_namespace(plan.namespace)
+    draw, sender, sent = random.Random(1), _Sender(plan.forge_addresses), Sent()
+    arms: list[list[tuple[str, str, Iterator[bytes]]]] = []
+    for target in plan.targets:
+        kinds = [(STRANGER, kind) for kind in FROM_ANYWHERE]
+        # The emulator accepts the sensor's address.
+        if plan.forge_addresses and target.is_forgeable and target.role != "netem":
+            kinds += [(PEER, kind) for kind in FROM_THE_PEER]
+        arms.append(
+            [(by, kind, _datagrams(FROM_ANYWHERE[kind], target, draw)) for by, kind in kinds]
+        )
+    for number in _paced(plan.per_port, plan.rate_hz, plan.until_s):
+        for target, of_target in zip(plan.targets, arms, strict=True):
+            by, kind, datagrams = of_target[number % len(of_target)]
+            sender.send(target, by, number, next(datagrams))
+            sent[target.role, by, kind] += 1
+    return sent

@@ -1,26 +1,39 @@
-"""The runtime folder in a world-writable place: other users get no access.
-
-Some tests imitate the other user's actions; tests that need a second user id are skipped without
-root.
-"""
+"""Folders in which other users may write: they get no access, and no planted name is followed."""
 
 import os
+import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import rerun.blueprint as rrb
+from typer.testing import CliRunner
 
+import noack
+from cosim.cli import app
 from cosim.doctor.machine_measures import _runtime_folder
+from cosim.measurement.live.live_measurement import ProbeRows
+from cosim.output.viewer.recording import RecordingFile
+from cosim.record.run_directory import ENDING_FILE, RECORD, RECORDING_FILE, EndingFile, finished_run
+from netem.capture import CaptureWriter
 from netem.control import control_server as emulator_session
-from noack.core.errors import CallerError
+from netem.fates import FateRecorder
+from netem.relay_links import LinkSpec
+from noack.core.errors import CallerError, NoackError
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime import run_registry
-from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, published
+from noack.runtime.join_ticket import Ticket, find_ticket, new_ticket, published, write_invitation
+from noack.runtime.spool import SPOOL, SpoolWriter
+from noack.scenario.matrix_files import write_matrices
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 from tests.attacks.other_user import NOBODY, needs_root
+from tests.noack.runtime.test_invitation import INVITED
 
 OWN = f"noack-{os.getuid()}"
 EMULATOR = "lab"
@@ -68,36 +81,29 @@ USES: dict[str, Use] = {
 }
 
 
-@pytest.mark.parametrize("use", USES.values(), ids=USES)
-def test_a_symbolic_link_instead_of_the_folder_is_refused(
-    use: Use, shared: Path, ticket: Ticket
+INSIDE = [
+    ("runs", "publish a run"), ("runs", "find a run"),
+    ("netem", "publish an emulator"), ("netem", "list emulators"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("place", "use"), [*INSIDE, *(("", use) for use in USES)])
+def test_a_symbolic_link_instead_of_a_folder_is_refused(
+    place: str, use: str, shared: Path, ticket: Ticket
 ) -> None:
     """Even a link to this user's own folder: its owner can change the target at any time."""
     own = shared / "own"
-    for folder in (own, own / "runs", own / "netem"):
+    for folder in (own, own / "runs", own / "netem", shared / OWN):
         folder.mkdir(mode=0o700)
+    if not place:
+        (shared / OWN).rmdir()
     (own / "default.json").write_text(ticket.model_dump_json())
-    (shared / OWN).symlink_to(own)
-    with pytest.raises(CallerError, match="closed to others"):
-        use(ticket)
-    assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "use"),
-    [
-        ("runs", "publish a run"), ("runs", "find a run"),
-        ("netem", "publish an emulator"), ("netem", "list emulators"),
-    ],
-)  # fmt: skip
-def test_a_folder_of_another_user_inside_is_refused(
-    kind: str, use: str, shared: Path, ticket: Ticket
-) -> None:
-    for folder in (shared / OWN, shared / "own"):
-        folder.mkdir(mode=0o700)
-    (shared / OWN / kind).symlink_to(shared / "own")
+    (shared / OWN / place).symlink_to(own)
     with pytest.raises(CallerError, match="closed to others"):
         USES[use](ticket)
+    if not place:
+        assert "closed to others" in str(_runtime_folder())  # the doctor reports it
+    assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
 
 
 def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(
@@ -166,15 +172,187 @@ def test_only_regular_files_are_read(shared: Path) -> None:
         join()
 
 
-def test_the_doctor_reports_a_folder_that_cannot_be_used(shared: Path) -> None:
-    (shared / "own").mkdir(mode=0o700)
-    (shared / OWN).symlink_to(shared / "own")
-    assert "closed to others" in str(_runtime_folder())
-
-
 def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     assert find_ticket("default") is None
     with pytest.raises(CallerError, match="no run is active"):
         run_registry.find()
     assert emulator_session.running() == []
     assert not (shared / OWN).exists()
+
+
+PRIVATE = b"mine alone"
+ENDS = ("127.0.0.1", 9000), ("127.0.0.1", 9001)
+SPEC = LinkSpec("link", *ENDS, LinkSettings(), LinkSettings())
+COMMANDS = (
+    "certify lane_weighted --out {out}/cert.mat",
+    "certify lane_weighted --tables {out}/tables",
+    "archive {run} --out {out}/a.noack.zip",
+    "export {run} --format mat --out {out}/run.mat",
+    "export {run} --format mcap --out {out}/run.mcap",
+    "compare {run} {run} --out {out}/compare.html",
+    "measure rural_n8_10kmh --out {out}/page.html --format svg --write {out}/network.toml",
+    "campaign {campaign} --workers 1 --out {out}/campaign",
+)
+CAMPAIGN = """\
+name = "tiny"
+scenario = "lane_following"
+seed = 1
+draws = 2
+[settings]
+horizon_s = 1.0
+[[axes]]
+name = "beta"
+key = "trigger.beta"
+values = [0.5]
+"""
+
+
+PLANTS: dict[str, Callable[[Path, Path], None]] = {
+    "symbolic link": Path.symlink_to,
+    "hard link": Path.hardlink_to,
+    "FIFO": lambda path, _: os.mkfifo(path),
+    "folder": lambda path, _: path.mkdir(),
+}
+LINKS = ("symbolic link", "hard link")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scenario = noack.load("lane_following", {"horizon_s": 1.0})
+    return noack.simulate(scenario, runs=tmp_path_factory.mktemp("runs")).directory
+
+
+@pytest.fixture
+def private(tmp_path: Path) -> Path:
+    path = tmp_path / "private" / "precious"
+    path.parent.mkdir()
+    path.write_bytes(PRIVATE)
+    return path
+
+
+@pytest.fixture
+def common(tmp_path: Path) -> Path:
+    """A folder in which every user may write, as in a group without the sticky bit."""
+    path = tmp_path / "shared"
+    path.mkdir()
+    path.chmod(0o777)
+    return path
+
+
+def planted(plant: str, common: Path, names: Sequence[Path], private: Path) -> None:
+    for name in names:
+        old = name.with_suffix(name.suffix + ".partial")
+        for one in (name, old.with_name(f".{old.name}"), name.with_suffix(".partial")):
+            path = common / one
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not os.path.lexists(path):
+                PLANTS[plant](path, private)
+
+
+def untouched(private: Path) -> bool:
+    return private.read_bytes() == PRIVATE and [*private.parent.iterdir()] == [private]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_follows_no_planted_name(
+    command: str, run: Path, common: Path, private: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+
+    def invoke() -> int:
+        places = {"out": str(common), "run": str(run), "campaign": str(tmp_path / "campaign.toml")}
+        done = CliRunner().invoke(app, [word.format(**places) for word in command.split()])
+        assert not done.exception or isinstance(done.exception, SystemExit), done.exception
+        if done.exit_code:
+            assert done.stderr.count("\n") == 1
+        return done.exit_code
+
+    assert invoke() == 0
+    names = [one.relative_to(common) for one in common.rglob("*") if one.is_file()]
+    assert names
+    # A FIFO or a folder ends a command at the first name; two commands show that.
+    for plant in PLANTS if command.startswith("certify") else LINKS:
+        shutil.rmtree(common)
+        common.mkdir()
+        planted(plant, common, names, private)
+        status = invoke()
+        assert untouched(private), plant
+        if status == 0:
+            assert not any((common / name).is_symlink() for name in names)
+            assert all((common / name).stat().st_nlink == 1 for name in names)
+
+
+def probe_rows(path: Path) -> None:
+    with ProbeRows(path, print) as rows:
+        rows.add(1, 2)
+
+
+def lock_file(path: Path) -> None:
+    with finished_run(path.parent):
+        pass
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "trace.csv": probe_rows,
+    ".lock": lock_file,
+    "a.pcapng": lambda path: CaptureWriter(path, [SPEC]).close(),
+    "fates.parquet": lambda path: FateRecorder(path, [SPEC]).__exit__(),
+    "recording.rrd": lambda path: RecordingFile(path, "a", rrb.Blueprint(), indexed=True).close(),
+    ENDING_FILE: lambda path: EndingFile(path.parent).__exit__(None, None, None),
+    "plant_step.recorder": lambda path: SpoolWriter(path.parent, "recorder").append(
+        "plant_step", 0, b"rows"
+    ),
+    "invitation.json": lambda path: write_invitation(path, INVITED),
+    "a.npz": lambda path: write_matrices(path, {"A": np.eye(2)}),
+    "a.mat": lambda path: write_matrices(path, {"A": np.eye(2)}),
+}
+
+
+@needs_root
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_grows_or_is_locked_follows_no_planted_name(
+    name: str, plant: str, common: Path, private: Path
+) -> None:
+    planted(plant, common, [Path(name)], private)
+    for one in common.iterdir():
+        if plant != "hard link":
+            os.chown(one, NOBODY, NOBODY, follow_symlinks=False)
+    with suppress(NoackError, OSError):
+        WRITERS[name](common / name)
+        assert name == ".lock" or not (common / name).is_symlink()
+    assert untouched(private)
+
+
+@needs_root
+def test_a_folder_that_is_another_users_link_is_not_written_to(common: Path, private: Path) -> None:
+    (common / "tables").symlink_to(private.parent)
+    os.chown(common / "tables", NOBODY, NOBODY, follow_symlinks=False)
+    words = ["certify", "lane_weighted", "--tables", str(common / "tables")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert done.stderr.endswith(f"{common / 'tables'} is a symbolic link of another user\n")
+    assert untouched(private)
+    os.chown(common / "tables", os.getuid(), os.getgid(), follow_symlinks=False)
+    assert CliRunner().invoke(app, words).exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["loops", RECORD, ENDING_FILE, RECORDING_FILE, SPOOL])
+def test_an_unfinished_run_with_links_is_not_completed(
+    name: str, tmp_path: Path, private: Path
+) -> None:
+    """Of somebody else's run with a loop named "private", the folder of that name was removed."""
+    scenario = noack.load("shared_bottleneck", {"horizon_s": 0.2})
+    run_dir = noack.simulate(scenario, runs=tmp_path / "runs").directory
+    text = (run_dir / "scenario.toml").read_text()
+    (run_dir / "scenario.toml").write_text(text.replace('name = "loop-1"', 'name = "private"'))
+    (run_dir / "summary.json").unlink()
+    (run_dir / SPOOL).mkdir(exist_ok=True)
+    if (run_dir / name).is_dir():
+        shutil.rmtree(run_dir / name)
+    (run_dir / name).unlink(missing_ok=True)
+    (run_dir / name).symlink_to(tmp_path)
+    done = CliRunner().invoke(app, ["summary", str(run_dir)])
+    assert done.exit_code == 2
+    assert f"{run_dir / name}: is a symbolic link; a run directory has none" in done.stderr
+    assert untouched(private)

@@ -38,18 +38,9 @@ except urllib.error.HTTPError as error:
 CONTENT = b"RRF2 and more"
 
 
-@pytest.fixture
-def own_server(tmp_path: Path) -> Iterator[RecordingServer]:
-    yield from _serving(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RecordingServer]:
-    yield from _serving(tmp_path_factory.mktemp("served"))
-
-
-def _serving(folder: Path) -> Iterator[RecordingServer]:
-    path = folder / "recording.rrd"
+    path = tmp_path_factory.mktemp("served") / "recording.rrd"
     path.write_bytes(CONTENT)
     with RecordingServer(path, follow=False) as serving:
         serving.start_page()
@@ -75,22 +66,23 @@ def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage
 
 
 def test_only_the_printed_address_serves_the_page(server: RecordingServer) -> None:
+    """Through a forwarded port, too; and the browser sends no referrer."""
     address = server.address
-    status, headers, _ = ask(f"{address}?theme=light")
-    assert status == 302
-    query = parse_qs(urlsplit(headers["Location"]).query)
-    assert query == {"url": [address + RECORDING], "theme": ["light"]}
+    for host in (None, "localhost:4000"):
+        status, headers, _ = ask(f"{address}?theme=light", host)
+        assert status == 302
+        query = parse_qs(urlsplit(headers["Location"]).query)
+        (url,) = query["url"]
+        origin = server.origin if host is None else f"http://{host}"
+        assert url == address.replace(server.origin, origin) + RECORDING
+        assert query["theme"] == ["light"]
     status, _, page = ask(server.origin + headers["Location"])
     assert status == 200
     assert b"re_viewer.js" in page
     assert ask(address + "re_viewer.js")[0] == 200
-    assert ask(query["url"][0])[::2] == (200, CONTENT)
-
-
-def test_through_a_forwarded_port_the_page_finds_the_recording(server: RecordingServer) -> None:
-    _, headers, _ = ask(server.address, host="localhost:4000")
-    (url,) = parse_qs(urlsplit(headers["Location"]).query)["url"]
-    assert url.startswith("http://localhost:4000/")
+    assert ask(address + RECORDING)[::2] == (200, CONTENT)
+    for path in (address, f"{address}?url=x", address + RECORDING, f"{server.origin}/"):
+        assert ask(path)[1]["Referrer-Policy"] == "no-referrer"
 
 
 def test_without_the_exact_secret_every_path_is_404(server: RecordingServer) -> None:
@@ -101,63 +93,24 @@ def test_without_the_exact_secret_every_path_is_404(server: RecordingServer) -> 
             assert ask(f"{server.origin}/{one}{name}")[0] == 404
 
 
-def test_the_secret_is_new_each_time_and_cannot_be_guessed(server: RecordingServer) -> None:
+def test_the_secret_is_new_each_time_long_and_on_no_command_line(server: RecordingServer) -> None:
     with RecordingServer(server.path, follow=False) as other:
         addresses = {server.address, server.window_address, other.address, other.window_address}
         secrets = {urlsplit(address).path.strip("/") for address in addresses}
     assert len(secrets) == 4
     assert all(len(secret) >= 43 for secret in secrets)  # 256 bits in base64
-
-
-def test_the_secret_is_on_no_command_line(server: RecordingServer) -> None:
     lines = [" ".join(child.cmdline()) for child in psutil.Process().children(recursive=True)]
     assert any("--serve-web" in line for line in lines)
     assert not any(secret_of(server) in line for line in lines)
 
 
-@pytest.mark.parametrize("path", ["\xe9", "\x01", "\x7f", "?\xe9"])
 def test_an_invalid_path_gets_status_400(
-    server: RecordingServer, path: str, capfd: pytest.CaptureFixture[str]
+    server: RecordingServer, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for prefix in (f"{server.origin}/", server.address):
-        assert ask(prefix + path)[0] == 400
+        for path in ("\xe9", "\x01", "\x7f", "?\xe9"):
+            assert ask(prefix + path)[0] == 400
     assert capfd.readouterr().err == ""
-
-
-def test_the_browser_sends_no_referrer(server: RecordingServer) -> None:
-    for path in ("", "?url=x", RECORDING, "none"):
-        assert ask(server.address + path)[1]["Referrer-Policy"] == "no-referrer"
-    assert ask(f"{server.origin}/")[1]["Referrer-Policy"] == "no-referrer"
-
-
-def test_the_page_ends_with_the_rerun_program(own_server: RecordingServer) -> None:
-    """Also if another program of this user binds the same port."""
-    address, viewer = own_server.address, own_server.web_viewer
-    assert viewer is not None
-    viewer.process.kill()
-    viewer.process.wait()
-    assert ask(address + "re_viewer.js")[0] == 502
-    with RecordingServer(own_server.path, follow=False) as other:
-        viewer.port = int(other.origin.rpartition(":")[2])
-        assert ask(address + "re_viewer.js")[0] == 502
-    assert ask(address + RECORDING)[::2] == (200, CONTENT)
-
-
-@needs_root
-def test_responses_of_another_users_program_on_reruns_port_are_refused(
-    own_server: RecordingServer,
-) -> None:
-    """The other user has bound the port before rerun, or after it."""
-    viewer = own_server.web_viewer
-    assert viewer is not None
-    with as_another_user(THEIR_SERVER, "0") as theirs:
-        assert theirs.stdout is not None
-        viewer.port = int(theirs.stdout.readline())
-        assert ask(f"http://{HOST}:{viewer.port}/")[2] == b"theirs"
-        for name in ("?url=x", "re_viewer.js"):
-            status, _, body = ask(own_server.address + name)
-            assert status == 502
-            assert b"theirs" not in body
 
 
 @needs_root
@@ -181,14 +134,13 @@ for host in ("127.0.0.1", "0.0.0.0"):
 
 
 @needs_root
-def test_a_windows_address_is_served_to_this_user_only(own_server: RecordingServer) -> None:
+def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) -> None:
     """The address is on a command line, where other users can read it."""
-    assert output_of_another_user(THEIR_GET, own_server.window_address + RECORDING) == "404"
-    assert not own_server.requested.is_set()
-    assert ask(own_server.window_address + RECORDING)[::2] == (200, CONTENT)
-    assert (
-        output_of_another_user(THEIR_GET, own_server.address + RECORDING) == f"200 {len(CONTENT)}"
-    )
+    server.requested.clear()
+    assert output_of_another_user(THEIR_GET, server.window_address + RECORDING) == "404"
+    assert not server.requested.is_set()
+    assert ask(server.window_address + RECORDING)[::2] == (200, CONTENT)
+    assert output_of_another_user(THEIR_GET, server.address + RECORDING) == f"200 {len(CONTENT)}"
 
 
 @needs_root
@@ -206,15 +158,39 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
             connection, _ = listening.accept()
             assert peer_user(connection) == NOBODY
         connection.close()
+        with socket.create_connection(listening.getsockname()) as ours:
+            assert peer_user(ours) is None  # no connection accepted yet
+            accepted, _ = listening.accept()
+            assert peer_user(ours) == peer_user(accepted) == os.getuid()
+            accepted.close()
+            assert peer_user(ours) is None
 
 
-def test_peer_user_is_this_user_after_accept() -> None:
-    with (
-        socket.create_server((HOST, 0)) as listening,
-        socket.create_connection(listening.getsockname()) as ours,
-    ):
-        assert peer_user(ours) is None  # no connection accepted yet
-        accepted, _ = listening.accept()
-        assert peer_user(ours) == peer_user(accepted) == os.getuid()
-        accepted.close()
-        assert peer_user(ours) is None
+@needs_root
+def test_responses_of_another_users_program_on_reruns_port_are_refused(
+    server: RecordingServer,
+) -> None:
+    """The other user has bound the port before rerun, or after it."""
+    viewer = server.web_viewer
+    assert viewer is not None
+    with as_another_user(THEIR_SERVER, "0") as theirs:
+        assert theirs.stdout is not None
+        viewer.port = int(theirs.stdout.readline())
+        assert ask(f"http://{HOST}:{viewer.port}/")[2] == b"theirs"
+        for name in ("?url=x", "re_viewer.js"):
+            status, _, body = ask(server.address + name)
+            assert status == 502
+            assert b"theirs" not in body
+
+
+def test_the_page_ends_with_the_rerun_program(server: RecordingServer) -> None:
+    """Also if another program of this user binds the same port."""
+    address, viewer = server.address, server.web_viewer
+    assert viewer is not None
+    viewer.process.kill()
+    viewer.process.wait()
+    assert ask(address + "re_viewer.js")[0] == 502
+    with RecordingServer(server.path, follow=False) as other:
+        viewer.port = int(other.origin.rpartition(":")[2])
+        assert ask(address + "re_viewer.js")[0] == 502
+    assert ask(address + RECORDING)[::2] == (200, CONTENT)

@@ -1,4 +1,6 @@
-"""The benchmark of the guarantee, with fewer decisions, and its check by hand-made outcomes."""
+"""The benchmarks of the guarantee and of the certificates' tightness, with fewer decisions."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +11,13 @@ from benchmarks.guarantees import (
     REORDERING,
     Decider,
     check_row,
+    loop_named,
     network_rows,
+    row_of,
+    triggers,
 )
+from cosim.analysis.adversary import Objective, find_worst
+from noack.scenario.sections import POLICIES
 from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
@@ -34,3 +41,23 @@ def test_the_check_counts_windows_and_gaps() -> None:
 def test_only_the_guarantee_limits_what_the_receiver_misses() -> None:
     longest = [row.value or 0 for row in network_rows() if "longest" in row.name]
     assert longest[2] == CAP < min(longest[:2])
+
+
+def test_every_policy_that_is_a_rule_is_compared() -> None:
+    paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
+    found = triggers(paper, np.eye(2)).values()
+    names = {one["policy"] for one in found} | {
+        one["rule"]["policy"] for one in found if "rule" in one
+    }
+    assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
+
+
+def test_a_bound_below_the_worst_run_is_reported() -> None:
+    loop = loop_named("double_integrator", 2.0, "identity")
+    worst = find_worst(loop, Objective.ERROR, beam=0)
+    assert worst.certified is not None
+    assert worst.value is not None
+    row = row_of("double_integrator", worst)
+    assert row.holds
+    assert 0.1 < (row.value or 0.0) < 1.0
+    assert row_of("", replace(worst, certified=worst.value * 0.99)).holds is False

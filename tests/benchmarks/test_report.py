@@ -98,19 +98,9 @@ def test_rows_and_reasons_are_printed_and_written_as_json(
     assert "no such program" in said
 
 
-def test_options_are_passed_to_their_benchmark() -> None:
-    seen: list[bool] = []
-
-    def measure(options: argparse.Namespace) -> list[Row]:
-        seen.append(options.install)
-        return []
-
-    options = {"--install": {"action": "store_true"}}
-    run(by_name(Benchmark("example", "An example", measure, options)), ["--install"])
-    assert seen == [True]
-
-
-def test_benchmarks_are_chosen_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_benchmarks_are_chosen_by_name_and_get_their_options(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     done: list[str] = []
     benchmarks = by_name(*(named(name, done=done) for name in "abc"))
     assert run(benchmarks, ["c", "a"]) == run(benchmarks, []) == 0
@@ -118,6 +108,11 @@ def test_benchmarks_are_chosen_by_name(capsys: pytest.CaptureFixture[str]) -> No
     with pytest.raises(SystemExit):
         run(benchmarks, ["d"])
     assert "no benchmark 'd'; benchmarks: a, b, c" in capsys.readouterr().err
+    seen: list[argparse.Namespace] = []
+    options = {"--install": {"action": "store_true"}}
+    own = Benchmark("example", "An example", lambda given: seen.append(given) or [], options)
+    run(by_name(own), ["--install"])
+    assert seen[0].install
 
 
 def rounds_of(ours: list[float], theirs: list[float]) -> Rounds:

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from benchmarks.soak import (
     RESULT_FILE,
     ROLES,
     Result,
+    Trend,
     constant,
     ended_badly,
     main,
@@ -59,39 +61,29 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return found
 
 
-def test_every_process_is_watched(result: Result) -> None:
-    assert set(result.watched) == {*ROLES}
-    for watched in result.watched.values():
-        assert all(sample.uss_kib > 1000 and sample.threads >= 1 for sample in watched.samples)
-
-
 def faults_of(result: Result) -> list[str]:
     stale = int(load_record(result.run_dir)["netem_release"]["stale"].sum())
     return [*ended_badly(result.summary, 0, stale)]
 
 
-def test_a_real_run_has_no_faults_at_its_end(result: Result) -> None:
+def test_a_soak_test_watches_every_process_and_writes_figures_and_a_picture(result: Result) -> None:
+    assert set(result.watched) == {*ROLES}
+    for watched in result.watched.values():
+        assert all(sample.uss_kib > 1000 and sample.threads >= 1 for sample in watched.samples)
     assert result.loop["events"] > 100
     record = load_record(result.run_dir)
     assert len(record["plant_step"]) == record.scenario.horizon_s * 20 + 1
     assert faults_of(result) == []
-
-
-def test_a_soak_test_writes_figures_and_a_picture(result: Result) -> None:
     assert result.run_dir is not None
     written = json.loads((result.run_dir / RESULT_FILE).read_text())
     assert set(written["processes"]) == {*ROLES}
     assert (result.run_dir / PICTURE_FILE).read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_good_end_has_no_faults() -> None:
-    assert not [*ended_badly(summary(), 0)]
-
-
 def test_stale_rejections_must_equal_the_packets_delivered_out_of_order() -> None:
+    assert not [*ended_badly(summary(), 0)]
     stale = summary(rejected_datagrams={"controller": {"stale": 3}})
-    assert not [*ended_badly(stale, 0, 3)]
-    assert [len([*ended_badly(stale, 0, number)]) for number in (0, 2)] == [1, 1]
+    assert [len([*ended_badly(stale, 0, number)]) for number in (3, 0, 2)] == [0, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -125,11 +117,8 @@ def test_a_mistake_on_the_command_line_is_reported(
 
 
 HOUR_S = 3600.0
-
-
-def judged(kib_of_s, length_s: float = HOUR_S, every_s: float = 5.0):  # type: ignore[no-untyped-def]
-    at_s = np.arange(0.0, length_s, every_s)
-    return trend(at_s.tolist(), [float(kib_of_s(t)) for t in at_s], length_s)
+LEAK_KIB_PER_S = 500 * 88 / 1024
+"""Of 88 bytes a step."""
 
 
 def noise(t: float) -> float:
@@ -137,63 +126,49 @@ def noise(t: float) -> float:
     return 300 * math.sin(t) * math.cos(0.37 * t)
 
 
-def test_fluctuating_memory_is_flat() -> None:
-    found = judged(lambda t: 80_000 + noise(t))
-    assert found.verdict == "flat"
-    assert abs(found.growth_kib) < 100
+def judged(kib_of_s: Callable[[float], float], length_s: float = HOUR_S) -> Trend:
+    at_s = np.arange(0.0, length_s, 5.0 if length_s <= HOUR_S else 60.0)
+    return trend(at_s.tolist(), [80_000.0 + kib_of_s(t) for t in at_s], length_s)
 
 
-@pytest.mark.parametrize("bytes_per_step", [2.0, 10.0, 88.0])
-def test_a_leak_per_step_is_reported_as_growth(bytes_per_step: float) -> None:
-    found = judged(lambda t: 80_000 + noise(t) + 500 * t * bytes_per_step / 1024)
-    assert found.verdict == "grows"
-    assert found.slope_kib_per_h == pytest.approx(3600 * 500 * bytes_per_step / 1024, rel=0.1)
+@pytest.mark.parametrize(
+    ("kib_of_s", "length_s", "verdict"),
+    [
+        (noise, HOUR_S, "flat"),
+        (lambda t: 50 * min(t, 300.0), HOUR_S, "flat"),  # the warm-up is not judged
+        (lambda t: 20_000 if t % 600 < 60 else 0, HOUR_S, "flat"),  # temporary memory
+        (lambda t: noise(t) + 500 * t * 2 / 1024, HOUR_S, "grows"),  # two bytes a step
+        (lambda t: 0.1 * t, HOUR_S, "creeps"),  # 0.8 events per second, 128 bytes each
+        # Five minutes suffice for a leak per step but not for slower leaks, a minute for none.
+        (lambda t: LEAK_KIB_PER_S * t, 300.0, "grows"),
+        (lambda t: 0.1 * t, 300.0, "flat"),
+        (lambda t: LEAK_KIB_PER_S * t, 60.0, "too short"),
+        # A longer run is judged by its growth rate.
+        (lambda t: noise(t) + 0.2 * t, 24 * HOUR_S, "creeps"),
+        (lambda t: noise(t) + 0.4 * t, 24 * HOUR_S, "grows"),
+    ],
+)
+def test_the_trend_of_memory(
+    kib_of_s: Callable[[float], float], length_s: float, verdict: str
+) -> None:
+    assert judged(kib_of_s, length_s).verdict == verdict
 
 
-def test_a_leak_per_event_is_reported_as_slow_growth_after_an_hour() -> None:
-    found = judged(lambda t: 80_000 + 0.1 * t)  # 0.8 events per second, 128 bytes each
-    assert found.growth_kib < found.allowed_kib
-    assert found.verdict == "creeps"
-
-
-def test_five_minutes_suffice_for_a_leak_per_step_but_not_for_slower_leaks() -> None:
-    assert judged(lambda t: 80_000 + 500 * t * 88 / 1024, 300.0).verdict == "grows"
-    assert judged(lambda t: 80_000 + 0.1 * t, 300.0).verdict == "flat"
-
-
-def test_one_minute_is_too_short_for_a_verdict() -> None:
-    assert judged(lambda t: 80_000 + 500 * t * 88 / 1024, 60.0).verdict == "too short"
-
-
-def test_the_warm_up_is_not_judged() -> None:
+def test_the_numbers_of_a_trend() -> None:
+    found = judged(lambda t: noise(t) + LEAK_KIB_PER_S * t)
+    assert found.slope_kib_per_h == pytest.approx(3600 * LEAK_KIB_PER_S, rel=0.1)
+    found = judged(lambda t: t - 80_000)
+    assert (found.at_10_kib, found.at_50_kib, found.at_100_kib) == (360.0, 1800.0, 3595.0)
     assert warm_up_s(HOUR_S) == 300.0
-    assert judged(lambda t: 80_000 + 50 * min(t, 300.0)).verdict == "flat"
-
-
-def test_temporary_memory_is_not_growth() -> None:
-    assert judged(lambda t: 80_000 + (20_000 if t % 600 < 60 else 0)).verdict == "flat"
-
-
-def test_a_longer_run_is_judged_by_its_growth_rate() -> None:
-    assert judged(lambda t: 80_000 + noise(t) + 0.2 * t, 24 * HOUR_S, 60.0).verdict != "grows"
-    assert judged(lambda t: 80_000 + noise(t) + 0.4 * t, 24 * HOUR_S, 60.0).verdict == "grows"
-
-
-def test_too_few_samples_give_no_verdict() -> None:
-    assert judged(lambda t: 80_000, HOUR_S, 900.0).verdict == "unknown"
+    assert trend([0.0, 900.0, 1800.0], [1.0] * 3, HOUR_S).verdict == "unknown"  # too few samples
     assert trend([], [], HOUR_S).verdict == "unknown"
 
 
-def test_memory_is_reported_at_shares_of_the_run() -> None:
-    found = judged(lambda t: t)
-    assert (found.at_10_kib, found.at_50_kib, found.at_100_kib) == (360.0, 1800.0, 3595.0)
-
-
 def test_changes_of_a_count_are_found_after_the_warm_up_only() -> None:
-    at_s = [0.0, 30.0, 70.0, 80.0, 99.0]
-    assert constant([30.0, 40.0, *at_s[2:]], [9, 9, 7, 7, 7], 100.0) == (7, 9)
-    assert constant([30.0, 40.0, *at_s[2:]], [7, 7, 8, 7, 7], 100.0) == (7, 7)
-    assert constant(at_s, [3, 7, 7, 7, 7], 100.0) == (7, 7)
+    at_s = [30.0, 40.0, 70.0, 80.0, 99.0]
+    assert constant(at_s, [9, 9, 7, 7, 7], 100.0) == (7, 9)
+    assert constant(at_s, [7, 7, 8, 7, 7], 100.0) == (7, 7)
+    assert constant([0.0, *at_s[1:]], [3, 7, 7, 7, 7], 100.0) == (7, 7)
 
 
 def test_a_folder_may_vanish_while_it_is_measured(

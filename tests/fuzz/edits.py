@@ -1,16 +1,96 @@
-"""Edit valid content: put the parser's own keys and values in wrong places."""
+"""Structured inputs from bytes of any length, which determine each choice; edits of content.
+
+Beyond the end of the bytes, every choice is the first option. So all bytes give an input, and fewer
+bytes give a simpler one. No fuzzer is needed, so a kept input has the same meaning everywhere.
+"""
 
 import copy
 import datetime
+import io
 import json
+import struct
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-from tests.fuzz.choices import Choices
-from tests.fuzz.harness import FOLDER
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+T = TypeVar("T")
+
+INTEGERS = (
+    0, 1, -1, 2, 3, 5, 64, 65, 255, 65_535, 65_536, 10**6, 10**9, 2**31, 2**53 + 1,
+    2**63 - 1, 2**63, -(2**63), 2**64 - 1, 2**64, 10**30, 10**400,
+)  # fmt: skip
+FLOATS = (
+    0.0, -0.0, 0.5, 1.0, -1.0, 1.5, 0.1, 100.0, 1e-9, 1e-3, 1e9, 1e17, 1e300,
+    1.7976931348623157e308, 5e-324, float("inf"), float("-inf"), float("nan"),
+)  # fmt: skip
+
+SEEDS = (b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2)
+"""Seeds with few choices and with many."""
+EDITS = tuple(b"\0" + seed for seed in SEEDS)
+"""The same seeds for parsers of text, where a zero byte selects edits of valid text."""
+
+
+class Choices:
+    """Reads choices from bytes, first to last."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._at = 0
+
+    @property
+    def left(self) -> int:
+        """Number of unused bytes."""
+        return len(self._data) - self._at
+
+    def take(self, count: int) -> bytes:
+        """Return the next ``count`` bytes."""
+        taken = self._data[self._at : self._at + count]
+        self._at += len(taken)
+        return taken.ljust(count, b"\0")
+
+    def rest(self) -> bytes:
+        """Return all unused bytes."""
+        return self.take(self.left)
+
+    def below(self, limit: int) -> int:
+        """Return a number from 0 to ``limit`` − 1."""
+        size = 1 if limit <= 256 else 2
+        return int.from_bytes(self.take(size), "little") % limit
+
+    def one(self, of: Sequence[T]) -> T:
+        """Return one of these options."""
+        return of[self.below(len(of))]
+
+    def flag(self) -> bool:
+        """Return True or False."""
+        return bool(self.below(2))
+
+    def integer(self) -> int:
+        """Return an integer: a boundary value, a small one, or any of 64 bits."""
+        match self.below(3):
+            case 0:
+                return self.one(INTEGERS)
+            case 1:
+                return self.below(256)
+            case _:
+                return int(struct.unpack("<q", self.take(8))[0])
+
+    def real(self) -> float:
+        """Return a float: a boundary value, or any 64 bits."""
+        if self.flag():
+            return float(struct.unpack("<d", self.take(8))[0])
+        return self.one(FLOATS)
+
+    def text(self) -> str:
+        """Return a short text of any UTF-8 characters."""
+        return self.take(self.below(16)).decode("utf-8", errors="replace")
+
 
 NAMED: Mapping[str, bytes] = {
     "trace.txt": b"0100 1\n",
@@ -141,7 +221,7 @@ def _named(folder: Path) -> None:
 
 def bases(folder: str, *more: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     """Return the content of the shipped TOML files of a folder, and ``more``."""
-    paths = sorted((FOLDER.parents[1] / folder).glob("*.toml"))
+    paths = sorted((Path(__file__).parents[2] / folder).glob("*.toml"))
     return [*(tomllib.loads(path.read_text(encoding="utf-8")) for path in paths), *more]
 
 
@@ -149,3 +229,91 @@ def quoted(known: Vocabulary) -> Sequence[bytes]:
     """Return plain keys, quoted words and some numbers, for a fuzzer that makes text."""
     words: Iterable[str] = (*known.keys, *(json.dumps(word) for word in known.words))
     return [word.encode() for word in (*words, "1e400", "nan", "-inf", "[[", "]]", "{", "}", "=")]
+
+
+_IN_64_BITS = [number for number in INTEGERS if -(2**63) <= number < 2**63]
+
+
+def edited_table(choices: Choices, table: pa.Table) -> pa.Table:
+    """Return a copy of a table with some edits."""
+    for _ in range(choices.below(4)):
+        name = choices.one(table.column_names) if table.num_columns else ""
+        at = table.schema.get_field_index(name)
+        if at < 0:
+            break
+        match choices.below(8):
+            case 0:
+                table = table.drop_columns([name])
+            case 1:
+                table = table.set_column(at, name, _other_type(choices, len(table)))
+            case 2:
+                table = table.append_column(name, table.column(at))
+            case 3:
+                table = table.slice(choices.below(len(table) + 1), choices.below(len(table) + 1))
+            case 4:
+                table = pa.concat_tables([table, table.slice(0, choices.below(len(table) + 1))])
+            case _:
+                table = table.set_column(
+                    at, table.schema.field(at), _one_changed(choices, table[at])
+                )
+    return table
+
+
+def written(choices: Choices, table: pa.Table, metadata: Mapping[str, str]) -> bytes:
+    """Return the bytes of a Parquet file, some of them changed."""
+    buffer = io.BytesIO()
+    pq.write_table(table.replace_schema_metadata(dict(metadata)), buffer, compression="none")
+    return damaged(choices, buffer.getvalue())
+
+
+def damaged(choices: Choices, data: bytes) -> bytes:
+    """Return the bytes with some of them changed, or truncated."""
+    changed = bytearray(data)
+    match choices.below(8):
+        case 0:
+            return bytes(changed[: choices.below(len(changed) + 1)])
+        case 1:
+            for _ in range(1 + choices.below(8)):
+                # Counted from the end, where Parquet stores its metadata.
+                changed[-1 - choices.below(min(len(changed), 2**16))] = choices.below(256)
+    return bytes(changed)
+
+
+def _other_type(choices: Choices, length: int) -> pa.Array:
+    match choices.below(7):
+        case 0:
+            return pa.array([choices.text()] * length)
+        case 1:
+            return pa.nulls(length)
+        case 2:
+            return pa.array(np.full(length, choices.real()))
+        case 3:
+            return pa.array([b"\0" * choices.below(40)] * length)
+        case 4:
+            return pa.array([[1, 2]] * length, pa.list_(pa.int64()))
+        case 5:
+            return pa.array(np.full(length, choices.below(2), np.uint64) * np.uint64(2**64 - 1))
+        case _:
+            return pa.array(np.zeros(length, "datetime64[ns]"))
+
+
+def _one_changed(choices: Choices, column: pa.ChunkedArray) -> Any:
+    values = column.to_pylist()
+    if not values:
+        return column
+    at = choices.below(len(values))
+    value: Any = None
+    if choices.below(8):
+        if pa.types.is_integer(column.type):
+            value = choices.one(_IN_64_BITS) if choices.flag() else choices.below(256) - 128
+        elif pa.types.is_floating(column.type):
+            value = choices.real()
+        elif pa.types.is_dictionary(column.type):
+            value = choices.one(["forward", "reverse", "up", "", "other"])
+        elif isinstance(values[at], bytes):
+            value = bytes(damaged(choices, values[at])).ljust(len(values[at]), b"\0")
+    values[at] = value
+    try:
+        return pa.array(values, column.type)
+    except (pa.ArrowInvalid, OverflowError, TypeError):
+        return column

@@ -1,12 +1,6 @@
 """With any input, every parser must return or report the mistake in one line.
 
-Each parser has a module below ``parsers`` with
-
-* ``one_input(data)``, which passes one input to the parser and raises if the parser fails;
-* optionally ``SEEDS``, initial inputs in addition to the kept ones (the default is that of
-  :mod:`tests.fuzz.choices`), ``WORDS``, from which the fuzzer builds inputs, and ``SANITIZED``: the
-  long run has the core that is built with ASan and UBSan.
-
+The modules below ``parsers`` have the parsers by name, in ``PARSERS``.
 ``corpus/NAME.txt`` contains the kept inputs, one per line, escaped as Python escapes bytes.
 """
 
@@ -16,7 +10,7 @@ import resource
 import signal
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -24,10 +18,9 @@ from pathlib import Path
 from types import FrameType
 
 from noack.core.errors import NoackError
-from tests.fuzz.choices import SEEDS
+from tests.fuzz.edits import SEEDS
 
 FOLDER = Path(__file__).parent
-NAMES = tuple(sorted(path.stem for path in (FOLDER / "parsers").glob("[a-z]*.py")))
 CORPUS = FOLDER / "corpus"
 LONGEST_CPU_S = 10.0
 """CPU time limit for one input; valid inputs take milliseconds, large ones up to 100 times that."""
@@ -42,14 +35,14 @@ class HangError(AssertionError):
 class Harness:
     """A parser under test."""
 
-    name: str
     one_input: Callable[[bytes], None]
-    seeds: Sequence[bytes]
+    """Passes one input to the parser, and raises if the parser fails."""
+    seeds: Sequence[bytes] = SEEDS
     """Initial inputs in addition to the kept ones."""
-    words: Sequence[bytes]
+    words: Sequence[bytes] = ()
     """Words from which the fuzzer builds inputs."""
-    sanitized: bool
-    """Whether the long run has the core with sanitizers."""
+    sanitized: bool = False
+    """Whether the long run has the core that is built with ASan and UBSan."""
 
     def run(self, data: bytes) -> None:
         """Pass one input to the parser.
@@ -65,13 +58,13 @@ class Harness:
         assert grown_kib < _MOST_MEMORY_KIB, f"one input took {grown_kib} KiB"
 
 
-def harness(name: str) -> Harness:
-    """Return the harness of a parser."""
-    module = importlib.import_module(f"tests.fuzz.parsers.{name}")
-    return Harness(
-        name, module.one_input, getattr(module, "SEEDS", SEEDS), getattr(module, "WORDS", ()),
-        getattr(module, "SANITIZED", False),
-    )  # fmt: skip
+@cache
+def parsers() -> Mapping[str, Harness]:
+    """Return all parsers by name."""
+    found: dict[str, Harness] = {}
+    for path in sorted((FOLDER / "parsers").glob("[a-z]*.py")):
+        found |= importlib.import_module(f"tests.fuzz.parsers.{path.stem}").PARSERS
+    return found
 
 
 def kept(name: str) -> list[bytes]:

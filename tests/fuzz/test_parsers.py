@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.harness import NAMES, from_line, harness, kept, to_line
+from tests.fuzz.harness import from_line, kept, parsers, to_line
 
 EXAMPLES = {"record": 10, "telemetry": 15, "campaign": 20}
 """Number of examples for slow parsers; 50 for the others. The long run is `make fuzz`."""
@@ -15,18 +15,18 @@ splices = st.lists(
 """Begin and end of replaced bytes, and the new bytes; None: the other input up to its end."""
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", parsers())
 def test_every_input_of_the_corpus_is_read_or_refused_in_one_line(name: str) -> None:
-    under_test = harness(name)
+    under_test = parsers()[name]
     inputs = [*under_test.seeds, *kept(name)]
     assert len(inputs) > 3
     for data in inputs:
         under_test.run(data)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", parsers())
 def test_inputs_near_the_corpus_are_read_or_refused_in_one_line(name: str) -> None:
-    under_test = harness(name)
+    under_test = parsers()[name]
     inputs = st.sampled_from([*under_test.seeds, *kept(name)])
 
     @settings(max_examples=EXAMPLES.get(name, 50), database=None)

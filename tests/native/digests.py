@@ -26,7 +26,7 @@ def _print(name: str, *parts: bytes) -> None:
 def _records() -> None:
     for name in shipped_names("scenarios"):
         try:
-            record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=2"])))
+            record = simulate(resolve(load(find_shipped(name, "scenarios"), ["horizon_s=1"])))
         except CallerError:  # several loops, or a plant that needs an extra
             continue
         for table in sorted(record.tables):

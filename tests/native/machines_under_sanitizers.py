@@ -1,16 +1,18 @@
-"""Random machines, for a core that is built with sanitizers; test_sanitized.py runs it in a child.
+"""Random machines and exact simulations, for a core that is built with sanitizers."""
 
-Their states, matrices, times and numbers are any that the core's checks admit.
-"""
-
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from noack.core.core_library import LIBRARY, core, load_core
+from cosim.simulation.exact_simulation import ExactSimulation, run_with_events
+from noack.core.core_library import LIBRARY, core, ffi, load_core
 from noack.protocol.wire_format import Flow, Message
+from noack.trigger.trigger_rule import TriggerRule
+from tests.cosim.simulation.batch.exact import random_population, random_setting
 from tests.machine_parts import SteppedMachines
 from tests.noack.machines.any_machines import (
     MS,
@@ -22,6 +24,7 @@ from tests.noack.machines.any_machines import (
     sizes,
     text_of,
 )
+from tests.trigger_rules import TABLES, area_rule, decaying_rule, random_rule
 from tests.wire_decoder import NO_VECTOR
 
 TIMES_NS, NUMBERS = 2**62, 2**63
@@ -119,7 +122,7 @@ def drive(own: SteppedMachines, given_inputs: list[Any]) -> None:
         own.handle(Message(own.role.receives, number, t_ns, vector, loop), t_ns)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(
     roles, st.lists(st.tuples(sizes(), st.integers(0, 2**16)), min_size=1, max_size=3), scales,
     st.sampled_from([1, 5, 1024]), inputs,
@@ -140,7 +143,7 @@ def test_large_machines(
         drive(machines_of(role, [(of, seed)], scale), given_inputs)
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(roles, sizes(3), st.integers(0, 2**16), inputs, st.data())
 def test_machines_of_any_numbers_are_refused_or_run_clean(
     role: str, of: Sizes, seed: int, given_inputs: list[Any], data: st.DataObject
@@ -158,3 +161,79 @@ def test_machines_of_any_numbers_are_refused_or_run_clean(
     core.noack_process_begin(own.core)
     with np.errstate(all="ignore"):
         drive(own, given_inputs)
+
+
+ANY_DOUBLE = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
+
+
+sizes_and_policies = st.one_of(
+    st.tuples(st.just(2), st.sampled_from([*TABLES])), st.tuples(st.integers(1, 20), st.just(""))
+)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32), sizes_and_policies, st.integers(1, 3))
+def test_random_batches(seed: int, size_and_policy: tuple[int, str], m: int) -> None:
+    (n, policy), rng = size_and_policy, np.random.default_rng(seed)
+    setting = random_setting(rng, n, m)
+    if policy:
+        trigger = random_rule(policy, rng, n, setting.trigger.weight)
+        setting = replace(setting, trigger=trigger, most_events=200)
+    rows, events = run_with_events(setting, random_population(rng, setting, 2))
+    assert [len(one.event_s) for one in events] == rows["transmissions"].tolist()
+
+
+@settings(max_examples=40)
+@given(st.data(), st.integers(1, 9), st.sampled_from(range(5)), st.booleans())
+def test_matrices_and_states_of_any_numbers(
+    data: st.DataObject, n: int, measure: int, area: bool
+) -> None:
+    """Infinite and undefined numbers end a run; they do not lead astray."""
+
+    def any_of(*shape: int) -> np.ndarray:
+        count = int(np.prod(shape))
+        return np.array(data.draw(st.lists(ANY_DOUBLE, min_size=count, max_size=count))).reshape(
+            shape
+        )
+
+    trigger = area_rule(0.1, n=n) if area else decaying_rule(0.5, 1.0, 0.1, n=n)
+    simulation = ExactSimulation(
+        any_of(n, n), any_of(1, n), trigger, horizon_s=2.0, known_start=measure > 2,
+        delivered=np.array([True, False]), most_events=20, measure=measure,
+    )  # fmt: skip
+    A, B, x0 = any_of(2, n, n), any_of(2, n, 1), any_of(2, n)
+    simulation.runs(A, B, x0, places=3, states=True)
+    simulation.segments(A[0], B[0], any_of(2), any_of(2, 3, n), any_of(2))
+    t_s = np.sort(any_of(4))
+    simulation.sample(A[0], B[0], t_s[:2], any_of(2, 3, n), t_s)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    plain = {"horizon_s": 1.0, "known_start": True}
+    one, trigger = np.eye(2), decaying_rule(0.5, 1.0)
+    for wrong in (
+        {"horizon_s": np.nan}, {"horizon_s": -1.0}, {"settle": np.inf}, {"measure": 9},
+        {"measure": -1}, {"fading_per_s": -1.0}, {"most_events": -1}, {"event_places": 3},
+        {"H": None}, {"K": None}, {"n": 0}, {"m": 65}, {"fate_count": 1},
+    ):  # fmt: skip
+        numbers = {name: ffi.NULL if value is None else value for name, value in wrong.items()}
+        with pytest.raises(ValueError, match=r"a (simulation|loop) has"):
+            _refused(one, trigger, {**plain, **numbers})
+    for field, value in (
+        ("level", -1.0), ("level", np.nan), ("rate_per_s", np.inf), ("floor", -1.0),
+        ("up_rows", 257), ("up_rows", -1), ("down_rows", 2), ("grid_ns", -1), ("shortest_ns", -1),
+        ("longest_ns", -1), ("longest_ns", 2**63 - 1), ("idle_ns", -(2**63)), ("decay_per_s", -1.0),
+    ):  # fmt: skip
+        simulation = ExactSimulation(one, one, trigger, **plain)
+        setattr(simulation.core.rule, field, value)
+        assert core.noack_exact_check(simulation.core) != ffi.NULL, field
+
+
+def _refused(one: np.ndarray, trigger: TriggerRule, numbers: dict[str, object]) -> None:
+    """Change a simulation's numbers, and check it again."""
+    simulation = ExactSimulation(one, one, trigger, horizon_s=1.0, known_start=True)
+    for name, value in numbers.items():
+        setattr(simulation.core, name, value)
+    mistake = core.noack_exact_check(simulation.core)
+    if mistake != ffi.NULL:
+        raise ValueError(ffi.string(mistake).decode())

@@ -1,13 +1,16 @@
-"""The loader of the core, and the names that Python has for the things of native/noack.h."""
+"""The loader of the core, its build, and the names that Python has for those of native/noack.h."""
 
+import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from native.build import HEADER, NO_COMPILER, is_current
 from noack.core.core_library import (
     LIBRARY,
     address_of,
@@ -18,7 +21,7 @@ from noack.core.core_library import (
     pointer_to,
 )
 from noack.core.errors import CallerError
-from noack.impairments.feature import Stage, StageTables
+from noack.impairments.feature import StageTables
 from noack.impairments.link_settings import Counters, RecordedDecision
 from noack.protocol.record_tables import Fate
 from tests.netem.feature_examples import IMPAIRED, names_file
@@ -48,34 +51,25 @@ def test_a_pointer_has_the_address_of_its_array() -> None:
         pointer_to(numbers[::2], "int64_t *")
 
 
-def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_broken_or_other_library_is_refused_in_one_line(tmp_path: Path) -> None:
     own = ffi.string(core.noack_sources())
-    (tmp_path / "other.so").write_bytes(LIBRARY.read_bytes().replace(own, own[::-1]))
-    with pytest.raises(CallerError, match="not of the same sources") as error:
-        load_core(tmp_path / "other.so")
-    assert "make setup" in str(error.value)
+    other = LIBRARY.read_bytes().replace(own, own[::-1])
+    for number, content in enumerate((None, b"", b"no library", other)):
+        path = tmp_path / f"{number}.so"
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(CallerError) as error:
+            load_core(path)
+        says = str(path) if number < 3 else "not of the same sources"
+        assert says in str(error.value)
+        assert "make setup" in str(error.value)
+        assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no library"])
-def test_a_missing_or_broken_library_is_refused_in_one_line(
-    tmp_path: Path, content: bytes | None
-) -> None:
-    path = tmp_path / "libnoack.so"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(CallerError) as error:
-        load_core(path)
-    assert str(path) in str(error.value)
-    assert "make setup" in str(error.value)
-    assert str(error.value).isprintable()
-
-
-@pytest.mark.parametrize("missing", ["libnoack.so", "_core_header.py"])
-def test_a_command_says_so_without_a_traceback(tmp_path: Path, missing: str) -> None:
+def test_a_command_without_the_core_says_so_without_a_traceback(tmp_path: Path) -> None:
     for package in ("noack", "cosim", "netem", "plant_server", "sensor_node", "controller_node"):
-        ignored = shutil.ignore_patterns("__pycache__", missing if package == "noack" else "")
+        ignored = shutil.ignore_patterns("__pycache__", "_core_header.py")
         shutil.copytree(ROOT / package, tmp_path / package, ignore=ignored)
-    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
     done = subprocess.run(
         [sys.executable, "-c", "from cosim.cli import main; main()", "check", "lane_following"],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=100,
@@ -91,11 +85,8 @@ def constants(name: str) -> dict[str, int]:
     return {word: number for number, word in ffi.typeof(f"enum {name}").elements.items()}
 
 
-def test_fates_have_the_same_numbers() -> None:
+def test_python_has_the_numbers_and_fields_of_c() -> None:
     assert constants("noack_fate") == {f"NOACK_{fate.name}": fate.value for fate in Fate}
-
-
-def test_records_have_the_same_fields_in_the_same_order() -> None:
     assert dtype_of("noack_counters").names == tuple(Counters.__dataclass_fields__)
     assert dtype_of("noack_recorded").names == RecordedDecision._fields
 
@@ -107,11 +98,113 @@ def test_each_stage_kind_has_a_file_in_c_and_a_feature_in_python() -> None:
         if number != core.NOACK_STAGE_KINDS
     ]
     assert {path.stem for path in (ROOT / "native" / "impairments").glob("*.c")} == set(kinds)
-    made = {stage.kind for stage in stages()}
-    assert made == set(kinds)
+    made = [one.stage(StageTables()) for one in IMPAIRED if not names_file(one)]
+    assert {stage.kind for stage in made if stage is not None} == set(kinds)
 
 
-def stages() -> list[Stage]:
-    """Return the stages of all examples of the features."""
-    made = (one.stage(StageTables()) for one in IMPAIRED if not names_file(one))
-    return [stage for stage in made if stage is not None]
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the folder native with few C files, which builds in a moment.
+
+    The core does not need the others to be a library: it is not loaded.
+    """
+    native = Path(shutil.copytree(ROOT / "native", tmp_path / "native"))
+    for path in native.rglob("*.c"):
+        if path.name == "states.c":
+            path.write_text("")
+        elif path.name not in ("link.c", "elementary.c"):
+            path.unlink()
+    program = (native / "build.py").read_text()
+    assert '"-O3"' in program
+    (native / "build.py").write_text(program.replace('"-O3"', '"-O0"'))
+    return native
+
+
+def build(
+    native: Path, *arguments: str | Path, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Build into the folder beside ``native``."""
+    return subprocess.run(
+        [sys.executable, native / "build.py", "--into", native.parent / "core", *arguments],
+        env=os.environ | environment, capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+
+
+def files(native: Path) -> dict[str, bytes]:
+    core = native.parent / "core"
+    return {path.name: path.read_bytes() for path in core.iterdir()}
+
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler"
+)
+
+
+def test_the_core_of_this_repository_is_that_of_its_sources() -> None:
+    assert is_current(), "run `make setup`"
+
+
+@needs_compiler
+def test_it_builds_only_what_has_changed_and_says_so_in_one_line(copy: Path) -> None:
+    first = build(copy, "--library")
+    assert (first.returncode, first.stderr) == (0, "")
+    assert len(first.stdout.splitlines()) == 1
+    assert files(copy).keys() == {LIBRARY.name}
+    assert build(copy).stdout == ""  # the declarations, which takes no time
+    made = files(copy)
+    assert made.keys() == {LIBRARY.name, HEADER}
+    again = build(copy)
+    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
+    (copy.parent / "core" / HEADER).unlink()
+    assert build(copy).stdout == ""
+    assert files(copy) == made
+    with (copy / "core.h").open("a") as file:
+        file.write("/* changed */\n")
+    assert build(copy).stdout == first.stdout
+    assert files(copy)[HEADER] != made[HEADER]
+
+
+@needs_compiler
+def test_a_mistake_leaves_the_earlier_core_as_it_was(copy: Path) -> None:
+    build(copy)
+    made = files(copy)
+    with (copy / "link.c").open("a") as file:
+        file.write("int mistake(\n")
+    done = build(copy)
+    assert done.returncode == 1
+    assert "link.c" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("the core cannot be built")
+    assert files(copy) == made
+
+
+@needs_compiler
+def test_of_two_builds_at_a_time_one_finds_it_built(copy: Path) -> None:
+    """What a killed build has left is removed."""
+    left = copy.parent / "core" / ".building-x"
+    left.mkdir(parents=True)
+    (left / LIBRARY.name).write_bytes(b"half of")
+    with ThreadPoolExecutor() as pool:
+        done = list(pool.map(build, [copy, copy]))
+    assert [one.returncode for one in done] == [0, 0]
+    assert sorted(len(one.stdout.splitlines()) for one in done) == [0, 1]
+    assert files(copy).keys() == {LIBRARY.name, HEADER}
+
+
+def test_without_a_compiler_it_says_what_to_install(copy: Path, tmp_path: Path) -> None:
+    """Without the installed packages (-S), among them ziglang; test_same_bits.py builds with it."""
+    command = [sys.executable, "-S", copy / "build.py", "--into", copy.parent / "core"]
+    done = subprocess.run(
+        command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+        timeout=100,
+    )  # fmt: skip
+    assert done.returncode == NO_COMPILER
+    (line,) = done.stderr.splitlines()
+    assert "gcc" in line
+    assert "ziglang" in line
+
+
+def test_noacks_own_core_is_never_a_sanitized_one() -> None:
+    command = [sys.executable, ROOT / "native" / "build.py", "--sanitized"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 2
+    assert "--into" in done.stderr.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""The core's elementary functions: as accurate as they claim, and defined for all numbers."""
+"""The core's elementary functions and random numbers: as accurate as they claim, and defined."""
 
 import math
 from collections.abc import Callable
@@ -6,28 +6,22 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import ndtr, ndtri
 
-from noack.core.core_library import core
+from noack.core.core_library import core, ffi
+from noack.core.random_streams import uniform_pair
 
 Function = Callable[[Decimal], Decimal]
 COUNT = 3000
 """Of random arguments in each range; a million of each were compared when the code was written."""
-
-
-def exp(x: Decimal) -> Decimal:
-    return x.exp()
-
-
-def expm1(x: Decimal) -> Decimal:
-    return x.exp() - 1
-
-
-def log(x: Decimal) -> Decimal:
-    return x.ln()
-
-
-def cube_root(x: Decimal) -> Decimal:
-    return (x.ln() / 3).exp()
+EXACT: dict[str, Function] = {
+    "exp": Decimal.exp,
+    "expm1": lambda x: x.exp() - 1,
+    "log": Decimal.ln,
+    "cube_root": lambda x: (x.ln() / 3).exp(),
+}
 
 
 def _uniform(low: float, high: float) -> Callable[[np.random.Generator], np.ndarray]:
@@ -46,30 +40,30 @@ def _near(center: float, largest: int) -> Callable[[np.random.Generator], np.nda
 
 
 @pytest.mark.parametrize(
-    ("name", "exact", "draw", "most_ulps"),
+    ("name", "draw", "most_ulps"),
     [
-        ("exp", exp, _uniform(-708, 709.7), 0.501),
-        ("exp", exp, _uniform(-3, 3), 0.501),
-        ("exp", exp, _near(0.0, -1), 0.501),
-        ("exp", exp, _uniform(-745.1, -707), 0.501),  # subnormal
-        ("expm1", expm1, _uniform(-40, 100), 0.502),
-        ("expm1", expm1, _uniform(-2, 2), 0.515),
-        ("expm1", expm1, _near(0.0, -1), 0.515),
-        ("log", log, _any_size, 0.501),
-        ("log", log, _uniform(0.4, 2.1), 0.501),
-        ("log", log, _near(1.0, -4), 0.501),
-        ("cube_root", cube_root, _any_size, 0.501),
-        ("cube_root", cube_root, _uniform(0.4, 8.1), 0.501),
+        ("exp", _uniform(-708, 709.7), 0.501),
+        ("exp", _uniform(-3, 3), 0.501),
+        ("exp", _near(0.0, -1), 0.501),
+        ("exp", _uniform(-745.1, -707), 0.501),  # subnormal
+        ("expm1", _uniform(-40, 100), 0.502),
+        ("expm1", _uniform(-2, 2), 0.515),
+        ("expm1", _near(0.0, -1), 0.515),
+        ("log", _any_size, 0.501),
+        ("log", _uniform(0.4, 2.1), 0.501),
+        ("log", _near(1.0, -4), 0.501),
+        ("cube_root", _any_size, 0.501),
+        ("cube_root", _uniform(0.4, 8.1), 0.501),
     ],
 )
 def test_errors_in_units_of_the_last_place(
-    name: str, exact: Function, draw: Callable[[np.random.Generator], np.ndarray], most_ulps: float
+    name: str, draw: Callable[[np.random.Generator], np.ndarray], most_ulps: float
 ) -> None:
     function = getattr(core, f"noack_{name}")
     with localcontext() as context:
         context.prec = 60
         for x in draw(np.random.default_rng(1)).tolist():
-            expected = exact(Decimal(x))
+            expected = EXACT[name](Decimal(x))
             ulp = Decimal(math.ulp(float(expected)))
             assert abs(Decimal(function(x)) - expected) <= Decimal(most_ulps) * ulp, x
 
@@ -93,6 +87,24 @@ def test_special_values(name: str) -> None:
         assert math.copysign(1.0, found) == math.copysign(1.0, expected) or math.isnan(found)
 
 
+def test_the_normal_distribution_and_its_quantile_are_those_of_scipy() -> None:
+    """Both tail branches and the middle; the upper half by symmetry where that is exact."""
+    half = np.concatenate([np.geomspace(2.0**-54, 0.4999, 4000), np.linspace(0.001, 0.5, 4000)])
+    score = np.vectorize(core.noack_normal_score)
+    np.testing.assert_allclose(score(half), ndtri(half), rtol=1e-14, atol=1e-16)
+    upper = 1.0 - half[half > 2.0**-53]
+    np.testing.assert_allclose(score(upper), -ndtri(1.0 - upper), rtol=1e-14, atol=1e-16)
+    # Relative error 1e-14 plus the effect of the argument's rounding, z² ulps.
+    z = np.linspace(-8.3, 8.3, 5001)
+    found = np.vectorize(core.noack_normal_cdf)(z)
+    assert (np.abs(found / ndtr(z) - 1) <= 1e-15 * (2 + z**2)).all()
+    # The scores of 0 and 1 are finite.
+    ends = score([0.0, 2.0**-53, 2.0**-52, 0.5, 1 - 2.0**-53, 1.0])
+    assert (np.diff(ends) > 0).all()
+    assert (ends[0], ends[3]) == (-ends[-1], 0.0)
+    assert ends[0] == pytest.approx(ndtri(2.0**-54), rel=1e-14)
+
+
 def test_cube_roots_of_cubes_and_special_values() -> None:
     for k in range(1, 2000):
         assert core.noack_cube_root(float(k**3)) == k
@@ -109,3 +121,35 @@ def test_the_exponential_does_not_decrease() -> None:
         x = begin + np.arange(3000) * math.ulp(begin or 1.0) * 4
         found = [core.noack_exp(value) for value in x.tolist()]
         assert found == sorted(found)
+
+
+ONES = 0xFFFFFFFF
+WORDS = st.integers(0, ONES)
+
+
+def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, ...]:
+    words = ffi.new("int64_t[4]")
+    core.noack_philox([c0, c1, c2, c3], [k0, k1], words)
+    return tuple(words)
+
+
+def test_the_known_answers_of_random123() -> None:
+    """From kat_vectors of the authors' library: zeros, ones, digits of pi."""
+    assert philox(*[0] * 6) == (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
+    assert philox(*[ONES] * 6) == (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)
+    pi = (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344, 0xA4093822, 0x299F31D0)
+    assert philox(*pi) == (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1)
+
+
+@given(WORDS, WORDS, WORDS, st.integers(0, 2**63 - 1), st.integers(0, 3))
+def test_uniform_numbers_are_the_words_of_the_counter(
+    key0: int, key1: int, flow: int, packet: int, block: int
+) -> None:
+    a, b, c, d = philox(packet & ONES, packet >> 32, flow, block, key0, key1)
+    expected = tuple(((x << 32 | y) >> 11) / 2**53 for x, y in ((a, b), (c, d)))
+    found = uniform_pair(key0, key1, flow, packet, block)
+    assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in found)
+    # Upper 27 bits: from the first word; lower 26 bits: the upper bits of the second word.
+    for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):
+        assert divmod(int(u * 2**53), 2**26) == (x >> 5, y >> 6)
+    assert np.allclose(found, expected, rtol=0, atol=2**-27)

@@ -33,16 +33,17 @@ def test_the_end_of_each_array_is_known() -> None:
 
 
 @pytest.mark.parametrize("arguments", [
-    ("tests/native/machines_under_sanitizers.py", "tests/native/links_under_sanitizers.py",
-     "tests/native/exact_under_sanitizers.py"),
+    ("tests/native/machines_under_sanitizers.py",),
     ("tests/fuzz/test_parsers.py", "tests/netem/capture/test_pcapng.py",
      "tests/noack/protocol/test_wire_format.py", "-k", "link_numbers or pcapng or wire"),
-    ("tests/netem/test_channel.py", "tests/cosim/simulation/test_event_order.py",
-     "tests/cosim/analysis/test_replay.py", "tests/cosim/analysis/adversary/test_worst_patterns.py",
-     "-k", "channel or event_order or (test_replay and (numbers or exact or bit_for_bit or "
-           "runs_end)) or (test_worst_patterns and (machines or early))"),
+    ("tests/netem/test_link.py", "tests/netem/test_mansd.py",
+     "tests/cosim/simulation/test_event_order.py", "tests/cosim/analysis/test_replay.py",
+     "tests/cosim/analysis/adversary/test_worst_patterns.py", "-k",
+     "plain_network or no_network or in_time or event_order or restarted or (test_replay and "
+     "(numbers or exact or bit_for_bit or runs_end)) or (test_worst_patterns and (machines or "
+     "early))"),
     ("tests/noack/runtime/test_live_driver.py", "tests/noack/runtime/test_peer_sockets.py"),
-], ids=["random machines, links and exact simulations", "parsers", "simulations and replays",
+], ids=["random machines and exact simulations", "parsers", "simulations and replays",
         "the live driver"])  # fmt: skip
 def test_these_tests_run_clean(arguments: Sequence[str]) -> None:
     done = run(*PYTEST, *arguments)

@@ -1,16 +1,22 @@
-"""Fixtures for netem's tests: many compiled decisions, and what their receiver observes."""
+"""Fixtures for netem's tests: many compiled decisions, and emulators in separate processes."""
 
-from collections.abc import Callable
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from netem.link_state import LinkState
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import Decisions, LinkSettings
-from tests.oracles.receiver import longest_burst, outcomes_of
+from noack.protocol.record_tables import Fate
 
 MOST = 1_000_000
 
@@ -66,22 +72,7 @@ def decide() -> Decide:
     return run
 
 
-def _longest_undelivered(decided: Decided) -> int:
-    longest = []
-    for flow in range(int(decided.flows.max(initial=0)) + 1):
-        of_flow = decided.decisions[decided.flows == flow]
-        assert (of_flow["packet"] == np.arange(len(of_flow))).all()
-        longest.append(longest_burst(outcomes_of(of_flow)))
-    return max(longest)
-
-
-@pytest.fixture(scope="session")
-def longest_undelivered() -> Callable[[Decided], int]:
-    """The longest sequence of datagrams of a flow that were lost or delivered out of order."""
-    return _longest_undelivered
-
-
-def assert_share(flags: ArrayLike, expected: float, batches: int = 200) -> None:
+def _assert_share(flags: ArrayLike, expected: float, batches: int = 200) -> None:
     """Check that the mean agrees with ``expected`` to five standard errors of the batch means.
 
     Flags may be correlated, but the correlation over a whole batch is negligible. The seeds are
@@ -96,4 +87,81 @@ def assert_share(flags: ArrayLike, expected: float, batches: int = 200) -> None:
 
 @pytest.fixture(scope="session")
 def share_is() -> Callable[..., None]:
-    return assert_share
+    return _assert_share
+
+
+FORWARDED = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
+
+
+class Emulator:
+    """``python -m netem`` with one link, in a separate folder.
+
+    Args:
+        folder: the folder for its fate trace.
+        to: the server, HOST:PORT.
+        words: impairments and options.
+        listen: the address to which clients send.
+        inside: a command prefix, e.g. to run the emulator in a network namespace.
+    """
+
+    def __init__(
+        self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()
+    ) -> None:
+        self._trace = folder / "fates.parquet"
+        self.process = subprocess.Popen(
+            [
+                *inside, sys.executable, "-m", "netem", "--listen", listen, "--to", to, "--json",
+                "--record-fates", str(self._trace), *words,
+            ],
+            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        ready = self.process.stdout.readline()
+        assert ready, self.process.communicate()[1]
+        (link,) = json.loads(ready)["ready"]
+        self.host, _, port = link["listen"].rpartition(":")
+        self.port = int(port)
+
+    def finish(self) -> dict[str, Any]:
+        """End the emulator and check for unintended losses; return its link's statistics."""
+        link, status, stderr = self.end()
+        assert status == 0, stderr
+        for line in stderr.splitlines():
+            # A program may end with datagrams to it in flight.
+            usual = ("Ctrl-C ends", "ICMP port unreachable")
+            assert any(words in line for words in usual), stderr
+        return link
+
+    def end(self) -> tuple[dict[str, Any], int, str]:
+        """End the emulator; return its link's statistics, exit status and standard error."""
+        self.process.send_signal(signal.SIGINT)
+        stdout, stderr = self.process.communicate(timeout=60)
+        (link,) = json.loads(stdout)["links"]
+        return dict(link), self.process.returncode, stderr
+
+    def fates(self, direction: str) -> list[dict[str, Any]]:
+        """Return the fate of each datagram of the first flow, in the order of arrival."""
+        rows: list[dict[str, Any]] = pq.read_table(self._trace).to_pylist()
+        return [row for row in rows if row["direction"] == direction and row["flow"] == 0]
+
+
+Emulate = Callable[..., Emulator]
+
+
+@pytest.fixture
+def emulate(tmp_path: Path) -> Iterator[Emulate]:
+    """Start emulators; kill the remaining ones at the end."""
+    started: list[Emulator] = []
+
+    def start(
+        to: str, *words: str, listen: str = "127.0.0.1:0", inside: Sequence[str] = ()
+    ) -> Emulator:
+        folder = tmp_path / f"emulator {len(started)}"
+        folder.mkdir()
+        started.append(Emulator(folder, to, *words, listen=listen, inside=inside))
+        return started[-1]
+
+    yield start
+    for emulator in started:
+        emulator.process.kill()
+        emulator.process.communicate()

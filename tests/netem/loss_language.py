@@ -3,7 +3,6 @@
 An outcome is 1 for a lost and 0 for a delivered datagram. Before the first one, all are delivered.
 """
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,25 +13,8 @@ from noack.impairments.constraints.recovery import Recovery
 from noack.impairments.link_settings import LinkSettings
 
 
-def is_allowed(lost: Sequence[bool], settings: LinkSettings) -> bool:
-    """Whether each window and each gap between two loss bursts fulfils the guarantee."""
-    text = "".join("1" if one else "0" for one in lost)
-    if settings.mansd is not None and "1" * (settings.mansd + 1) in text:
-        return False
-    for one in settings.constraints:
-        if isinstance(one, AtMost):
-            counts = (text[at : at + one.window].count("1") for at in range(len(text)))
-            if max(counts, default=0) > one.losses:
-                return False
-        elif isinstance(one, Recovery):
-            gaps = re.findall("(?<=1)0+(?=1)", text)
-            if min(map(len, gaps), default=one.deliveries) < one.deliveries:
-                return False
-    return True
-
-
 def allowed_rows(lost: NDArray[np.bool_], settings: LinkSettings) -> NDArray[np.bool_]:
-    """The same for each row of (rows, n) outcomes."""
+    """Whether each row of (rows, n) outcomes fulfils the guarantee in all windows and gaps."""
     lost = np.pad(lost, ((0, 0), (1, 0)))
     count, n = np.cumsum(lost, axis=1), lost.shape[1]
     allowed = np.ones(len(lost), bool)
@@ -40,14 +22,17 @@ def allowed_rows(lost: NDArray[np.bool_], settings: LinkSettings) -> NDArray[np.
     if settings.mansd is not None:
         windows.append((settings.mansd, settings.mansd + 1))
     for losses, window in windows:
-        for end in range(1, n):
-            within = count[:, end] - count[:, max(end - window, 0)]
-            allowed &= within <= losses
+        begins = np.maximum(np.arange(n) - window, 0)
+        allowed &= (count - count[:, begins] <= losses).all(axis=1)
     for one in settings.constraints:
         if isinstance(one, Recovery):
-            for gap in range(1, one.deliveries):
-                for first in range(n - gap - 1):
-                    last = first + gap + 1
-                    both = lost[:, first] & lost[:, last]
-                    allowed &= ~(both & (count[:, last] - count[:, first] == 1))
+            for later in range(2, one.deliveries + 1):  # two bursts, later - 1 deliveries apart
+                ends = lost[:, :-later] & lost[:, later:]
+                apart = count[:, later:] - count[:, :-later] == 1
+                allowed &= ~(ends & apart).any(axis=1)
     return allowed
+
+
+def is_allowed(lost: Sequence[bool], settings: LinkSettings) -> bool:
+    """The same for one sequence."""
+    return bool(allowed_rows(np.array([lost], bool), settings)[0])

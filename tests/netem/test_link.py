@@ -1,4 +1,4 @@
-"""One direction of a link, without a cap or with one: fates, departures, records, counts."""
+"""One direction of a link; and the network of a run, against the plain one in Python."""
 
 import itertools
 from collections.abc import Sequence
@@ -6,10 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from netem import link_state
+from netem.channel import Channel, channel_of
+from netem.link_state import LinkState
 from netem.tc_words import settings_of
+from noack.core.core_library import address_of, core, ffi
+from noack.impairments.kinds.opportunities import Opportunities
+from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -19,7 +25,9 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.oracles.link import Datagram, Link, update_link_of
+from tests.netem.any_settings import capped, computable, harsh
+from tests.netem.stepped_channel import SteppedChannel
+from tests.oracles.link import Datagram, Duplex, Link, update_link_of
 
 MS = 1_000_000
 LOSSES = [
@@ -68,9 +76,6 @@ def drain(link: Link) -> list[tuple[int, Outputs]]:
     return found
 
 
-# Inputs that determine a flow's fates.
-
-
 @given(
     st.sampled_from([*LOSSES, ALL_TIMELESS]), st.none() | st.integers(0, 4),
     st.lists(st.tuples(st.integers(0, 3), st.integers(0, 10**12)), max_size=60),
@@ -97,70 +102,14 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
 
 @pytest.mark.parametrize("words", LOSSES[:-1])
 def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
+    """Which no other impairment changes."""
     sequences = [
         tuple(fates(Link(settings_of(words), seed, *name), flow, 100))
         for seed, name, flow in itertools.product((5, 6), (("a",), ("b",), ("a", "b")), (0, 1))
     ]
     assert len(set(sequences)) == 12
-    assert tuple(fates(Link(settings_of(words), 5, "a"), 0, 100)) == sequences[0]
-
-
-@pytest.mark.parametrize("cap", ["", "mansd 2"])
-@pytest.mark.parametrize("other", ["duplicate 50%", "delay 10ms 5ms", "corrupt 0%"])
-def test_adding_an_impairment_does_not_change_the_losses(cap: str, other: str) -> None:
-    loss = "loss 40% 70%"
-    alone = fates(new_link(f"{loss} {cap}"), 0, 300)
-    assert alone == fates(new_link(f"{other} {loss} {cap}"), 0, 300)
-    assert alone == fates(new_link(f"{loss} {other} {cap}"), 0, 300)
-
-
-@pytest.mark.parametrize(
-    ("kind", "words", "its_own"),
-    [
-        ("loss", "loss 10%", "lost"), ("duplicate", "duplicate 80% 50%", "copied"),
-        ("corrupt", "corrupt 90%", "bit"), ("reorder", "reorder 90%", "delay_ns"),
-        ("delay", "delay 20ms 5ms 30% distribution normal", "delay_ns"),
-    ],
-)  # fmt: skip
-def test_another_probability_changes_no_other_randomness(
-    kind: str, words: str, its_own: str
-) -> None:
-    """The unaffected parts of each decision stay the same, as far as they are observable."""
-
-    def visible(words: str) -> list[dict[str, Any]]:
-        link, found = new_link(words), []
-        for k in range(1000):
-            decision = link.decide(0, 100, k * 10**9)
-            seen: dict[str, Any] = {"lost": decision.fate == Fate.DROPPED}
-            if not seen["lost"]:
-                seen["copied"] = decision.copy_ns >= 0
-                if not seen["copied"]:  # with a copy, either can leave first
-                    seen |= {"bit": decision.bit, "delay_ns": decision.release_ns - k * 10**9}
-            found.append(seen)
-        return found
-
-    compared = dict.fromkeys(("lost", "copied", "bit", "delay_ns"), 0)
-    changed = " ".join((TIMELESS | {kind: words}).values())
-    for before, after in zip(visible(ALL_TIMELESS), visible(changed), strict=True):
-        for name in before.keys() & after.keys() - {its_own}:
-            assert before[name] == after[name]
-            compared[name] += 1
-    assert all(count > 50 for name, count in compared.items() if name != its_own)
-
-
-def test_neither_payload_nor_size_changes_the_losses() -> None:
-    small, large = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
-    same, other = new_link(ALL_TIMELESS), new_link(ALL_TIMELESS)
-    for k in range(100):
-        losses = [link.decide(0, size, 0).fate == 1 for link, size in ((small, 0), (large, 10 * k))]
-        assert losses[0] == losses[1]
-        (one,) = rows_of(same.handle(Datagram(0, bytes(k)), 0))
-        (two,) = rows_of(other.handle(Datagram(0, bytes([k]) * k), 0))
-        for name in ("fate", "release_ns", "copy_ns", "bit"):
-            assert one[name] == two[name]
-
-
-# The fate of a datagram.
+    for one in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
+        assert tuple(fates(new_link(one), 0, 100)) == sequences[0]
 
 
 def test_a_stale_datagram_is_recorded_as_such() -> None:
@@ -173,22 +122,20 @@ def test_a_stale_datagram_is_recorded_as_such() -> None:
     assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
 
 
-@pytest.mark.parametrize("copies", [False, True])
-def test_the_limit_bounds_the_datagrams_in_flight(copies: bool) -> None:
-    link = new_link(f"{'duplicate 100%' * copies} delay 10ms limit 5")
-    found = fates(link, 0, 20)
-    assert found.count(Fate.OVERFLOWED) == (17 if copies else 15)
+@pytest.mark.parametrize(
+    ("words", "overflowed"),
+    [
+        ("delay 10ms", 15),
+        ("duplicate 100% delay 10ms", 17),
+        ("duplicate 100% delay 10ms reorder 100% mansd 3", 0),  # only copies are delayed
+    ],
+)
+def test_the_limit_bounds_the_datagrams_and_copies_in_flight(words: str, overflowed: int) -> None:
+    link = new_link(f"{words} limit 5")
+    assert fates(link, 0, 20).count(Fate.OVERFLOWED) == overflowed
     assert link.counters.most_in_flight == 5
     assert len(drain(link)) == 5
     assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
-
-
-def test_the_limit_also_bounds_copies_of_undelayed_datagrams() -> None:
-    link = new_link("duplicate 100% delay 10ms reorder 100% mansd 3 limit 5")
-    for k in range(20):
-        link.handle(Datagram(0, b"x"), k)
-    assert link.counters.delivered == 20
-    assert link.counters.most_in_flight == 5
 
 
 @given(st.lists(st.integers(0, 2), max_size=60), st.none() | st.integers(0, 3))
@@ -204,9 +151,6 @@ def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> 
     assert list(counted) == [found.count(fate) for fate in Fate]
     assert of.received == len(order)
     assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
-
-
-# The link of a scenario.
 
 
 @pytest.mark.parametrize(
@@ -226,3 +170,110 @@ def test_the_link_of_a_scenario_keeps_its_mansd(
     link = update_link_of(resolve(validate(content, "here")))
     found = "".join("dF"[fate is Fate.FORCED] for fate in fates(link, 0, 7))
     assert found == expected
+
+
+def test_a_refused_change_leaves_a_link_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = LinkState(settings_of("delay 1ms"), 1, "any")
+    link.start_flow(0, 0)
+    begin = address_of(link.core.memory), address_of(link.core.stages)
+
+    def refuse(wrong: object) -> None:
+        raise ValueError("link: refused")
+
+    monkeypatch.setattr(link_state, "_require", refuse)
+    with pytest.raises(ValueError, match="refused"):
+        link.change(LinkSettings(), np.full(1, NEVER_NS))
+    assert (link._memory["memory"].ctypes.data, address_of(link._stages)) == begin
+    assert link.decide(0, 72, 0).release_ns == MS
+
+
+LOOPS = 4
+any_link = st.one_of(computable, harsh, capped)
+arrivals = st.lists(
+    st.tuples(
+        st.integers(0, 2 * LOOPS - 1), st.sampled_from([0, 1, 20, 32, 72, 1500]),
+        st.one_of(st.integers(0, 10**7), st.integers(0, 10**10)), st.booleans(),
+    ),
+    max_size=60,
+)  # fmt: skip
+"""Flow, size, time since the datagram before, and whether what is due has left."""
+
+
+def content_of(outputs: Sequence[Any]) -> tuple[list[tuple[int, bytes]], list[Any]]:
+    datagrams = [(one.flow, one.data) for one in outputs if not isinstance(one, Record)]
+    rows = [(one.table, *map(plain, one.row)) for one in outputs if isinstance(one, Record)]
+    return datagrams, rows
+
+
+def plain(value: Any) -> bytes | int:
+    return bytes(value) if isinstance(value, bytes | np.void) else int(value)
+
+
+@settings(max_examples=40)
+@given(any_link, any_link, st.none() | any_link, arrivals, st.sampled_from([0, 2**40]))
+def test_it_does_what_the_plain_network_does(
+    first: LinkSettings,
+    second: LinkSettings,
+    later: LinkSettings | None,
+    arriving: Sequence[tuple[int, int, int, bool]],
+    number: int,
+) -> None:
+    named = (first, 5, "update"), (second, 5, "actuation")
+    forward, reverse = (Link(*one, first_number=number) for one in named)
+    expected = Duplex(forward, reverse, first_number=number, loops=LOOPS)
+    links = [LinkState(*one, rows=LOOPS) for one in named]
+    channel = SteppedChannel(Channel(links, loops=LOOPS, first_number=number))
+    now_ns, rng = 0, np.random.default_rng(1)
+    for k, (flow, size, step_ns, leaves) in enumerate(arriving):
+        if later is not None and k == len(arriving) // 2:
+            changed = later.model_copy(update={"first_delivered": first.first_delivered})
+            forward.change(changed)
+            channel.channel.change(changed)
+        now_ns += step_ns
+        while leaves and (due_ns := expected.next_deadline_ns()) is not None and due_ns <= now_ns:
+            assert channel.next_deadline_ns() == due_ns
+            assert content_of(channel.on_timer(now_ns)) == content_of(expected.on_timer(now_ns))
+        datagram = Datagram(flow, rng.bytes(size))
+        assert content_of(channel.handle(datagram, now_ns)) == content_of(
+            expected.handle(datagram, now_ns)
+        )
+    while (due_ns := expected.next_deadline_ns()) is not None:
+        assert channel.next_deadline_ns() == due_ns
+        assert content_of(channel.on_timer(due_ns)) == content_of(expected.on_timer(due_ns))
+    assert channel.next_deadline_ns() is None
+    assert [one.counters for one in channel.channel.links] == [forward.counters, reverse.counters]
+
+
+def test_room_for_delayed_datagrams_grows(content: dict[str, Any]) -> None:
+    delay = {"kind": "delay", "delay_s": 1.0}
+    network = content["network"] | {"loss": {"model": "lossless"}, "impairments": [delay]}
+    channel = SteppedChannel(channel_of(resolve(validate(content | {"network": network}, ""))))
+    sent = [bytes([k % 256, k // 256]) for k in range(1000)]
+    for k, data in enumerate(sent):
+        assert not content_of(channel.handle(Datagram(0, data), k))[0]
+    left = [content_of(channel.on_timer(10**9 + k))[0] for k in range(1000)]
+    assert left == [[(0, data)] for data in sent]
+
+
+def test_numbers_of_no_network_are_refused(content: dict[str, Any]) -> None:
+    channel = channel_of(resolve(validate(content, "")))
+    own = channel.core
+    for name, value in (
+        ("loops", 0), ("loops", 2), ("directions", 3), ("places", 1), ("row_places", 0),
+        ("heap_count", -1), ("packet_count", own.row_places + 1),
+    ):  # fmt: skip
+        before = getattr(own, name)
+        setattr(own, name, value)
+        assert core.noack_channel_check(own) != ffi.NULL
+        setattr(own, name, before)
+        assert core.noack_channel_check(own) == ffi.NULL
+
+
+def test_a_queue_that_cannot_be_served_in_time() -> None:
+    served = Opportunities(times_ms=(0, 10**12), overhead_bytes=65_535, queue=2)
+    link = LinkState(LinkSettings(impairments=(served,), mansd=0), 1, "late")
+    link.start_flow(0, 0)
+    count = 250_000
+    rows, sizes = np.zeros(count, np.int64), np.full(count, 65_535, np.int64)
+    decisions = link.decide_many(rows, sizes, np.full(count, 2**61 - 10**9))
+    assert (decisions["fate"] <= core.NOACK_FORCED).all()

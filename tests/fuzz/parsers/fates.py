@@ -10,10 +10,8 @@ from netem.fates import METADATA, SCHEMA, description, read_fates
 from netem.relay_links import LinkSpec
 from netem.tc_words import settings_of
 from noack.impairments.link_settings import LinkSettings
-from tests.fuzz.choices import Choices
-from tests.fuzz.edits import Vocabulary, edited
-from tests.fuzz.harness import refusal, workspace
-from tests.fuzz.tables import edited_table, written
+from tests.fuzz.edits import Choices, Vocabulary, edited, edited_table, written
+from tests.fuzz.harness import Harness, refusal, workspace
 from tests.oracles.link import Link
 
 _LATEST_NS = 2**62
@@ -48,7 +46,7 @@ def _rows() -> pa.Table:
 TABLE = _rows()
 
 
-def one_input(data: bytes) -> None:
+def fates_input(data: bytes) -> None:
     choices = Choices(data)
     document: Any = edited(choices, DOCUMENT, KNOWN) if choices.flag() else DOCUMENT
     text = json.dumps(document)
@@ -72,3 +70,8 @@ def _replay(path: Path, links: list[str] | None) -> None:
                 # The compiled relay adds in signed 64 bits.
                 assert _LATEST_NS + int(max(delay_ns, copy_delay_ns)) < 2**63
                 link.decide(flow, 100, 0)
+
+
+PARSERS = {
+    "fates": Harness(fates_input),
+}

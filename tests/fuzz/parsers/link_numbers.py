@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from netem.link_state import LinkState
 from noack.core.core_library import core, dtype_of, ffi, pointer_to
 from noack.impairments.link_settings import NEVER_NS, LinkSettings, RecordedDecision
-from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Choices
+from tests.fuzz.harness import Harness
 from tests.netem.feature_examples import CONSTRAINED, IMPAIRED, keeps_loss, names_file
 
-SANITIZED = True
 SEEDS = (
     b"", bytes(range(256)), bytes(range(255, -1, -1)) * 2,
     *(bytes([*range(at, at + 40)]) * 4 for at in range(0, 200, 11)),
@@ -33,7 +33,7 @@ LATEST_NS, LARGEST_BYTES = 2**61, 65_535
 Words = NDArray[np.int64]
 
 
-def one_input(data: bytes) -> None:
+def link_numbers_input(data: bytes) -> None:
     """Make two links, decide for packets of the first, and go on with the second."""
     choices = Choices(data)
     links = [link for link in (_link(choices), _link(choices)) if link is not None]
@@ -154,3 +154,8 @@ def _allocate(link: Any, tables: dict[str, Words]) -> dict[str, Any]:
 
 def _resized(words: Words, length: int) -> Words:
     return np.resize(words, length) if len(words) else np.zeros(length, np.int64)
+
+
+PARSERS = {
+    "link_numbers": Harness(link_numbers_input, seeds=SEEDS, sanitized=True),
+}

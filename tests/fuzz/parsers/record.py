@@ -1,9 +1,10 @@
-"""Run directories: the files of a short run, some of them edited, damaged or missing."""
+"""Run directories, of which files are edited, damaged or missing; and messages to the recorder."""
 
 import io
 import json
 import shutil
 from collections.abc import Mapping
+from contextlib import redirect_stderr
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import Outcome, summarise
 from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.live.finalize import reopen
+from cosim.live.recorder import Recorder
 from cosim.output.run_verdict import print_outcome
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import (
@@ -32,14 +34,14 @@ from cosim.record.run_directory import (
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
-from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from noack.protocol.record_tables import OWNER
+from noack.runtime.spool import NOTICES, SPOOL, SpoolWriter, batch_of, notices_of
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario_file import dumps, validate
 from tests.cosim.summaries import alone
-from tests.fuzz.choices import Choices
-from tests.fuzz.edits import Vocabulary, edited
-from tests.fuzz.harness import refusal, workspace
-from tests.fuzz.tables import damaged, edited_table, written
+from tests.fuzz.edits import Choices, Vocabulary, damaged, edited, edited_table, written
+from tests.fuzz.harness import Harness, refusal, workspace
+from tests.fuzz.plane import FakePlane, Query, Sample
 
 SCENARIO = {
     "name": "short", "horizon_s": 0.05, "model": {"name": "double_integrator"},
@@ -59,7 +61,7 @@ FIDELITY = {
     "rms_x_live": 1.0, "shares": {"sampling": 1.0, "residual": 0.0}, "events_ideal": 1,
     "events_live": 1, "max_event_difference_s": None, "first_different_event": None,
 }  # fmt: skip
-KNOWN = Vocabulary(
+RECORD_KNOWN = Vocabulary(
     ("rows", "ended", "channel", "rejected", "acknowledgements", "realtime", "pid", "plant",
      "netem", "plant_step", "netem_packet", "t_ns", "level", "text", "process", "kind"),
     ("horizon", "violation", "live", "simulated", "plant", "tag", ""),
@@ -115,7 +117,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
-def one_input(data: bytes) -> None:
+def record_input(data: bytes) -> None:
     choices = Choices(data)
     content = dict(files(choices.flag(), choices.flag()))
     spooled = choices.below(3)  # 0 recorded, 1 interrupted, 2 recorded with rows left in the spool
@@ -149,7 +151,7 @@ def _changed(choices: Choices, name: str, data: bytes) -> bytes | None:
         return written(choices, edited_table(choices, _table(data)), {})
     if name.endswith((".json", ".jsonl")) and kind != 1:
         lines = data.splitlines() if name.endswith("l") else [data]
-        lines = [edited(choices, json.loads(line), KNOWN) for line in lines]
+        lines = [edited(choices, json.loads(line), RECORD_KNOWN) for line in lines]
         return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
     if name.startswith(SPOOL) and kind != 1:
         return _spool(choices, name, data)
@@ -165,7 +167,7 @@ def _table(data: bytes) -> Any:
 def _spool(choices: Choices, name: str, data: bytes) -> bytes:
     """Return a spool file with changed row numbers or an additional chunk."""
     if "notices" in name:
-        payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
+        payload = json.dumps(edited(choices, NOTICE, RECORD_KNOWN)).encode()
     else:
         numbers = np.frombuffer(data[16 : 16 + (len(data) - 16) // 8 * 8], "<i8").copy()
         for _ in range(choices.below(4)):
@@ -204,3 +206,82 @@ def _read(run_dir: Path) -> None:
         again = load_record(run_dir)  # a finalised record can be read
         assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)
         assert record.notices == again.notices
+
+
+RESOLVED = resolve(validate(SCENARIO, "short"))
+REPORT = {
+    "pid": 1, "ended": "horizon", "realtime": {},
+    "channel": {"accepted": 1, "rejected": {"tag": 1}},
+    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1}, "generation": 0,
+    "instance": "one",
+}  # fmt: skip
+_TYPES = run_tables(RESOLVED)
+HEADER = {"first": 0, "rows": 4, "generation": 0}
+TELEMETRY_KNOWN = Vocabulary(
+    (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
+)
+
+
+def telemetry_input(data: bytes) -> None:
+    choices = Choices(data)
+    run_dir = workspace() / "telemetry"
+    shutil.rmtree(run_dir, ignore_errors=True)
+    run_dir.mkdir()
+    (run_dir / SCENARIO_FILE).write_text(dumps(RESOLVED))
+    plane = FakePlane()
+    recorder = Recorder(RESOLVED, run_dir, plane)
+    queries = []
+    for _ in range(1 + choices.below(6)):
+        match choices.below(5):
+            case 0:
+                queries.append(_report(choices))
+                plane.put("report", queries[-1])
+            case 1:
+                plane.put(
+                    "alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one")
+                )
+            case _:
+                plane.put("telemetry", _batch(choices))
+    with redirect_stderr(io.StringIO()) as errors:
+        recorder.poll()
+    assert errors.getvalue().count("\n") <= 1, "invalid messages fill the log"
+    recorder.show()
+    recorder.acknowledge()
+    assert isinstance(recorder.finished, bool)
+    assert all(query.answered == 1 for query in queries), "a report has no answer"
+    # The record contains the valid part of the messages.
+    recorder.finish()
+    recorder.report()
+    record = finish_record(run_dir).loop()
+    assert set(record.tables) >= {"plant_step"}
+
+
+def _batch(choices: Choices) -> Sample:
+    table = choices.one([*OWNER, NOTICES, "", "nothing"])
+    role = choices.one([OWNER.get(table, "plant"), "nobody"])
+    if table == NOTICES:
+        lines = [edited(choices, NOTICE, TELEMETRY_KNOWN) for _ in range(1 + choices.below(3))]
+        payload = batch_of(json.dumps(line).encode() for line in lines)
+    else:
+        count = choices.below(3)
+        numbers = [choices.integer() % 2**63 if choices.below(4) == 0 else 0 for _ in range(8)]
+        payload = np.resize(np.array(numbers, "<i8"), 64 * count).tobytes()
+        types = _TYPES.get(table)
+        if types is not None and choices.below(4):
+            payload = payload[: types.itemsize * choices.below(4)]
+    header = json.dumps(edited(choices, HEADER, TELEMETRY_KNOWN)).encode()
+    attachment = None if choices.below(8) == 1 else damaged(choices, header)
+    payload = damaged(choices, payload) if payload else payload
+    return Sample(f"noack/0/telemetry/{role}/{table}", payload, attachment)
+
+
+def _report(choices: Choices) -> Query:
+    report: Any = edited(choices, REPORT, TELEMETRY_KNOWN)
+    payload = None if choices.below(8) == 1 else damaged(choices, json.dumps(report).encode())
+    return Query(f"noack/0/report/{choices.one([*OWNER.values(), 'nobody'])}", payload)
+
+
+PARSERS = {
+    "record": Harness(record_input),
+    "telemetry": Harness(telemetry_input),
+}

@@ -1,7 +1,13 @@
-"""``reader`` reads every file; it implements the draft and the RFCs independently of the code."""
+"""Captures, which ``reader`` reads independently of the code; and the thread that writes them."""
 
+import errno
+import os
+import resource
 import struct
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,34 +15,39 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.capture import PcapngSection
-from netem.relay_links import DIRECTIONS, EVENT
+from netem.capture import CaptureWriter, PcapngSection
+from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
+from noack.core.errors import CallerError
 from noack.protocol.record_tables import Fate
-from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
-from tests.netem.capture.reader import Datagram, datagram, read
-
-
-def comment_of(**fields: Any) -> str:
-    (packet,) = read(file_of(fields)).packets
-    return packet.comment
+from tests.netem.capture.reader import (
+    INTERFACES,
+    SPECS,
+    T_NS,
+    Datagram,
+    batch,
+    datagram,
+    events,
+    file_of,
+    read,
+)
 
 
 @given(st.lists(events, max_size=5))
 def test_an_independent_reader_finds_what_was_written(described: list[dict[str, Any]]) -> None:
-    packets = read(file_of(*described)).packets
+    section, interfaces, packets, _ = read(file_of(*described))
+    assert section[4][0].startswith(b"noack netem ")
+    assert [(kind, snap) for kind, snap, _ in interfaces] == [(101, 262_144)] * 2
+    assert [options for _, _, options in interfaces] == [
+        {2: [name.encode()], 3: [at.encode()], 9: [b"\x09"]} for name, at in INTERFACES
+    ]
     assert len(packets) == len(described)
     for packet, event in zip(packets, described, strict=True):
         assert packet.interface == event["interface"]
         assert packet.t_ns == event["t_ns"]
         assert packet.original_bytes == len(packet.frame)
         assert packet.options[2] == [struct.pack("<I", 2 if event["departure"] else 1)]
-        assert datagram(packet.frame) == Datagram(
-            event["source"],
-            event["destination"],
-            event["source_port"],
-            event["destination_port"],
-            event["payload"],
-        )
+        names = ("source", "destination", "source_port", "destination_port", "payload")
+        assert datagram(packet.frame) == Datagram(*(event[name] for name in names))
         name = DIRECTIONS[event["direction"]]
         assert packet.comment.endswith(f"; {name}, flow {event['flow']}, packet {event['packet']}")
 
@@ -56,48 +67,26 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
     assert parts + section.statistics() == whole
 
 
-def test_a_file_names_its_program_and_describes_the_interfaces() -> None:
-    section = PcapngSection([("link0 client", "[::]:5000 → here"), ("link0 server", "")])
-    file = read(section.header() + section.statistics())
-    assert file.section[4][0].startswith(b"noack netem ")
-    assert set(file.section) == {2, 3, 4}
-    assert file.packets == []
-    assert [(kind, snap) for kind, snap, _ in file.interfaces] == [(101, 262_144)] * 2
-    assert [options for _, _, options in file.interfaces] == [
-        {2: [b"link0 client"], 3: ["[::]:5000 → here".encode()], 9: [b"\x09"]},
-        {2: [b"link0 server"], 9: [b"\x09"]},
-    ]
-
-
 LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
 
 
 @pytest.mark.parametrize(
     ("fields", "comment"),
     [
-        ({}, "delivered"),
         (LOST, "dropped by the loss model, consecutive loss 2"),
         (LOST | {"mansd": 4}, "dropped by the loss model, consecutive loss 2, cap 4"),
-        (LOST | {"delay_ns": 10, "hold_back_ns": 10},
-         "dropped by the loss model, consecutive loss 2"),
-        ({"fate": Fate.FORCED}, "forced: delivered by the cap"),
         ({"fate": Fate.FORCED, "packet": 0, "mansd": 4},
          "forced: delivered as the first of its flow"),
         ({"fate": Fate.FORCED, "mansd": 4, "delay_ns": 10_000_000},
          "forced: delivered by the cap of 4 consecutive losses, delayed 10 ms"),
-        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "mansd": 4, "delay_ns": 1_000_000},
-         "corrupted in bit 513, consecutive loss 1, cap 4, delayed 1 ms"),
-        ({"fate": 4, "consecutive_losses": 1, "mansd": 1},
-         "dropped by a full queue, consecutive loss 1, cap 1"),
+        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "delay_ns": 1_000_000},
+         "corrupted in bit 513, consecutive loss 1, delayed 1 ms"),
+        ({"fate": 4, "consecutive_losses": 1}, "dropped by a full queue, consecutive loss 1"),
         ({"fate": 5, "consecutive_losses": 12}, "dropped in a blackout, consecutive loss 12"),
         ({"fate": 99}, "unknown fate"),
-        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "consecutive_losses": 1, "mansd": 4},
+        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "mansd": 4},
          "delivered, delayed 12.345 ms, held back 1.2 ms for the guarantee"),
-        ({"departure": 1, "delay_ns": 12_345_678}, "delivered, after 12.346 ms"),
         ({"departure": 1, "delay_ns": -5}, "delivered, after 0 ms"),
-        ({"departure": 1, "copy": 1, "delay_ns": 499}, "copy, delivered, after 0 ms"),
-        ({"departure": 1, "stale": 1, "delay_ns": 50_000},
-         "delivered out of order (stale), after 0.05 ms"),
         ({"departure": 1, "fate": 3, "bit": 0, "stale": 1, "delay_ns": 10**18},
          "corrupted in bit 0, delivered out of order (stale), after 1000000000000 ms"),
         ({"departure": 1, "copy": 1, "bit": 8, "delay_ns": 1000},
@@ -105,22 +94,8 @@ LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
     ],
 )  # fmt: skip
 def test_the_comment_describes_the_fate(fields: dict[str, Any], comment: str) -> None:
-    packet = fields.get("packet", 17)
-    assert comment_of(**fields) == f"{comment}; forward, flow 3, packet {packet}"
-
-
-def test_a_datagram_has_the_same_number_on_both_interfaces() -> None:
-    seen = [
-        {"interface": 0},
-        {"interface": 1, "departure": 1},
-        {"interface": 1, "departure": 1, "copy": 1},
-        {"interface": 1, "direction": 1},
-        {"interface": 0, "packet": 18},
-        {"interface": 0, "flow": 4},
-    ]
-    numbers = [packet.options[5][0] for packet in read(file_of(*seen)).packets]
-    assert numbers[0] == numbers[1] == numbers[2]
-    assert len(set(numbers)) == 4
+    (packet,) = read(file_of(fields)).packets
+    assert packet.comment == f"{comment}; forward, flow 3, packet {fields.get('packet', 17)}"
 
 
 def test_a_checksum_of_0_is_sent_as_ffff() -> None:
@@ -144,24 +119,6 @@ def test_the_largest_datagram_fits(family: int, most: int) -> None:
     table["size_bytes"] += 1
     with pytest.raises(ValueError, match="too large for a datagram"):
         section.packets(table, np.append(data, np.uint8(0)))
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "text"),
-    [
-        ("interface", 2, "an interface that does not exist"), ("t_ns", -1, "before 1970"),
-        ("family", 0, "neither of IPv4 nor of IPv6"), ("size_bytes", 8, "outside the data"),
-        ("size_bytes", 2**32 - 1, "too large"), ("offset", 19, "outside the data"),
-        ("offset", 2**63, "outside the data"), ("offset", 2**64 - 1, "outside the data"),
-    ],
-)  # fmt: skip
-def test_an_impossible_event_is_refused(field: str, value: int, text: str) -> None:
-    table, data = batch({}, {})
-    table, data = table[:1], data[:18]
-    PcapngSection(INTERFACES).packets(table, data)
-    table[field] = value
-    with pytest.raises(ValueError, match=f"a batch is impossible: .*{text}"):
-        PcapngSection(INTERFACES).packets(table, data)
 
 
 @given(events, st.data())
@@ -198,3 +155,135 @@ def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
         ends = [struct.unpack("<II", options[code][0]) for code in (2, 3)]
         assert [high << 32 | low for high, low in ends] == [T_NS, T_NS + 7]
         assert t_ns == T_NS + 7
+
+
+FOUR = [{"packet": number, "interface": number % 2} for number in range(4)]
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def fifo(tmp_path: Path) -> Iterator[tuple[Path, int]]:
+    """A FIFO and its read end; nothing reads from it unless a test does."""
+    path = tmp_path / "fifo"
+    os.mkfifo(path)
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    os.set_blocking(descriptor, True)
+    yield path, descriptor
+    os.close(descriptor)
+
+
+@contextmanager
+def capturing(path: Path | str, **options: int) -> Iterator[CaptureWriter]:
+    capture = CaptureWriter(path, SPECS, **options)
+    try:
+        yield capture
+    finally:
+        capture.close()
+
+
+def test_the_file_holds_the_batches(tmp_path: Path) -> None:
+    path = tmp_path / "capture.pcapng"
+    path.write_bytes(b"an older capture" * 1000)
+    with capturing(path) as capture:
+        for event in FOUR:
+            events, data = batch(event)
+            data = data.copy()
+            capture.take(events, data)
+            events["packet"], data[:] = 9, 0  # the relay reuses these arrays
+    assert path.read_bytes() == file_of(*FOUR)
+    assert (capture.error, capture.missing_events, capture.written) == (None, 0, 4)
+    capture.take(*batch({}))
+    capture.close()
+    assert capture.missing_events == 1
+
+
+def test_events_that_overflow_the_queue_are_reported_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "capture.pcapng"
+    free, begun = threading.Event(), threading.Event()
+    packets = PcapngSection.packets
+
+    def slow(self: PcapngSection, events: Events, data: Bytes) -> memoryview:
+        if events.size:
+            begun.set()
+            assert free.wait(PATIENCE_S)
+        return packets(self, events, data)
+
+    monkeypatch.setattr(PcapngSection, "packets", slow)
+    with capturing(path, batches=2) as capture:
+        capture.take(*batch({}))
+        assert begun.wait(PATIENCE_S)  # the writer is busy, the queue empty
+        capture.take(*batch({}))
+        capture.take(*batch({}))
+        assert capture.missing_events == 0
+        capture.take(*batch({}, {}))
+        capture.take(*batch({"interface": 1}))
+        assert capture.missing_events == 3
+        free.set()
+        while capture.written < 3:
+            pass
+        capture.take(*batch({"interface": 1}, {"interface": 1}, {}))
+    assert (capture.missing_events, capture.written, capture.error) == (3, 6, None)
+    drop_counts = [packet.options.get(4, [b""])[0] for packet in read(path.read_bytes()).packets]
+    assert [int.from_bytes(count, "little") for count in drop_counts] == [0, 0, 0, 1, 0, 2]
+
+
+def test_a_capture_that_a_full_disk_ends_can_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "capture.pcapng"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, limits[1]))
+    try:
+        with capturing(path) as capture:
+            for _ in range(40):
+                capture.take(*batch({"payload": bytes(60_000)}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert capture.error is not None
+    assert capture.error.endswith(f"ends after 17 events: {os.strerror(errno.EFBIG)}")
+    assert (capture.written, capture.missing_events) == (17, 23)
+    assert len(read(path.read_bytes()).packets) == 17
+
+
+def test_an_impossible_event_ends_the_capture(tmp_path: Path) -> None:
+    with capturing(tmp_path / "capture.pcapng") as capture:
+        capture.take(*batch({}))
+        capture.take(*batch({"family": 5}))
+    assert capture.error is not None
+    assert "after 1 events: a batch is impossible" in capture.error
+    assert len(read((tmp_path / "capture.pcapng").read_bytes()).packets) == 1
+
+
+def test_a_reader_that_reads_nothing_does_not_delay_the_end(fifo: tuple[Path, int]) -> None:
+    path, descriptor = fifo
+    capture = CaptureWriter(path, SPECS)
+    for _ in range(3):
+        capture.take(*batch({"payload": bytes(60_000)}))
+    capture.close(patience_s=0.05)
+    assert capture.error is not None
+    assert capture.error.endswith(": nothing could be written for 0.05 s")
+    assert capture.missing_events == 3 - capture.written > 0
+    while os.read(descriptor, 1 << 16):
+        pass
+    capture._thread.join(PATIENCE_S)
+    assert not capture._thread.is_alive()
+
+
+def test_a_path_that_cannot_be_opened_and_a_terminal_are_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("missing/capture.pcapng", "."):
+        with pytest.raises(CallerError, match="the capture cannot be opened: "):
+            CaptureWriter(tmp_path / name, SPECS)
+    monkeypatch.setattr(os, "isatty", lambda descriptor: descriptor == 1)
+    with pytest.raises(CallerError, match="cannot go to a terminal"):
+        CaptureWriter("-", SPECS)
+
+
+def test_a_capture_can_be_written_to_standard_output(
+    capfdbinary: pytest.CaptureFixture[bytes],
+) -> None:
+    with capturing("-") as capture:
+        capture.take(*batch({}, {"flow": 5}))
+    assert capture.error is None
+    assert capfdbinary.readouterr().out == file_of({}, {"flow": 5})

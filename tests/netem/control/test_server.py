@@ -1,26 +1,68 @@
-"""Control of a running emulator over real zenoh on loopback."""
+"""Control of running emulators over real zenoh on loopback: the server, and the commands."""
 
+import json
+import os
+import stat
+import sys
 import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
 from zenoh.handlers import FifoChannel
 
-from netem.control import control_server
-from netem.control.control_server import EMULATORS, ControlServer, find, running
+from netem import stand_alone
+from netem.control import control_server, emulator_commands
+from netem.control.control_server import EMULATORS, ControlServer, find, published, running
 from netem.control.emulator_commands import Client
 from netem.control.emulator_statistics import CommandQueue
+from netem.control.statistics_view import Screen
+from netem.fates import FateRecorder
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
-from noack.runtime.private_folder import private_folder
+from tests.netem.conftest import Emulate
+from tests.netem.control import relays
 from tests.netem.control.relays import FakeRelay
+from tests.netem.engine.relays import endpoints
+from tests.netem.fates.links import spec_of
 
 
 @pytest.fixture
 def client(server: ControlServer) -> Any:
     with Client(find("lab")) as client:
         yield client
+
+
+def test_a_session_is_found_while_it_lasts() -> None:
+    """Its file is private, and is not removed if another emulator has replaced it."""
+    with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
+        find(None)
+    with published("lab") as path:
+        assert running() == ["lab"]
+        assert find("lab") == find(None) == "lab"
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        with published("b"):
+            with pytest.raises(CallerError, match=r"which emulator\? Running: b, lab"):
+                find(None)
+            with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
+                find("lba")
+        other = path.with_name("other")
+        other.write_text("mine")
+        other.replace(path)
+    assert path.read_text() == "mine"
+    with pytest.raises(FileExistsError, match="capture"), published("d"):
+        raise FileExistsError("capture.pcapng")  # an error of the emulator itself
+    assert running() == []
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
+def test_unfit_names_are_refused(name: str) -> None:
+    with pytest.raises(CallerError, match="use letters, digits"), published(name):
+        pass
 
 
 def test_statistics_are_published(
@@ -49,18 +91,14 @@ def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Cl
 
 MISTAKES = [
     ({"link": "up", "words": "lozz 5%"}, "lozz: .*loss"),
-    ({"link": "up", "words": "loss 500%"}, "loss 500%"),
     ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
     ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
-    ({"link": "up", "words": "delay 1ms 1ms distribution /x"}, "/x: read the file first"),
     ({"words": "loss 5%"}, "which link. Links: up, down"),
     ({"link": "left", "words": "loss 5%"}, "no link 'left'; links: up, down"),
     ({"link": "up"}, "give words, or settings"),
     ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
     ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
     ({"link": "up", "settings": {"mansd": -1}}, "settings.mansd: should be greater than"),
-    ({"link": "up", "settings": {"mansd": "2"}}, "settings.mansd: should be a valid integer"),
-    ({"link": "up", "settings": {"seed": 1}}, "settings.seed: Extra inputs"),
     ({"link": "up", "words": 5}, "words"),
     ({"link": "up", "words": "loss 5%", "wordz": 1}, "wordz"),
 ]
@@ -71,31 +109,19 @@ def test_a_mistake_gets_one_line_and_changes_nothing(relay: FakeRelay, client: C
         with pytest.raises(CallerError, match=message) as caught:
             client.ask("change", **content)
         assert "\n" not in str(caught.value)
-    assert relay.changes == 0
-
-
-def ask_with(name: str, payload: str | bytes | None, what: str = "change") -> str:
-    """Send a query; return the error."""
-    with open_session(EMULATORS, name, listen=False) as connection:
-        key = f"netem/{name}/{what}"
-        replies = connection.get(key, FifoChannel(4), payload=payload, timeout=60)
-        (error,) = [reply.err for reply in replies if reply.err is not None]
-        return error.payload.to_string()
-
-
-def test_a_query_that_is_no_object_is_refused(relay: FakeRelay, server: ControlServer) -> None:
-    for payload in ("{", "[]", "7", "null", b"\xff\xfe"):
-        assert ask_with(find("lab"), payload) == "a query is a JSON object"
+    with open_session(EMULATORS, "lab", listen=False) as connection:
+        for payload in ("{", "[]", "null", b"\xff\xfe"):
+            replies = connection.get(
+                "netem/lab/change", FifoChannel(4), payload=payload, timeout=60
+            )
+            (error,) = [reply.err for reply in replies if reply.err is not None]
+            assert error.payload.to_string() == "a query is a JSON object"
     assert relay.changes == 0
 
 
 def test_a_second_server_of_the_name_is_refused(server: ControlServer) -> None:
-    folder = private_folder() / "netem"
-    files = ["lab.json", "lab.sock", "lab.sock.lock"]
-    assert sorted(path.name for path in folder.iterdir()) == files
     with pytest.raises(CallerError, match=r"^--control lab: an emulator of this name runs"):
         ControlServer("lab", CommandQueue(FakeRelay("up"))).__enter__()
-    assert sorted(path.name for path in folder.iterdir()) == files
     assert running() == ["lab"]
 
 
@@ -115,3 +141,151 @@ def test_a_client_that_blocks_the_server_does_not_block_the_relay(
             commands.snapshot()  # runs in the relay's thread
     finally:
         free.set()
+
+
+def run(arguments: str) -> ExitStatus:
+    return emulator_commands.main(arguments.split())
+
+
+def test_show_prints_the_statistics(
+    relay: FakeRelay, server: ControlServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    relay.counters["up", "forward"].dropped = 12
+    assert run("show") == run("show lab") == ExitStatus.OK
+    out = capsys.readouterr().out
+    assert "noack netem lab" in out
+    assert "12 dropped" in out
+    assert run("show lab --json") == ExitStatus.OK
+    document = json.loads(capsys.readouterr().out)
+    assert document["links"][0]["forward"]["fates"]["dropped"] == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changed"),
+    [
+        ("loss 5% --link up mansd 4", ["forward"]),
+        ("lab loss 5% mansd 4 --direction reverse --link up", ["reverse"]),
+        ("--control lab --link up --direction both loss 5% mansd 4", ["forward", "reverse"]),
+    ],
+)
+@pytest.mark.usefixtures("server")
+def test_a_link_is_set_in_words(
+    relay: FakeRelay, capsys: pytest.CaptureFixture[str], arguments: str, changed: Sequence[str]
+) -> None:
+    assert run(f"set {arguments}") == ExitStatus.OK
+    assert relay.changes == len(changed)
+    wanted = settings_of("loss 5% mansd 4")
+    assert {name for (_, name), now in relay.settings.items() if now == wanted} == {*changed}
+    out = capsys.readouterr().out.splitlines()
+    assert {f"up {name}: loss 5% mansd 4" for name in changed} <= {*out[:2]}
+    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: no impairment"]
+
+
+COMMAND_MISTAKES = [
+    ("set", "words are missing, for example: loss 5% mansd 4; or: loss none"),
+    ("set --link up lozz 5%", "lozz: "),
+    ("set --link up loss trace gone", "gone"),
+    ("set lba --link up loss 5%", "no emulator 'lba'; running: lab"),
+    ("set lab loss 5%", "which link? Links: up, down"),
+    ("show lab --control lba", "--control lba: NAME is lab already"),
+    ("watch lba", "no emulator 'lba'; running: lab"),
+]
+
+
+@pytest.mark.usefixtures("server")
+def test_a_mistake_gets_one_line(relay: FakeRelay, capsys: pytest.CaptureFixture[str]) -> None:
+    """And of several emulators, one must be named."""
+    for arguments, message in COMMAND_MISTAKES:
+        assert run(arguments) == ExitStatus.CALLER
+        error = capsys.readouterr().err
+        assert error.startswith(f"noack netem {arguments.split()[0]}: ")
+        assert error.count("\n") == 1
+        assert message in error
+    assert relay.changes == 0
+    other = FakeRelay("x")
+    with relays.running(other) as commands, ControlServer("loss", commands):
+        assert run("show") == ExitStatus.CALLER
+        assert "which emulator? Running: lab, loss" in capsys.readouterr().err
+        assert run("set loss loss 5%") == ExitStatus.OK  # the name is also a netem word
+    assert other.settings["x", "forward"] == settings_of("loss 5%")
+
+
+def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
+    relay: FakeRelay, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    relay.counters["up", "forward"].received = 7
+    end, pipe = os.pipe()
+    lines: list[str] = []
+
+    def read_two() -> None:
+        with os.fdopen(end) as reader:
+            lines.extend(reader.readline() for _ in range(2))
+
+    with os.fdopen(pipe, "w") as stdout, ThreadPoolExecutor() as threads:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        reading = threads.submit(read_two)
+        assert run("watch lab") == ExitStatus.OK
+        reading.result()
+    assert all("  up forward  " in line for line in lines)
+
+
+def test_watch_fails_when_the_emulator_ends(
+    relay: FakeRelay,
+    commands: CommandQueue,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(emulator_commands, "_SILENCE_S", 0.1)
+    relay.counters["up", "forward"].received = 7
+    emulator = ControlServer("lab", commands).__enter__()
+    monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
+    assert run("watch lab") == ExitStatus.FAILED
+    assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
+
+
+def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:
+    sent = [number.to_bytes(2) for number in range(320)]
+    with endpoints(*["127.0.0.1"] * 2) as (server, client):
+        for endpoint in (server, client):
+            endpoint.settimeout(60)
+        emulator = emulate("{}:{}".format(*server.getsockname()), "--control", "lab")
+        client.connect((emulator.host, emulator.port))
+        assert running() == ["lab"]
+        for payload in sent[:20]:
+            client.send(payload)
+        assert [server.recv(10) for _ in range(20)] == sent[:20]
+
+        assert emulator_commands.main(["set", "loss", "100%", "mansd 2"]) == ExitStatus.OK
+        assert "forward: loss 100% mansd 2\n" in capsys.readouterr().out
+        for payload in sent[20:]:
+            client.send(payload)
+        received = [int.from_bytes(server.recv(10)) for _ in range(100)]
+        assert received == list(range(22, 320, 3))
+
+        assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
+        found = json.loads(capsys.readouterr().out)["links"][0]["forward"]
+        assert (found["received"], found["forwarded"]) == (320, 120)
+        assert (found["fates"]["dropped"], found["fates"]["forced"]) == (200, 100)
+        assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
+        assert found["loss"]["realised"] == pytest.approx(2 / 3)
+        assert found["loss"]["predicted"] == pytest.approx(2 / 3)
+        assert sum(found["unintended"].values()) == 0
+        assert [flow["packets"] for flow in found["flows"]] == [320]
+
+        assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
+        assert capsys.readouterr().err == (
+            "noack netem set: relay forward no longer has mansd 2; the words replaced "
+            "all settings\n"
+        )
+        emulator.finish()
+    assert running() == []
+
+
+def test_a_replay_uses_the_cap_of_its_trace_by_default(tmp_path: Path) -> None:
+    path = tmp_path / "fates.parquet"
+    with FateRecorder(path, [spec_of(settings_of("loss 60% mansd 2"), "relay")]):
+        pass
+    for words, cap in (("loss 100%", 2), ("loss 100% mansd 4", 4)):
+        (spec,) = stand_alone._replaying([spec_of(settings_of(words), "relay")], path)
+        assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
+        assert spec.decisions == {"forward": [], "reverse": []}

@@ -1,8 +1,21 @@
+"""Statistics of constructed reports, as a document, on a terminal and as lines; and their page."""
+
+import io
 import json
-from typing import Any
+import re
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, cast, get_type_hints
 
 import pytest
+from rich.console import Console
 
+from netem.__main__ import main
+from netem.control import emulator_statistics
+from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import (
     AppliedSettings,
     DirectionStatistics,
@@ -10,10 +23,14 @@ from netem.control.emulator_statistics import (
     Statistics,
     statistics,
 )
+from netem.control.statistics_view import History, plain_lines, render
+from netem.fates import SCHEMA, FateRecorder
 from netem.relay_links import FlowReport
+from netem.tc_words import settings_of
 from noack.core.clock import NS_PER_S
 from noack.impairments.link_settings import Counters
-from tests.netem.control.relays import FakeRelay, times
+from tests.netem.control.relays import FakeRelay, running, times
+from tests.netem.fates.links import spec_of
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
@@ -31,11 +48,12 @@ def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
 
 
 def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> None:
-    relay.counters["up", "forward"] = Counters(
+    counted = Counters(
         received=100, received_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
         overflowed=2, blacked_out=1, duplicated=3, held_back=6, forwarded=91,
         forwarded_bytes=6552, delivered_out_of_order=9, longest_loss_burst=2, most_in_flight=17,
     )  # fmt: skip
+    relay.counters["up", "forward"] = counted
     relay.flows = [FlowReport(3, ("::1", 4000), 60, 2)]
     relay.unintended["lost_in_kernel"] = 7
     document = statistics(look(relay, 2.5))
@@ -46,15 +64,11 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert (up["clients"], up["clients_ever"], up["refused"]) == (1, 3, 0)
     found = forward(document)
     assert found["words"] == "loss 10% delay 10ms mansd 2"
-    assert (found["received"], found["received_bytes"]) == (100, 7200)
-    assert (found["forwarded"], found["forwarded_bytes"]) == (91, 6552)
-    assert found["fates"] == {
-        "delivered": 80, "dropped": 8, "forced": 5, "corrupted": 4, "overflowed": 2,
-        "blacked_out": 1,
-    }  # fmt: skip
-    assert (found["duplicated"], found["delivered_out_of_order"], found["held_back"]) == (3, 9, 6)
-    assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
-    assert (found["in_flight"], found["most_in_flight"]) == (5, 17)
+    shown = cast(dict[str, Any], found | found["fates"])
+    for name, number in asdict(counted).items():
+        assert shown[name] == number, name
+    assert sum(found["fates"].values()) == 100
+    assert (found["mansd"], found["in_flight"]) == (2, 5)
     assert found["unintended"] == {"lost_in_kernel": 7, "send_errors": 0}
     assert found["flows"] == [
         {"flow": 3, "client": "[::1]:4000", "packets": 60, "longest_loss_burst": 2}
@@ -67,40 +81,190 @@ def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> No
     assert json.loads(json.dumps(document, allow_nan=False)) == document
 
 
-def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
-    relay.counters["up", "forward"] = Counters(
-        received=50, received_bytes=5000, delivered=40, dropped=10, forwarded=40,
-        forwarded_bytes=4000,
-    )  # fmt: skip
-    relay.delays = times(1_000_000)
-    before = look(relay, 10)
-    relay.counters["up", "forward"] = Counters(
-        received=450, received_bytes=45_000, delivered=140, dropped=310, forwarded=140,
-        forwarded_bytes=14_000,
-    )  # fmt: skip
-    relay.delays = times(1_000_000, 5_000_000, 5_000_000)
-    recent = forward(statistics(look(relay, 12), before))["recent"]
-    assert recent is not None
-    assert recent["seconds"] == 2
-    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (200, 160_000)
-    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (50, 40_000)
-    assert recent["loss"] == pytest.approx(0.75)
-    assert recent["delay_ns"]["p50"] == pytest.approx(5_000_000, rel=0.03)
-
-
 def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) -> None:
-    now = Counters(received=300, delivered=150, dropped=150)
-    relay.counters["up", "forward"] = now
+    """And is at most 1, although late packets become stale."""
+    relay.counters["up", "forward"] = Counters(received=300, delivered=150, dropped=150)
     since = {("up", "forward"): Counters(received=100, delivered=100)}
-    found = forward(statistics(look(relay, 1, since)))
-    assert found["loss"]["realised"] == pytest.approx(0.75)
-    assert found["loss"]["lost"] == pytest.approx(0.75)
+    before = look(relay, 1, since)
+    found = forward(statistics(before))
+    assert found["loss"]["realised"] == found["loss"]["lost"] == pytest.approx(0.75)
     assert (found["received_before"], found["received"]) == (100, 300)
-
-
-def test_late_stale_packets_do_not_raise_the_loss_above_one(relay: FakeRelay) -> None:
-    before = look(relay, 1)
-    relay.counters["up", "forward"] = Counters(received=1, delivered=1, delivered_out_of_order=5)
-    recent = forward(statistics(look(relay, 2), before))["recent"]
+    relay.counters["up", "forward"] = Counters(
+        received=301, delivered=151, dropped=150, delivered_out_of_order=5
+    )
+    recent = forward(statistics(look(relay, 2, since), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1
+
+
+def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
+    """In second k, from 0 on, 1000 k datagrams of 100 bytes arrive on each link."""
+    found, before = [], None
+    for second in range(seconds):
+        for (_, side), counters in relay.counters.items():
+            if side == "forward":
+                received = 1000 * second
+                counters.received += received
+                counters.received_bytes += 100 * received
+                counters.dropped += received // 5
+                counters.forced += received // 10
+                counters.delivered += received - received // 5 - received // 10
+                counters.forwarded += received - received // 5
+                counters.forwarded_bytes += 100 * (received - received // 5)
+                counters.longest_loss_burst = 2
+        relay.delays = relay.delays + times(*[10_000_000] * 98, 20_000_000, 20_000_000)
+        snapshot = look(relay, second + 1)
+        found.append(statistics(snapshot, before))
+        before = snapshot
+    return found
+
+
+def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
+    *_, last = documents(relay)
+    recent = forward(last)["recent"]
+    assert recent is not None
+    assert recent["seconds"] == 1
+    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (2000, 1_600_000)
+    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (1600, 1_280_000)
+    assert recent["loss"] == pytest.approx(0.2)
+    assert recent["delay_ns"]["p50"] == pytest.approx(10_000_000, rel=0.03)
+
+
+def text_of(relay: FakeRelay, width: int = 80, height: int | None = 24) -> list[str]:
+    history = History()
+    for document in documents(relay):
+        history.add(document)
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height or 24, color_system=None)
+    console.print(render(history, "lab", width, height))
+    return file.getvalue().splitlines()
+
+
+def test_a_link_is_shown_with_the_numbers_of_both_directions() -> None:
+    """Words of any length, and names with brackets."""
+    relay = FakeRelay("[bold]up")
+    samples = settings_of("loss 10% delay 1ms samples " + ",".join(["1ms"] * 500))
+    relay.settings["[bold]up", "reverse"] = samples
+    assert len(text_of(relay)) <= 24
+    relay = FakeRelay("[bold]up")
+    relay.unintended["lost_in_kernel"] = 1234
+    text = " ".join(" ".join(text_of(relay)).replace("│", " ").split())
+    for shown in (
+        "[bold]up 127.0.0.1:5000 → [::1]:6000 1 client", "loss 10% delay 10ms mansd 2",
+        "received 2,000/s", "1.60 Mbit/s", "forwarded 1,600/s", "1.28 Mbit/s", "loss 20.0 %",
+        "drawn 20.0 %, predicted 9.91 %", "lost 600 dropped 0", "burst 2, cap 2", "300 forced",
+        "0, no cap", "in flight 5, max 0", "unintended losses: 1,234 lost in kernel (forward)",
+    ):  # fmt: skip
+        assert shown in text, text
+    p50, p99 = text.partition("delay p50 ")[2].split(" ms")[:2]
+    assert float(p50) == pytest.approx(10, rel=0.03)
+    assert float(p99.removeprefix(" p99 ")) == pytest.approx(20, rel=0.03)
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_the_view_fits_into_any_width(width: int) -> None:
+    names = [f"a-link-with-a-long-name-{number}" for number in range(30)]
+    for links, height in ((["up", "down"], 24), (["up", "down"], None), (names, 24)):
+        lines = text_of(FakeRelay(*links), width, height)
+        assert all(len(line) <= width for line in lines)
+    # With many links, numbers are not cut.
+    assert len(lines) <= 24
+    for line in lines[2:-1]:
+        assert all(number in line for number in ("2,000/s", "20.0 %", "2/2"))
+    assert ("last minute" in lines[1]) == (width >= 120)
+
+
+def test_a_pipe_gets_one_line_per_direction_in_use() -> None:
+    relay = FakeRelay("up", "down")
+    relay.unintended["send_errors"] = 3
+    first, *_, last = documents(relay)
+    assert plain_lines(first) == []
+    up, down = plain_lines(last)
+    assert up.startswith(
+        "3.0 s  up forward  received 2,000/s  1.60 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
+        "loss 20.0 %  drawn 20.0 %, predicted 9.91 %  longest loss burst 2, cap 2  forced 300  "
+    )
+    assert up.endswith("in flight 5  UNINTENDED 3 send_errors")
+    assert "down forward" in down
+
+
+def series(history: History, points: int) -> list[float | None]:
+    return [*history.series("up", "forward", "received_per_s", points)]
+
+
+def sample(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statistics:
+    side = {"recent": None if rate is None else {"seconds": seconds, "received_per_s": rate}}
+    document = {"elapsed_s": elapsed_s, "links": [{"name": "up", "forward": side, "reverse": side}]}
+    return cast(Statistics, document)
+
+
+def test_the_history_of_the_last_minute() -> None:
+    """A sample applies to the time since the previous one."""
+    every_second, every_ten = History(), History()
+    assert series(every_second, 3) == [None] * 3
+    for second in range(1, 101):
+        every_second.add(sample(second, None if second == 99 else second))
+    assert series(every_second, 60) == [*range(41, 99), None, 100]
+    assert series(every_second, 30)[:29] == [41.5 + 2 * k for k in range(29)]
+    every_ten.add(sample(50, 7, seconds=10))
+    every_ten.add(sample(60, 9, seconds=10))
+    assert series(every_ten, 12) == [None] * 8 + [7, 7, 9, 9]
+
+
+PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
+
+
+def rows(title: str) -> dict[str, str]:
+    """Return the table with this title as a mapping from first column to second column."""
+    (table,) = re.findall(rf"^\| {title} \| \|\n\|---\|---\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    return dict(row.strip("| \n").split(" | ", 1) for row in table.splitlines())
+
+
+def names(text: str) -> set[str]:
+    return set(re.findall("`([a-z0-9_]+)`", text))
+
+
+def explained() -> dict[str, Any]:
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main(["--explain", "--json", "loss 5%"]) == 0
+    (link,) = json.loads(out.getvalue())["links"]
+    return dict(link)
+
+
+@pytest.mark.parametrize(
+    ("title", "keys"),
+    [
+        ("document", get_type_hints(emulator_statistics.Statistics)),
+        ("link", get_type_hints(emulator_statistics.LinkStatistics)),
+        ("direction", get_type_hints(emulator_statistics.DirectionStatistics)),
+        ("recent", get_type_hints(emulator_statistics.RecentRates)),
+        ("column", dict.fromkeys(SCHEMA.names)),
+        ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
+        ("explained link", explained()),
+        ("explained direction", explained()["forward"]),
+    ],
+)
+def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) -> None:
+    assert set().union(*map(names, rows(title))) == set(keys)
+    text = rows("direction")
+    assert names(text["`loss`"]) == set(get_type_hints(emulator_statistics.LossStatistics))
+    assert names(text["`flows`"]) == set(get_type_hints(emulator_statistics.FlowStatistics))
+    assert names(text["`delay_ns`"]) == set(get_type_hints(emulator_statistics.DelayQuantiles))
+
+
+def test_the_documented_programs_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first controls an emulator, the second reads the metadata of a fate trace."""
+    relay = FakeRelay("relay")
+    change, read = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    with running(relay) as commands, ControlServer("lab", commands):
+        exec(change, {})
+    assert capsys.readouterr().out == "None\n"
+    assert relay.settings["relay", "reverse"].mansd == 2
+    with FateRecorder(tmp_path / "monday.parquet", [spec_of(settings_of("mansd 3"), "relay")]):
+        pass
+    monkeypatch.chdir(tmp_path)
+    exec(read, {})
+    assert capsys.readouterr().out.split() == [version("noack"), "0", "3"]

@@ -1,15 +1,12 @@
 """The externally visible behaviour of the relay."""
 
 import errno
-import io
 import os
 import resource
 import socket
 import struct
 import sys
 import time
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from netem import relay_memory
-from netem.relay_links import DirectionReport, raise_file_limit
+from netem.relay_links import DirectionReport
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError
-from noack.impairments.link_settings import RecordedDecision
-from noack.protocol.record_tables import Fate
 from noack.runtime import udp_sockets
 from tests.netem.engine.relays import (
     HOSTS,
@@ -39,7 +34,6 @@ IP_VERSIONS = pytest.mark.parametrize(("here", "there"), [(4, 4), (4, 6), (6, 4)
 V4 = HOSTS[4]
 UDP_SEGMENT = 103
 THIRD_LOST = settings_of("loss periodic 1/3")
-HALF_LOST = settings_of("loss 50%")
 
 
 def numbers(datagrams: Received) -> list[int]:
@@ -53,16 +47,20 @@ def send_numbers(client: socket.socket, to: Any, begin: int, end: int) -> None:
 
 @IP_VERSIONS
 def test_both_directions_work_over_both_versions_of_ip(here: int, there: int) -> None:
-    with endpoints(HOSTS[there], HOSTS[here], HOSTS[here]) as (server, *clients):
+    """Only the server's answers reach a client."""
+    with endpoints(*[HOSTS[there]] * 2, *[HOSTS[here]] * 2) as (server, stranger, *clients):
         with running([link(name_of(server), host=HOSTS[here])]) as one:
             for client in clients:
                 client.sendto(b"question", one.address())
             for data, source in one.receive(server, 2):
                 assert data == b"question"
                 server.sendto(b"answer to %d" % source[1], source)
+                stranger.sendto(b"lie", source)
             answers = [one.receive(client)[0] for client in clients]
             assert {source for _, source in answers} == {one.address()}
             assert len({data for data, _ in answers}) == 2
+            one.settle(2, "reverse")
+            assert all(drain(client) == [] for client in clients)
             report = one.report()
         assert (report.clients, report.clients_ever) == (2, 2)
         assert {flow.client for flow in report.forward.flows} == set(map(name_of, clients))
@@ -95,17 +93,6 @@ def test_a_one_way_link_sends_from_one_port_and_discards_answers(here: int, ther
     assert len(sources) == 1
 
 
-def test_answers_from_another_address_of_the_server_do_not_make_it_a_client() -> None:
-    with endpoints("0.0.0.0", V4) as (server, client):
-        spec = link(("127.0.0.2", name_of(server)[1]), return_path=False)
-        with running([spec]) as one:
-            client.sendto(b"x", one.address())
-            server.sendto(b"answer", one.receive(server)[0][1])
-            one.settle(1)
-            assert drain(server) == []
-            assert one.report().clients_ever == 1
-
-
 def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
     """For so many, the relay loads the clients' data before the decisions."""
     with endpoints(V4) as (server,), endpoints(*[V4] * 700) as clients:
@@ -129,19 +116,6 @@ def test_seven_hundred_clients_keep_their_flows_and_answers_apart() -> None:
     assert sorted(arrived) == sorted(ports)
     counters = report.forward.counters
     assert (report.clients, counters.received, counters.dropped) == (700, 2100, 700)
-
-
-def test_only_answers_of_the_server_reach_the_client() -> None:
-    with (
-        endpoints(V4, V4, V4) as (server, client, stranger),
-        running([link(name_of(server))]) as one,
-    ):
-        client.sendto(b"question", one.address())
-        ((_, path),) = one.receive(server)
-        stranger.sendto(b"lie", path)
-        server.sendto(b"truth", path)
-        assert [data for data, _ in one.receive(client)] == [b"truth"]
-        assert one.report().reverse.counters.received == 1
 
 
 def test_an_absent_server_is_reported_and_causes_no_later_loss(
@@ -205,35 +179,20 @@ def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
             one.relay.change("another", "reverse", late)
 
 
-def test_idle_clients_are_forgotten_and_come_back_as_new_flows() -> None:
-    with relayed(THIRD_LOST, idle_s=0.05) as (server, client, one):
-        for flow in range(2):
-            send_numbers(client, one.address(), 0, 4)
-            one.settle(4 * (flow + 1))
-            assert numbers(drain(server)) == [1, 2]
-            report = one.report()
-            assert [(f.flow, f.packets) for f in report.forward.flows] in ([(flow, 4)], [])
-            one.until(lambda: one.report().clients == 0)
-            assert one.report().clients_ever == flow + 1
-
-
-def test_a_client_with_datagrams_in_flight_is_not_idle() -> None:
-    with relayed(settings_of("delay 600ms"), idle_s=0.01) as (server, client, one):
-        client.sendto(b"late", one.address())
-        assert one.receive(server)[0][0] == b"late"
+def test_a_client_with_datagrams_in_flight_or_unread_is_not_idle() -> None:
+    """Although it sends nothing for longer than the idle time."""
+    slow = settings_of("loss worst mansd 3 delay 300ms")
+    with relayed(slow, idle_s=0.05) as (server, client, one):
+        send_numbers(client, one.address(), 0, 4)
+        assert numbers(one.receive(server)) == [3]
         one.until(lambda: one.report().clients == 0)
-
-
-def test_a_client_with_unread_datagrams_is_not_idle() -> None:
-    """A stall longer than the idle time does not make clients with queued datagrams idle."""
-    with relayed(settings_of("loss worst mansd 3"), idle_s=0.3) as (_, client, one):
         client.sendto(b"0", one.address())
-        one.settle(1)
+        one.settle(5)
         send_numbers(client, one.address(), 1, 4)
-        time.sleep(1.2)
-        one.settle(4)
+        time.sleep(1.2)  # a stall
+        one.settle(8)
         report = one.report()
-    assert (report.clients_ever, report.forward.counters.forced) == (1, 1)
+    assert (report.clients_ever, report.forward.counters.forced) == (2, 2)
 
 
 def test_more_clients_than_allowed_are_refused_and_counted(
@@ -248,24 +207,17 @@ def test_more_clients_than_allowed_are_refused_and_counted(
         drain(server)
         clients[2].sendto(b"now", one.address())
         assert one.receive(server)[0][0] == b"now"
-    assert capfd.readouterr().err.count("no more than 2 clients at once") == 1
-
-
-def test_a_lack_of_file_descriptors_is_reported_and_counted(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    with relayed(clients=12) as (server, *clients, one):
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        used = max(server.fileno(), *(client.fileno() for client in clients)) + 8
-        resource.setrlimit(resource.RLIMIT_NOFILE, (used, hard))
+        most = max(client.fileno() for client in clients) + 2
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
         try:
-            for client in clients:
-                client.sendto(b"x", one.address())
-            one.until(lambda: one.report().refused + one.report().forward.counters.received == 12)
+            clients[0].sendto(b"x", one.address())
+            one.until(lambda: one.report().refused == 3)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        assert one.report().refused > 0
-    assert "no file descriptors are left" in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert error.count("no more than 2 clients at once") == 1
+    assert error.count("no file descriptors are left") == 1
 
 
 @pytest.mark.parametrize("return_path", [True, False])
@@ -273,12 +225,11 @@ def test_send_errors_are_counted_by_reason(
     return_path: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The kernel refuses broadcasts from a socket without the broadcast option."""
-    with endpoints(V4) as (client,):
-        spec = link(("255.255.255.255", 9), return_path=return_path)
-        with running([spec]) as one:
-            send_numbers(client, one.address(), 0, 10)
-            one.settle(10)
-            report = one.report()
+    spec = link(("255.255.255.255", 9), return_path=return_path)
+    with endpoints(V4) as (client,), running([spec]) as one:
+        send_numbers(client, one.address(), 0, 10)
+        one.settle(10)
+        report = one.report()
     assert report.forward.unintended == {"lost_in_kernel": 0, "Permission denied": 10}
     assert "could not be sent (Permission denied)" in capfd.readouterr().err
 
@@ -303,39 +254,27 @@ def all_of(direction: DirectionReport) -> int:
     return direction.counters.received + sum(direction.unintended.values())
 
 
-@pytest.fixture
-def small_buffers(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("segment", [False, True])
+def test_all_kernel_drops_are_counted(
+    segment: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each segment counts, although the client sends 64 of them in one call."""
     monkeypatch.setattr(udp_sockets, "_BUFFER_BYTES", 16_384)
-
-
-@pytest.mark.parametrize("version", [4, 6])
-@pytest.mark.usefixtures("small_buffers")
-def test_all_kernel_drops_are_counted(version: int, capfd: pytest.CaptureFixture[str]) -> None:
-    host, many = HOSTS[version], 300
-    with relayed(host=host) as (server, client, one):
-        send_numbers(client, one.address(), 0, many)
+    size, many = 72, 1280
+    with relayed(host=HOSTS[6], segment=segment) as (server, client, one):
+        client.connect(one.address())
+        client.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, size)
+        for _ in range(many // 64):
+            client.send(bytes(size * 64))
         one.until(lambda: all_of(one.report().forward) == many)
-        send_numbers(server, drain(server)[0][1], 0, many)
-        one.until(lambda: all_of(one.report().reverse) == many)
+        send_numbers(server, drain(server)[0][1], 0, 300)
+        one.until(lambda: all_of(one.report().reverse) == 300)
         report = one.report()
     error = capfd.readouterr().err
     for side in ("forward", "reverse"):
-        assert getattr(report, side).unintended["lost_in_kernel"] > many / 2
+        assert getattr(report, side).unintended["lost_in_kernel"] > 150
         assert f"link test, {side}:" in error
     assert "lost in the kernel" in error
-
-
-@pytest.mark.usefixtures("small_buffers")
-def test_all_kernel_drops_of_segmented_messages_are_counted() -> None:
-    """Each segment counts, although the client sends them in one call."""
-    messages, segments, size = 20, 64, 72
-    with relayed(segment=True) as (_, client, one):
-        client.connect(one.address())
-        client.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, size)
-        for _ in range(messages):
-            client.send(bytes(size * segments))
-        one.until(lambda: all_of(one.report().forward) == messages * segments)
-        assert one.report().forward.unintended["lost_in_kernel"] > 1000
 
 
 @pytest.mark.parametrize("segment", [False, True])
@@ -356,7 +295,7 @@ def test_segments_are_separate_datagrams(segment: bool) -> None:
         assert [data for data, _ in drain(server)] == expected
 
 
-class CountOnly:
+class _CountOnly:
     """A tap that does not read payloads."""
 
     wants_data = False
@@ -373,8 +312,8 @@ class CountOnly:
 def test_taps_receive_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
     """There are more events than the buffer for events holds."""
     monkeypatch.setattr(relay_memory, "_EVENTS", 200)
-    many, tap = 500, CountOnly()
-    with relayed(HALF_LOST, taps=[tap]) as (_, client, one):
+    many, tap = 500, _CountOnly()
+    with relayed(settings_of("loss 50%"), taps=[tap]) as (_, client, one):
         send_numbers(client, one.address(), 0, many)
         one.settle(many)
         report = one.report()
@@ -382,50 +321,3 @@ def test_taps_receive_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
     assert tap.departures == report.forward.counters.forwarded
     assert report.forward.delays.sum() == tap.departures
     assert report.forward.lateness.sum() == 0
-
-
-class _Broken(io.TextIOBase):
-    def write(self, text: str, /) -> int:
-        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
-
-
-@pytest.mark.parametrize("stderr", [_Broken(), None])
-def test_the_relay_continues_if_standard_error_is_unusable(
-    stderr: io.TextIOBase | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with endpoints(V4, V4, V4) as (server, first, second):
-        monkeypatch.setattr(sys, "stderr", stderr)
-        with running([link(name_of(server), most_clients=1)]) as one:
-            first.sendto(b"1", one.address())
-            one.settle(1)
-            second.sendto(b"refused", one.address())
-            one.until(lambda: one.report().refused == 1)
-            first.sendto(b"2", one.address())
-            assert [data for data, _ in one.receive(server, 2)] == [b"1", b"2"]
-
-
-def test_a_change_does_not_interrupt_a_replay() -> None:
-    lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
-    passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
-    record = [lost, passed, lost, lost, passed, lost]
-    with relayed(decisions={"forward": [record]}) as (server, client, one):
-        send_numbers(client, one.address(), 0, 3)
-        one.settle(3)
-        one.relay.change("test", "forward", settings_of("loss worst mansd 3"))
-        send_numbers(client, one.address(), 3, 10)
-        one.settle(10)
-        assert numbers(drain(server)) == [1, 4, 8]
-
-
-def test_file_descriptors_above_the_limit_of_select_work() -> None:
-    raise_file_limit()
-    with endpoints(V4, V4) as (server, client), ExitStack() as unused:
-        file = unused.enter_context(Path(os.devnull).open())
-        lowest = os.dup(file.fileno())
-        while (descriptor := os.dup(file.fileno())) < 1024:
-            unused.callback(os.close, descriptor)
-        unused.callback(os.close, descriptor)
-        os.close(lowest)
-        with running([link(name_of(server))]) as one:
-            client.sendto(b"hello", one.address())
-            assert one.receive(server)[0][0] == b"hello"

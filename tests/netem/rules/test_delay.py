@@ -1,8 +1,6 @@
-"""Kolmogorov–Smirnov tests of each shape against SciPy; correlations against closed forms.
+"""Delays, corruption, duplicates and reordering, against SciPy's distributions and closed forms."""
 
-Seeds are fixed. With random seeds, one in ten thousand such tests would give a p-value below 1e-4.
-"""
-
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,9 +20,9 @@ PARETO = stats.pareto(3, loc=-1.5 / np.sqrt(0.75), scale=1 / np.sqrt(0.75))
 SHAPES = {"uniform": stats.uniform(-1, 2), "normal": stats.norm(), "pareto": PARETO}
 
 
-def random_parts(decide: Any, words: str, *, before: str = "", count: int = COUNT) -> Any:
+def random_parts(decide: Any, words: str, *, before: str = "") -> Any:
     """Return the delays minus 50 ms, in units of 2 ms; delays are truncated to whole ns."""
-    found = decide(f"{before} delay 50ms 2ms {words}", count).delays_ns
+    found = decide(f"{before} delay 50ms 2ms {words}", COUNT).delays_ns
     return (found + 0.5 - FIXED_NS) / JITTER_NS
 
 
@@ -58,16 +56,19 @@ def test_the_mixture_combines_quantiles() -> None:
 
     variance = sum(quad(square_at, a, b, limit=200)[0] for a, b in ((-9, 0), (0, 6), (6, 36)))
     delay = Delay(jitter_s=1e-9, distribution="paretonormal")
-    state = LinkState(LinkSettings(impairments=(delay,)), 0, "a")
-    link = state.core
+    found = quantile_of(LinkSettings(impairments=(delay,)))
     for u in np.linspace(0.001, 0.999, 99).tolist():
-        found = core.noack_delay_quantile_ns(ffi.addressof(link.stages[0], "delay"), link.reals, u)
-        assert found == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
+        assert found(u) == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
+    # Of the largest uniform number, the unbounded distribution is cut: it fits into an integer.
+    longest = quantile_of(settings_of("delay 3600s 3600s distribution pareto"))
+    assert 1e15 < longest(1 - 2**-53) < 2**62
 
 
-@pytest.mark.parametrize("fixed_ns", [0, 1, 12_345_678, 10**12 + 1])
-def test_a_constant_delay_is_exact(decide: Any, fixed_ns: int) -> None:
-    assert (decide(f"delay {fixed_ns}ns", 10).delays_ns == fixed_ns).all()
+def quantile_of(settings: LinkSettings) -> Callable[[float], float]:
+    """The delay in ns that belongs to a uniform number."""
+    state = LinkState(settings, 0, "a")
+    delay = ffi.addressof(state.core.stages[0], "delay")
+    return lambda u: float(core.noack_delay_quantile_ns(delay, state.core.reals, u))
 
 
 def test_observed_delays_have_the_quantiles_of_the_sample(decide: Any) -> None:
@@ -109,27 +110,14 @@ def test_delays_are_correlated_with_losses(decide: Any, of_loss: float, correlat
         assert z.max() <= stats.norm.isf(p) + 1e-6
 
 
-@pytest.mark.parametrize("loss", ["loss 0%", "loss gemodel 10% 30% 0%"])
-def test_a_loss_of_probability_0_does_not_change_the_distribution(decide: Any, loss: str) -> None:
-    found = random_parts(decide, "distribution normal lossrel 80%", before=loss, count=400_000)
-    assert_distributed(found[::40], stats.norm)
-
-
-def test_packets_in_the_bad_state_have_long_delays(decide: Any) -> None:
-    """With correlation 1, packets that survive the bad state have delays in the top quarter."""
-    found = random_parts(decide, "lossrel 100%", before="loss gemodel 10% 30% 50%")
-    late = found > 0.5  # the upper quarter of the uniform distribution on ± 1
-    survive_bad, survive_good = 0.25 * 0.5, 0.75
-    expected = survive_bad / (survive_bad + survive_good)
-    # The chain correlates successive delays: 1 − p − r = 0.6 doubles the standard error.
-    assert abs(late.mean() - expected) < 10 * np.sqrt(expected * (1 - expected) / len(found))
-
-
-def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(decide: Any) -> None:
+def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(
+    decide: Any, share_is: Callable[..., None]
+) -> None:
     words = "delay 50ms 2ms 70% distribution normal"
     alone = decide(words, COUNT).decisions
     doubled = decide(f"duplicate 50% {words}", COUNT).decisions
     copied = doubled["copy_ns"] >= 0
+    share_is(copied, 0.5)
     np.testing.assert_array_equal(alone["release_ns"][~copied], doubled["release_ns"][~copied])
     own = alone["release_ns"][copied]
     first, second = doubled["release_ns"][copied], doubled["copy_ns"][copied]
@@ -142,12 +130,31 @@ def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(decide: Any) -> N
     assert abs(measured - 0.7) < 5 * np.sqrt(3 / len(z))
 
 
-def test_the_longest_delay_fits_into_an_integer() -> None:
-    """Of the largest uniform number, the unbounded distribution is cut at 10¹⁵ ns."""
-    state = LinkState(settings_of("delay 3600s 3600s distribution pareto"), 0, "a")
-    link = state.core
-    u = 1 - 2**-53
-    assert (
-        core.noack_delay_quantile_ns(ffi.addressof(link.stages[0], "delay"), link.reals, u) > 1e15
-    )
-    assert link.stages[0].delay.constant_ns == 3600e9
+@pytest.mark.parametrize("size_bytes", [1, 100, 65_507])
+def test_every_bit_is_flipped_with_the_same_probability(
+    decide: Any, share_is: Callable[..., None], size_bytes: int
+) -> None:
+    decided = decide("corrupt 50%", 200_000, sizes_bytes=size_bytes)
+    bits = decided.decisions["bit"][decided.fates == 3]
+    share_is(decided.fates == 3, 0.5)
+    assert ((decided.decisions["bit"] >= 0) == (decided.fates == 3)).all()
+    assert bits.min() >= 0
+    assert bits.max() < 8 * size_bytes
+    empty = decide("corrupt 100%", 100, sizes_bytes=np.arange(100) % 2)
+    assert empty.fates.tolist() == [0, 3] * 50
+    counts = np.histogram(bits, min(8 * size_bytes, 800), (0, 8 * size_bytes))[0]
+    assert stats.chisquare(counts).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("gap", [1, 5])
+def test_reordered_packets_leave_at_once(
+    decide: Any, share_is: Callable[..., None], gap: int
+) -> None:
+    decided = decide(f"delay 10ms reorder 30% gap {gap}", 100_000)
+    at_once = decided.delays_ns == 0
+    assert set(decided.delays_ns.tolist()) == {0, 10_000_000}
+    turns = np.arange(1, 100_001) % gap == 0
+    assert not at_once[~turns].any()
+    share_is(at_once[turns], 0.3)
+    # Only delays before the reorder are skipped.
+    assert (decide("delay 10ms reorder 100% delay 3ms", 10).delays_ns == 3_000_000).all()

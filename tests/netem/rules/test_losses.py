@@ -1,6 +1,7 @@
-"""Compare loss models with closed forms: rates, joint probabilities, first packets."""
+"""Compare loss models and blackouts with closed forms and definitions."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from netem.tc_words import settings_of
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_prediction import read_files
 from tests.oracles.link import Link
 
 COUNT = 400_000
@@ -98,22 +103,6 @@ def test_the_chain_begins_in_its_first_state_and_moves_before_each_packet(
         assert abs(of_step.mean() - p) <= 5 * np.sqrt(p * (1 - p) / flows)
 
 
-@pytest.mark.parametrize("share", [0, 1])
-def test_probabilities_0_and_1_are_exact(decide: Any, share: int) -> None:
-    words = ["loss 0%", "loss 0% 99.9%", "loss gemodel 0% 0%", "loss burst 0% 1", "loss none"]
-    if share:
-        words = ["loss 100%", "loss 100% 99.9%", "loss gemodel 100% 0%", "loss worst"]
-    for one in words:
-        assert (decide(one, 10_000).fates == share).all()
-
-
-@pytest.mark.parametrize("words", ["loss 50%", "loss 60% 70%", "loss gemodel 20% 5%"])
-def test_the_cap_does_not_change_the_draws(decide: Any, words: str) -> None:
-    freely, capped = decide(words, 10_000).fates, decide(f"{words} mansd 2", 10_000).fates
-    np.testing.assert_array_equal(capped != 0, freely != 0)
-    assert (capped == 2).any()
-
-
 def lost_packets(words: str, packets: Any) -> list[bool]:
     """Return which packets are lost; another script comes first, so the table offset is not 0."""
     link = Link(settings_of(f"loss script {2**39},{2**39 + 1} {words}"), 0, "a")
@@ -126,14 +115,24 @@ def lost_packets(words: str, packets: Any) -> list[bool]:
     return found
 
 
+@pytest.mark.parametrize("share", [0, 1])
+def test_probabilities_0_and_1_are_exact(decide: Any, share: int) -> None:
+    never = ["loss 0%", "loss 0% 99.9%", "loss gemodel 0% 0%", "loss burst 0% 1", "loss none"]
+    always = ["loss 100%", "loss 100% 99.9%", "loss gemodel 100% 0%", "loss worst"]
+    for one in always if share else never:
+        assert (decide(one, 10_000).fates == share).all()
+
+
 @given(st.sets(st.integers(0, 60)), st.integers(0, 40))
 def test_exactly_the_packets_of_a_script_are_lost(numbers: set[int], extra: int) -> None:
-    """A script applied once, and a repeated script."""
+    """A script applied once, a repeated script, and one with a large number."""
     script = ",".join(map(str, sorted(numbers))) or "none"
     assert lost_packets(f"loss script {script}", range(80)) == [k in numbers for k in range(80)]
     every = max(numbers, default=0) + 1 + extra
     again = lost_packets(f"loss script {script} every {every}", range(300))
     assert again == [k % every in numbers for k in range(300)]
+    last = 2**40 - 1
+    assert lost_packets(f"loss script 0,{last}", [last - 1, last, last + 1]) == [False, True, False]
 
 
 @given(st.integers(1, 30), st.data(), st.integers(0, 50))
@@ -143,7 +142,60 @@ def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first
     assert found == [k >= first and (k - first) % period < burst for k in range(200)]
 
 
-def test_large_packet_numbers_can_be_scripted() -> None:
-    last = 2**40 - 1
-    packets = [0, 1, last - 1, last, last + 1]
-    assert lost_packets(f"loss script 0,{last}", packets) == [k in (0, last) for k in packets]
+STEP_NS = 10_000_000
+P, R = 0.02, 0.1
+
+
+def common_state() -> Link:
+    """A Gilbert–Elliott chain whose state all flows of a link share."""
+    own = GilbertElliottLoss(good_to_bad=P, bad_to_good=R, state="link", step_s=STEP_NS * 1e-9)
+    return Link(LinkSettings(impairments=(LossOf(loss=own),), first_delivered=False), 7, "x")
+
+
+def test_a_common_bad_state_concerns_all_flows_at_once() -> None:
+    link = common_state()
+    states = [
+        {link.decide(k, 1, step * STEP_NS + k * STEP_NS // 50).fate == 1 for k in range(50)}
+        for step in range(500)
+    ]
+    assert all(len(found) == 1 for found in states)
+    assert 0 < sum(found == {True} for found in states) < 500
+
+
+@pytest.mark.parametrize("every", [1, 7, 1000])
+def test_common_states_at_a_distance_follow_the_powers_of_the_matrix(every: int) -> None:
+    """Also if most steps are without a packet."""
+    link, count = common_state(), 20_000
+    bad = np.array([link.decide(i % 3, 1, i * every * STEP_NS).fate == 1 for i in range(count)])
+    moves = np.linalg.matrix_power(np.array([[1 - P, P], [R, 1 - R]]), every)
+    for state in (0, 1):
+        after = bad[1:][bad[:-1] == state]
+        expected = moves[state, 1]
+        spread = np.sqrt(expected * (1 - expected) / len(after))
+        assert abs(after.mean() - expected) < 5 * spread
+
+
+@given(st.sets(st.integers(0, 50), min_size=2), st.none() | st.integers(0, 30))
+def test_every_packet_is_lost_from_begin_until_just_before_end(
+    borders: set[int], extra: int | None
+) -> None:
+    ends = sorted(borders)[: len(borders) // 2 * 2]
+    intervals = list(zip(ends[::2], ends[1::2], strict=True))
+    period = None if extra is None else ends[-1] + extra
+    words = "blackout " + ",".join(f"{a}us-{b}us" for a, b in intervals)
+    if period is not None:
+        words += f" every {period}us"
+    # Another blackout comes first, so that the interval's table offset is not 0.
+    link = Link(settings_of(f"blackout 10s-11s {words}"), 0, "a")
+    borders_ns = [1000 * t for t in range(200)]
+    for t_ns in sorted({*borders_ns, *(t - 1 for t in borders_ns[1:])}):
+        place = t_ns if period is None else t_ns % (1000 * period)
+        expected = any(1000 * a <= place < 1000 * b for a, b in intervals)
+        assert link.decide(0, 1, t_ns).fate == (5 if expected else 0)
+
+
+def test_outages_of_a_file_are_a_blackout_of_these_intervals(tmp_path: Path) -> None:
+    (tmp_path / "outages.txt").write_text("# from a log\n3ms 0.005s\n\n9ms 10ms\n")
+    link = Link(read_files(settings_of("outages outages.txt"), tmp_path), 0, "a")
+    lost = [t_ms for t_ms in range(20) if link.decide(0, 1, t_ms * 10**6).fate == 5]
+    assert lost == [3, 4, 9]

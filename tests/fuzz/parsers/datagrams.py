@@ -1,0 +1,204 @@
+"""Datagrams from outside: random, authentic but malformed, modified by an attacker."""
+
+import hashlib
+import math
+import struct
+
+import numpy as np
+
+from cosim.measurement.live.probe_ends import ProbePlan, ProbeReceiver, ProbeSender
+from noack.core.errors import PeerError
+from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
+from noack.protocol.wire_format import Encoder, Flow, Message, Rejection, loop_number, read_header
+from noack.runtime.host_clocks.time_exchange import TIME_BYTES, TimeDatagram, TimeFormat, TimeKind
+from tests.fuzz.edits import Choices
+from tests.fuzz.harness import Harness, refusal
+from tests.wire_decoder import Decoder
+
+WIRE_KEY = bytes(range(32))
+RUN = 0x0123_4567_89AB_CDEF
+WIRE_WORDS = (b"NA\x01", struct.pack("<Q", RUN))
+
+
+def wire_input(data: bytes) -> None:
+    _junk(data)
+    choices = Choices(data)
+    dimension = 1 + choices.below(4)
+    flow = choices.one([Flow.MEASUREMENT, Flow.UPDATE, Flow.ACTUATION, Flow.ACKNOWLEDGEMENT])
+    if flow is Flow.ACKNOWLEDGEMENT:
+        dimension = 0
+    decoder, encoder = Decoder(flow, dimension, RUN, WIRE_KEY), Encoder(RUN, WIRE_KEY)
+    newest, accepted, seen = -1, 0, b""
+    for count in range(1, 21):
+        if not choices.left:
+            return
+        odd = choices.below(4) == 0
+        datagram = _odd(choices, dimension) if odd else _sound(choices, encoder, flow, dimension)
+        from_peer = choices.below(4) != 0
+        match choices.below(4):
+            case 1:
+                datagram = seen or datagram
+            case 2:
+                datagram = _changed(choices, datagram)
+        message = decoder.decode(datagram, from_peer=from_peer)
+        expected = from_peer and _is_sound(datagram, flow, dimension, newest)
+        assert (message is not None) == expected
+        accepted += expected
+        assert (decoder.accepted, sum(decoder.rejected.values())) == (accepted, count - accepted)
+        if message is not None:
+            assert message.sequence > newest
+            newest, seen = message.sequence, datagram
+            assert encoder.encode(message) == datagram
+
+
+def _junk(data: bytes) -> None:
+    """Without the key, no datagram is accepted."""
+    loop_number(data)
+    header = read_header(data)
+    assert (header is None) == (len(data) < 32 or data[:2] != b"NA")
+    for flow in Flow:
+        assert (
+            Decoder(flow, min(max(len(data) - 48, 0) // 8, 64), RUN, WIRE_KEY).decode(data) is None
+        )
+
+
+def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> bytes:
+    """Return a datagram that a process of the run may send, or nearly so."""
+    sequence, t_ns = choices.integer() % 2**64, choices.integer()
+    t_ns = (t_ns + 2**63) % 2**64 - 2**63
+    vector = np.array([choices.real() for _ in range(dimension)])
+    return encoder.encode(Message(flow, sequence, t_ns, vector))
+
+
+def _odd(choices: Choices, dimension: int) -> bytes:
+    """Return a datagram with the correct key but any header or any content length."""
+    magic, version = choices.one([b"NA", b"NB", b"\0\0"]), choices.one([1, 0, 2, 255])
+    flow, n = choices.one([1, 2, 3, 4, 0, 5, 255]), choices.one([dimension, 0, 1, 64, 65, 65_535])
+    loop, run = choices.one([0, 1, 65_535]), choices.one([RUN, RUN ^ 1, 0])
+    sequence, t_ns = choices.integer() % 2**64, choices.integer() % 2**63
+    numbers = choices.one([dimension, n % 65, 0])
+    content = struct.pack("<2sBBHHQQq", magic, version, flow, n, loop, run, sequence, t_ns)
+    content += struct.pack(f"<{numbers}d", *(choices.real() for _ in range(numbers)))
+    content += choices.take(choices.one([0, 0, 1, 8]))
+    return content + _tag(content)
+
+
+def _changed(choices: Choices, datagram: bytes) -> bytes:
+    """Return the datagram with a bit flipped, truncated or extended."""
+    match choices.below(3):
+        case 0:
+            bit = choices.below(8 * len(datagram))
+            number = int.from_bytes(datagram, "little") ^ (1 << bit)
+            return number.to_bytes(len(datagram), "little")
+        case 1:
+            return datagram[: choices.below(len(datagram))]
+        case _:
+            return datagram + choices.take(1 + choices.below(16))
+
+
+def _tag(content: bytes) -> bytes:
+    return hashlib.blake2b(content, key=WIRE_KEY, digest_size=16).digest()
+
+
+def _is_sound(datagram: bytes, flow: Flow, dimension: int, newest: int) -> bool:
+    """Whether a datagram must be accepted according to ``docs/wire.md``."""
+    if len(datagram) != 48 + 8 * dimension or _tag(datagram[:-16]) != datagram[-16:]:
+        return False
+    magic, version, kind, n, loop, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)
+    vector = struct.unpack_from(f"<{dimension}d", datagram, 32)
+    return (
+        (magic, version, kind, n, loop, run) == (b"NA", 1, flow.value, dimension, 0, RUN)
+        and newest < sequence < 2**63
+        and 0 <= t_ns < 2**62
+        and all(math.isfinite(entry) for entry in vector)
+    )
+
+
+TIMES_KEY = bytes(range(32))
+TIMES_WORDS = (b"NC\x01\x01\0\0\0\0", b"NC\x01\x02\0\0\0\0")
+_CONTENT = "<2sBBI16sQqq"
+
+
+def times_input(data: bytes) -> None:
+    form, choices = TimeFormat(TIMES_KEY), Choices(data)
+    for kind in TimeKind:
+        assert isinstance(form.decode(data, kind), Rejection)
+    while choices.left:
+        magic, version = choices.one([b"NC", b"NA", b"\0\0"]), choices.one([1, 0, 255])
+        number, reserved = choices.one([1, 2, 0, 255]), choices.one([0, 0, 1])
+        times = [(choices.integer() + 2**63) % 2**64 - 2**63 for _ in range(2)]
+        nonce, clock = choices.take(16), choices.integer() % 2**64
+        content = struct.pack(_CONTENT, magic, version, number, reserved, nonce, clock, *times)
+        datagram = whole = (
+            content + hashlib.blake2b(content, key=TIMES_KEY, digest_size=16).digest()
+        )
+        match choices.below(4):
+            case 1:
+                bits = int.from_bytes(datagram, "little") ^ (1 << choices.below(8 * TIME_BYTES))
+                datagram = bits.to_bytes(TIME_BYTES, "little")
+            case 2:
+                datagram = datagram[: choices.below(TIME_BYTES)]
+            case 3:
+                datagram += choices.take(1 + choices.below(16))
+        is_sound = datagram == whole and (magic, version, reserved) == (b"NC", 1, 0)
+        for kind in TimeKind:
+            found = form.decode(datagram, kind)
+            expected = is_sound and number == kind and 0 <= times[0] <= times[1] < 2**62
+            assert isinstance(found, TimeDatagram) == expected
+            if isinstance(found, TimeDatagram):
+                assert form.encode(found) == datagram
+
+
+_PERIOD_NS = 20_000_000
+_FIELDS = ("session", "host", "sequence", "sent_ns", "start_ns", "period_ns", "planned", "number",
+           "newest", "seen")  # fmt: skip
+_SIGNED = ("sent_ns", "start_ns")
+
+
+def probes_input(data: bytes) -> None:
+    choices = Choices(data)
+    receiver = ProbeReceiver(5, 0, 10**9)
+    sender = ProbeSender(ProbePlan(_PERIOD_NS, 20, is_round_trip=True), 1, 5, 0)
+    for _ in range(4):
+        sender.on_timer(sender.next_deadline_ns())
+    now_ns = 0
+    while choices.left and now_ns < 200 * _PERIOD_NS:
+        datagram = _datagram(choices, now_ns // _PERIOD_NS)
+        now_ns += choices.below(256) * _PERIOD_NS // 8
+        answer = receiver.handle(datagram, "somewhere", now_ns)
+        assert answer is None or len(answer) == len(datagram)  # never amplifies
+        sender.handle(datagram, now_ns)
+        if answer is not None:
+            sender.handle(answer, now_ns)
+        receiver.is_over(now_ns)
+    with refusal():
+        try:
+            found = [sender.finish(0), receiver.finish(0)]
+        except ValueError as error:
+            raise PeerError(str(error)) from None
+        for one in found:
+            assert one is None or one.trace is None or len(one.trace) < 10**7
+
+
+def _datagram(choices: Choices, place: int) -> bytes:
+    kind = choices.one([ProbeKind.PROBE, *ProbeKind])
+    content = ProbeDatagram(
+        kind, 1, 5, place % 4, max(place, 4) * _PERIOD_NS, 0, _PERIOD_NS, 20, place, place
+    )
+    for _ in range(choices.below(3)):
+        name = choices.one(_FIELDS)
+        value = choices.integer() & (2**63 - 1 if name != "seen" else 2**128 - 1)
+        sign = -1 if name in _SIGNED and choices.flag() else 1
+        content = content._replace(**{name: sign * value})
+    datagram = bytearray(encode_probe(content, 100 + choices.below(20)))
+    if choices.below(8) == 1:
+        datagram[choices.below(len(datagram))] ^= 1 << choices.below(8)
+        del datagram[100 + choices.below(20) :]
+    return bytes(datagram)
+
+
+PARSERS = {
+    "wire": Harness(wire_input, words=WIRE_WORDS),
+    "times": Harness(times_input, words=TIMES_WORDS),
+    "probes": Harness(probes_input),
+}

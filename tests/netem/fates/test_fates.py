@@ -1,0 +1,284 @@
+"""The recorder of fates; its traces, damaged or not; and the replay, which repeats them."""
+
+import json
+import re
+import resource
+import threading
+from collections.abc import Callable
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from netem.fates import METADATA, FateRecorder, read_fates
+from netem.relay_links import EVENT
+from netem.tc_words import settings_of
+from noack.core.errors import CallerError
+from noack.impairments.link_settings import Decisions, LinkSettings
+from noack.protocol.record_tables import Fate
+from tests.fuzz.parsers.fates import DOCUMENT, TABLE
+from tests.netem.any_settings import harsh as settings
+from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, record, spec_of
+from tests.oracles.link import Link
+
+NOTHING = np.zeros(0, np.uint8)
+LINK = settings_of("corrupt 50% mansd 2")
+
+
+def arrived(count: int, link: int = 0, direction: int = 0, first: int = 0) -> NDArray[Any]:
+    events = np.zeros(count, EVENT)
+    events["packet"] = np.arange(first, first + count)
+    events["link"], events["direction"] = link, direction
+    for name in ("bit", "copy_bit", "copy_delay_ns"):
+        events[name] = -1
+    return events
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "fates.parquet"
+
+
+def test_the_file_contains_the_description_of_its_links(path: Path) -> None:
+    record(path, LINK, [])
+    document = json.loads(pq.ParquetFile(path).metadata.metadata[METADATA.encode()])
+    assert document["missing_events"] == 0
+    (link,) = document["links"]
+    assert (link["name"], link["seed"]) == ("a", 7)
+    assert LinkSettings.model_validate_json(json.dumps(link["forward"])) == LINK
+    with pytest.raises(CallerError, match="has no link 'b'; its links: a"):
+        read_fates(path, ["b"])
+
+
+def test_directions_are_separate_and_a_flow_may_have_packets_in_only_one(path: Path) -> None:
+    """There are more rows than a group of the file has."""
+    many = 70_000
+    back = arrived(2, direction=1)
+    back["flow"] = 1
+    back["fate"], back["delay_ns"] = Fate.DROPPED, -1
+    other = arrived(1)
+    other["flow"] = 1
+    with FateRecorder(path, [spec_of(LINK), spec_of(LINK, "up")]) as recorder:
+        recorder.take(np.concatenate([arrived(3), other, back]), NOTHING)
+        for first in range(3, many, 1000):
+            recorder.take(arrived(min(1000, many - first), first=first), NOTHING)
+    assert (recorder.rows, recorder.missing_events) == (many + 3, 0)
+    assert pq.ParquetFile(path).metadata.num_row_groups > 1
+    fates = read_fates(path).decisions
+    assert {key: [len(flow) for flow in flows] for key, flows in fates.items()} == {
+        ("a", "forward"): [many, 1],
+        ("a", "reverse"): [0, 2],
+        ("up", "forward"): [],
+        ("up", "reverse"): [],
+    }
+    assert [fate for fate, *_ in fates["a", "reverse"][1]] == [Fate.DROPPED] * 2
+    assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "reverse")}
+
+
+def test_events_beyond_the_queue_limit_are_reported_missing_at_once(
+    path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+    write_table = pq.ParquetWriter.write_table
+
+    def slow(self: pq.ParquetWriter, table: pa.Table) -> None:
+        assert free.wait(60)
+        write_table(self, table)
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", slow)
+    with FateRecorder(path, [spec_of(LINK)], max_waiting=100_000) as recorder:
+        recorder.take(arrived(100_000), NOTHING)
+        recorder.take(arrived(7), NOTHING)  # returns at once, although the write is blocked
+        assert recorder.missing_events == 7
+        recorder.missing(2)  # events that the relay lost
+        free.set()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "events are missing" in error
+    with pytest.raises(CallerError, match="9 events are missing; an incomplete trace"):
+        read_fates(path)
+
+
+def test_the_relay_continues_if_the_file_cannot_grow(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with FateRecorder(path, [spec_of(LINK)]) as recorder:
+            for first in range(0, 300_000, 100_000):
+                recorder.take(arrived(100_000, first=first), NOTHING)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "cannot be written (File too large)" in error
+    assert (recorder.rows, recorder.missing_events) == (0, 300_000)
+    with pytest.raises(CallerError, match="incomplete because"):
+        read_fates(path)
+
+
+def test_a_file_that_cannot_be_created_is_reported_at_once(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"none/x: cannot be written \(No such file"):
+        FateRecorder(tmp_path / "none" / "x", [spec_of(LINK)])
+    with pytest.raises(CallerError, match=r"cannot be written \(No space left on device\)"):
+        FateRecorder(Path("/dev/full"), [spec_of(LINK)])
+
+
+def write(path: Path, table: pa.Table, document: object = DOCUMENT) -> Path:
+    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(document)}), path)
+    return path
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(CallerError) as caught:
+        read_fates(path)
+    line = str(caught.value)
+    assert line.startswith(f"{path}")
+    assert "\n" not in line
+    return line
+
+
+def with_values(column: str, values: Callable[[list[Any]], list[Any]]) -> pa.Table:
+    at = TABLE.column_names.index(column)
+    field = TABLE.schema.field(at)
+    return TABLE.set_column(at, field, pa.array(values(TABLE[column].to_pylist()), field.type))
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    assert len(read_fates(write(tmp_path / "a", TABLE)).decisions["up", "forward"]) == 2
+    assert re.search(r"cannot be read \(.*No such file", refused(tmp_path / "none"))
+    assert "cannot be read" in refused(tmp_path)
+    (tmp_path / "a").write_text("fates")
+    assert "not a fate trace, or incomplete" in refused(tmp_path / "a")
+    pq.write_table(pa.table({"a": [1]}), tmp_path / "a")
+    assert "not a fate trace of this program" in refused(tmp_path / "a")
+    other = write(tmp_path / "a", TABLE, {"format": 9, "version": "9.9"})
+    assert "has the format of noack 9.9; record it again" in refused(other)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        None, *({k: v for k, v in DOCUMENT.items() if k != key} for key in DOCUMENT),
+        DOCUMENT | {"missing_events": "0"}, DOCUMENT | {"missing_events": -1},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {"mansd": 1_000_001}}]},
+    ],
+)  # fmt: skip
+def test_a_trace_with_an_invalid_document_is_refused(document: object, tmp_path: Path) -> None:
+    assert "not a fate trace of this program" in refused(write(tmp_path / "a", TABLE, document))
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("fate", 9), ("delay_ns", -5), ("delay_ns", 2**62 + 1), ("copy_delay_ns", 2**62 + 1),
+     ("bit", -2), ("flow", -1), ("flow", 10**12), ("copy_bit", -3)],
+)  # fmt: skip
+def test_an_impossible_decision_is_refused(column: str, value: int, tmp_path: Path) -> None:
+    table = with_values(column, lambda values: [value, *values[1:]])
+    line = refused(write(tmp_path / "a", table))
+    assert "impossible decision: " in line
+    assert f"{column} {value}" in line
+
+
+def test_a_missing_or_repeated_packet_or_value_is_refused(tmp_path: Path) -> None:
+    for packets, message in (([0, 3], "expected packet 1, found 2"), ([0, 0], "found 0")):
+        line = refused(write(tmp_path / "a", TABLE.take(packets)))
+        assert "up forward: flow 0: expected packet 1" in line
+        assert f"{message}; an incomplete trace" in line
+    table = with_values("delay_ns", lambda values: [*values[:-1], None])
+    assert "an incomplete trace cannot be replayed" in refused(write(tmp_path / "a", table))
+
+
+BAD = settings_of(
+    "loss gemodel 20% 40% duplicate 40% corrupt 40% delay 100us 100us rate 50mbit queue 3 "
+    "mansd 3 limit 12"
+)
+"""Every impairment acts, frequently."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fates")
+
+
+def fates_of(folder: Path) -> Decisions:
+    return read_fates(folder / "fates.parquet").decisions["a", "forward"]
+
+
+def seen(run: Run) -> list[tuple[int, ...]]:
+    """Return the values that the sender and the receiver can observe."""
+    observable = attrgetter(
+        "fate", "packet", "consecutive_losses", "release_ns", "copy_ns", "bit", "copy_bit"
+    )
+    return list(map(observable, run.decisions))
+
+
+@given(settings, arrivals, st.booleans())
+def test_the_same_arrivals_have_the_same_fates(
+    folder: Path, link: LinkSettings, came: list[Arrival], capped: bool
+) -> None:
+    """The fates do not depend on the replaying link: another seed, no impairments."""
+    before = record(folder / "fates.parquet", link, came)
+    bare = LinkSettings(mansd=link.mansd) if capped else LinkSettings()
+    for replaying in (link, bare):
+        again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), came)
+        assert seen(again) == seen(before)
+        assert again.departures == before.departures
+
+
+@given(settings, arrivals, st.data())
+def test_at_other_times_the_delays_are_the_same(
+    folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
+) -> None:
+    """tests/netem/test_mansd.py checks that the replay keeps the cap."""
+    before = record(folder / "fates.parquet", link, came)
+    gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(came), max_size=len(came))
+    mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))
+    moved = [one._replace(gap_ns=gap) for one, gap in zip(came, data.draw(gaps), strict=True)]
+    replaying = link.model_copy(update={"mansd": mansd})
+    again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), moved)
+    for old, old_came, new, new_came in zip(
+        before.decisions, before.arrivals, again.decisions, again.arrivals, strict=True
+    ):
+        if old.fate == new.fate and old.release_ns >= 0:
+            delay_ns = new.release_ns - new_came[0]
+            assert delay_ns >= old.release_ns - old_came[0]
+            assert new.hold_back_ns or delay_ns == old.release_ns - old_came[0]
+        lost = (Fate.DROPPED, Fate.CORRUPTED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
+        assert old.fate == new.fate or (old.fate in lost and new.fate == Fate.FORCED)
+
+
+@given(arrivals, st.data())
+def test_a_bit_that_a_datagram_does_not_have_is_not_flipped(
+    folder: Path, came: list[Arrival], data: st.DataObject
+) -> None:
+    broken = settings_of("corrupt 100%")
+    record(folder / "fates.parquet", broken, came)
+    sizes = st.lists(st.integers(0, 40), min_size=len(came), max_size=len(came))
+    other = [
+        arrival._replace(size_bytes=size_bytes)
+        for arrival, size_bytes in zip(came, data.draw(sizes), strict=True)
+    ]
+    again = drive(Link(broken, 8, "b", decisions=fates_of(folder)), other)
+    for was, now, decision in zip(came, other, again.decisions, strict=True):
+        corrupted = was.size_bytes > 0 and now.size_bytes > 0
+        assert decision.fate == (Fate.CORRUPTED if corrupted else Fate.DELIVERED)
+        assert (0 <= decision.bit < 8 * now.size_bytes) == corrupted
+
+
+def test_packets_that_are_not_in_the_trace_use_the_links_own_settings(folder: Path) -> None:
+    record(folder / "fates.parquet", BAD, [Arrival(1000, 0, 8)] * 5)
+    link = Link(settings_of("loss worst"), 8, "b", decisions=fates_of(folder))
+    again = drive(link, [Arrival(1000, 0, 8)] * 8 + [Arrival(1000, 1, 8)] * 3)
+    fates = [decision.fate for decision in again.decisions]
+    assert fates[5:] == [Fate.DROPPED] * 6
+    assert fates[:5] != [Fate.DROPPED] * 5

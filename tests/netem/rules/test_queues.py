@@ -1,0 +1,355 @@
+"""Queues: rates in exact fractions, CoDel by RFC 8289, opportunities by mahimahi's model."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from math import ceil
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.link_state import LinkState
+from netem.tc_words import settings_of
+from noack.core.core_library import core
+from noack.impairments.disciplines.codel import Codel
+from noack.impairments.kinds.opportunities import Opportunities
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
+from tests.oracles.link import Link
+
+NS = 10**9
+
+rates = st.builds(
+    Rate,
+    rate_bps=st.sampled_from([1, 7, 1000, 9_600, 1_000_003, 10**9, 10**12]),
+    queue=st.integers(1, 6),
+    overhead_bytes=st.sampled_from([-40, 0, 28]),
+    cell_bytes=st.sampled_from([0, 48]),
+    cell_overhead_bytes=st.sampled_from([0, 5]),
+)
+
+
+def bits(rate: Rate, size_bytes: int) -> int:
+    line = max(size_bytes + rate.overhead_bytes, 0)
+    if rate.cell_bytes:
+        line = ceil(Fraction(line, rate.cell_bytes)) * (rate.cell_bytes + rate.cell_overhead_bytes)
+    return 8 * line
+
+
+def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[int | None]:
+    """Return departures in whole ns; None if the queue is full and the packet need not pass.
+
+    A forced packet in a full queue shares the last place.
+    """
+    free = Fraction(0)
+    waiting: list[int] = []
+    found: list[int | None] = []
+    for t_ns, size_bytes, forced in arrivals:
+        waiting = [leaves for leaves in waiting if leaves > t_ns]
+        if len(waiting) == rate.queue and not forced:
+            found.append(None)
+            continue
+        # The emulator compares in whole nanoseconds whether the line is busy.
+        begin = free if int(free) >= t_ns else Fraction(t_ns)
+        free = begin + Fraction(bits(rate, size_bytes) * NS, rate.rate_bps)
+        if len(waiting) == rate.queue:
+            waiting.pop()
+        waiting.append(int(free))
+        found.append(int(free))
+    return found
+
+
+@given(
+    rates,
+    st.lists(
+        st.tuples(st.sampled_from([0, 0, 1, 1000, 10**6, 10**9]), st.integers(0, 2000),
+                  st.booleans()),
+        max_size=40,
+    ),
+)  # fmt: skip
+def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
+    times = np.cumsum([step[0] for step in steps]).tolist()
+    arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
+    other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
+    state = LinkState(LinkSettings(impairments=(other, rate)), 0, "a")
+    link = state.core
+    found: list[int | None] = []
+    for t_ns, size_bytes, forced in arrivals:
+        room = core.noack_queue_enters(link, 1, t_ns)
+        found.append(core.noack_queue_serve(link, 1, size_bytes) if room or forced else None)
+    assert found == departures(rate, arrivals)
+    assert list(link.departures_ns[0:3]) == [0, 0, 0]
+
+
+def test_packets_lost_before_the_queue_and_dropped_copies_use_no_line_time(decide: Any) -> None:
+    for words, last_s in (("loss worst rate 8kbit 0", 3), ("rate 8kbit 0 loss worst", 5)):
+        decided = decide(f"{words} mansd 1 first", 5, sizes_bytes=1000, arrivals_ns=0)
+        assert decided.fates.tolist() == [2, 1, 2, 1, 2]
+        assert decided.delays_ns[-1] == last_s * NS
+    words, arrivals = "duplicate 100% rate 8kbit 0 queue 3", [0, 0, 0, NS, 10 * NS]
+    decisions = decide(words, 5, sizes_bytes=1000, arrivals_ns=arrivals).decisions
+    assert decisions["fate"].tolist() == [0, 0, 4, 0, 0]
+    assert (decisions["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
+    assert (decisions["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
+
+
+def test_departures_of_forced_packets_stay_within_the_largest_time(decide: Any) -> None:
+    """At 1 bit/s, packets that must all pass queue up for centuries."""
+    decisions = decide("rate 1bit 28 1 1000 queue 1 mansd 0", 30, sizes_bytes=65_507).decisions
+    assert np.all(np.diff(decisions["release_ns"]) >= 0)
+    assert decisions["release_ns"][0] == (65_507 + 28) * 1001 * 8 * NS
+    assert decisions["release_ns"][-1] == 2**61
+    assert np.all(decisions["consecutive_losses"] == 0)
+
+
+MS = 10**6
+RATE_BPS = 8_000_000
+"""Sending a byte takes 1 µs."""
+PER_BYTE_NS = 1000
+
+
+@dataclass
+class Packet:
+    number: int
+    size_bytes: int
+    enqueued_ns: int
+
+
+@dataclass
+class Reference:
+    """A line with CoDel: names and control flow of the RFC; ``spare`` replaces the MTU rule."""
+
+    target_ns: int
+    interval_ns: int
+    spare: Callable[["Reference", Packet, int], bool]
+    must_pass: Callable[[int], bool]
+    queue: deque[Packet] = field(default_factory=deque)
+    free_ns: int = 0
+    first_above: int = 0
+    drop_next: int = 0
+    count: int = 0
+    lastcount: int = 0
+    dropping: bool = False
+    leaves_ns: dict[int, int | None] = field(default_factory=dict)
+
+    def control_law(self, t: int, count: int) -> int:
+        return t + int(self.interval_ns / math.sqrt(count))
+
+    def dodequeue(self, now: int) -> tuple[Packet | None, bool]:
+        if not self.queue:
+            self.first_above = 0
+            return None, False
+        packet = self.queue.popleft()
+        sojourn = now - packet.enqueued_ns
+        if sojourn < self.target_ns or self.spare(self, packet, sojourn):
+            self.first_above = 0
+        elif self.first_above == 0:
+            self.first_above = now + self.interval_ns
+        elif now >= self.first_above:
+            return packet, True
+        return packet, False
+
+    def drop(self, packet: Packet) -> None:
+        self.leaves_ns[packet.number] = None
+
+    def dequeue(self, now: int) -> Packet | None:
+        packet, ok_to_drop = self.dodequeue(now)
+        if packet is None:
+            self.dropping = False
+            return None
+        if self.dropping:
+            if not ok_to_drop:
+                self.dropping = False
+            while packet and now >= self.drop_next and self.dropping:
+                if self.must_pass(packet.number):
+                    return packet
+                self.drop(packet)
+                self.count += 1
+                packet, ok_to_drop = self.dodequeue(now)
+                if not ok_to_drop:
+                    self.dropping = False
+                else:
+                    self.drop_next = self.control_law(self.drop_next, self.count)
+        elif ok_to_drop and not self.must_pass(packet.number):
+            self.drop(packet)
+            packet, _ = self.dodequeue(now)
+            self.dropping = True
+            delta = self.count - self.lastcount
+            self.count = 1
+            if delta > 1 and now - self.drop_next < 16 * self.interval_ns:
+                self.count = delta
+            self.drop_next = self.control_law(now, self.count)
+            self.lastcount = self.count
+        return packet
+
+    def serve_until(self, t_ns: int) -> None:
+        while self.free_ns <= t_ns and self.queue:
+            now = max(self.free_ns, self.queue[0].enqueued_ns)
+            packet = self.dequeue(now)
+            if packet:
+                self.free_ns = now + packet.size_bytes * PER_BYTE_NS
+                self.leaves_ns[packet.number] = self.free_ns
+        if self.free_ns <= t_ns and not self.queue:
+            self.dequeue(self.free_ns)
+
+
+def ahead(mtu_bytes: int) -> Callable[[Reference, Packet, int], bool]:
+    """The rule of this emulator: at most one MTU was before the packet on arrival."""
+    return lambda line, packet, sojourn: sojourn <= mtu_bytes * PER_BYTE_NS
+
+
+def reference(
+    arrivals: Sequence[tuple[int, int]], codel: Codel, spare: Any, mansd: int | None = None
+) -> list[int | None]:
+    """Return departures in ns, None if dropped; arrivals are (ns, bytes), ascending."""
+    leaves_ns: dict[int, int | None] = {}
+
+    def must_pass(number: int) -> bool:
+        before = range(number - mansd, number) if mansd is not None else range(-1, 0)
+        return all(leaves_ns.get(one, 0) is None for one in before)
+
+    line = Reference(
+        round(codel.target_s * 1e9), round(codel.interval_s * 1e9), spare, must_pass,
+        leaves_ns=leaves_ns,
+    )  # fmt: skip
+    for number, (t_ns, size_bytes) in enumerate(arrivals):
+        line.serve_until(t_ns)
+        line.queue.append(Packet(number, size_bytes, t_ns))
+    line.serve_until(2**62)
+    return [leaves_ns[number] for number in range(len(arrivals))]
+
+
+def emulated(
+    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None
+) -> list[int | None]:
+    rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
+    link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
+    found = [link.decide(0, size, t).release_ns for t, size in arrivals]
+    return [None if t_ns < 0 else t_ns for t_ns in found]
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0, 1, 50_000, 10**6]), st.integers(1, 1500)), max_size=150),
+    st.sampled_from([0.0001, 0.001, 0.005]),
+    st.sampled_from([0.0001, 0.002, 0.02]),
+    st.sampled_from([None, 1, 3]),
+)
+def test_any_arrivals_and_any_cap(
+    steps: list[tuple[int, int]], target_s: float, interval_s: float, mansd: int | None
+) -> None:
+    """Packets that must pass are served, and the law drops the next packet that need not pass."""
+    times = np.cumsum([gap for gap, _ in steps]).tolist()
+    arrivals = [(t, size) for t, (_, size) in zip(times, steps, strict=True)]
+    codel = Codel(target_s=target_s, interval_s=interval_s, mtu_bytes=100)
+    assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
+
+
+def test_random_arrivals_with_pauses() -> None:
+    """Packets of 100 to 1500 bytes that overload the line."""
+    rng, count, codel = np.random.default_rng(2), 6000, Codel()
+    sizes = rng.integers(100, 1501, count)
+    gaps = rng.exponential(800 * PER_BYTE_NS / 1.1, count)
+    gaps[rng.integers(0, count, 16)] += 300 * MS
+    arrivals = list(zip(np.cumsum(gaps).astype(int).tolist(), sizes.tolist(), strict=True))
+    expected = reference(arrivals, codel, ahead(1500))
+    assert emulated(arrivals, codel) == expected
+    assert expected.count(None) > 20
+
+
+def test_the_law_drops_copies_of_delivered_packets() -> None:
+    words = "duplicate 100% rate 8mbit 0 codel target 1us interval 1us mtu 0"
+    link, found = Link(settings_of(words), 0, "a"), set()
+    for k in range(50):
+        decision = link.decide(0, 100, 10_000 * k)
+        found.add((decision.fate, decision.copy_ns >= 0))
+    assert found == {(0, True), (0, False), (4, False)}
+
+
+OVERHEAD_BYTES = 32
+
+
+class Mahimahi:
+    """Its ``LinkQueue`` with a drop-tail queue, opportunity by opportunity; times in ns."""
+
+    def __init__(self, times_ms: list[int], packets: int, most_bytes: int | None) -> None:
+        self.schedule = [t * MS for t in times_ms]
+        self.next, self.base_ns = 0, 0
+        self.limits = packets, most_bytes
+        self.queue: deque[tuple[int, int]] = deque()
+        self.in_transit: tuple[int, int] | None = None
+        self.departures: dict[int, int] = {}
+
+    def run_until(self, now_ns: int) -> None:
+        while self.base_ns + self.schedule[self.next] <= now_ns:
+            time_ns = self.base_ns + self.schedule[self.next]
+            self.next += 1
+            if self.next == len(self.schedule):
+                self.next, self.base_ns = 0, self.base_ns + self.schedule[-1]
+            left = 1504
+            while left > 0 and (self.in_transit or self.queue):
+                number, size = self.in_transit or self.queue.popleft()
+                sent = min(left, size)
+                left -= sent
+                self.in_transit = (number, size - sent) if size > sent else None
+                if self.in_transit is None:
+                    self.departures[number] = time_ns
+
+    def enqueue(self, number: int, size_bytes: int, now_ns: int) -> None:
+        self.run_until(now_ns)
+        size, (packets, most_bytes) = size_bytes + OVERHEAD_BYTES, self.limits
+        waiting = sum(size for _, size in self.queue)
+        if len(self.queue) < packets and (most_bytes is None or waiting + size <= most_bytes):
+            self.queue.append((number, size))
+        else:
+            self.departures[number] = -1
+
+
+times = st.lists(st.integers(0, 12), min_size=1, max_size=8).map(sorted).filter(lambda t: t[-1] > 0)
+packets = st.lists(
+    st.tuples(st.integers(0, 3 * MS) | st.sampled_from([0, MS]), st.integers(0, 4000)), max_size=40
+)
+
+
+@given(times, packets, st.integers(1, 9), st.none() | st.integers(1, 9000), st.integers(0, 11))
+def test_each_packet_leaves_as_in_mahimahi(
+    times_ms: list[int], steps: Any, queue: int, queue_bytes: int | None, offset: int
+) -> None:
+    offset_ms = offset % times_ms[-1]
+    settings = Opportunities(
+        times_ms=tuple(times_ms), queue=queue, queue_bytes=queue_bytes, offset_s=offset_ms / 1e3
+    )
+    link = Link(LinkSettings(impairments=(settings,), limit=1000), 0, "test")
+    model = Mahimahi(times_ms, queue, queue_bytes)
+    now_ns, found = 0, []
+    for number, (gap_ns, size) in enumerate(steps):
+        now_ns += gap_ns
+        model.enqueue(number, size, now_ns + offset_ms * MS)
+        found.append(link.decide(number % 3, size, now_ns).release_ns)
+    model.run_until(now_ns + 2_000 * MS)  # 40 packets need at most 120 opportunities
+    expected = [model.departures[number] for number in range(len(steps))]
+    assert found == [-1 if at < 0 else at - offset_ms * MS for at in expected]
+
+
+def test_a_packet_that_must_pass_leaves_although_the_queue_is_full() -> None:
+    settings = Opportunities(times_ms=(100,), queue=1)
+    decisions = []
+    link = Link(LinkSettings(impairments=(settings,), mansd=1), 0, "test")
+    for _ in range(5):
+        decision = link.decide(0, 1472, 0)
+        decisions.append((decision.fate, decision.release_ns // MS))
+    assert decisions == [(0, 100), (4, -1), (2, 200), (4, -1), (2, 300)]
+
+
+def test_the_longest_delay_is_that_of_a_full_queue() -> None:
+    for times_ms, queue in (((7,), 1), ((0, 3, 4, 20), 5), ((1, 1, 1, 9, 30), 11)):
+        settings = Opportunities(times_ms=times_ms, queue=queue)
+        longest = 0
+        for first_ns in range(1, times_ms[-1] * MS, MS // 2):
+            link = Link(LinkSettings(impairments=(settings,)), 0, "test")
+            left_ns = [link.decide(0, 1472, first_ns).release_ns for _ in range(queue + 1)]
+            longest = max(longest, max(left_ns) - first_ns)
+        assert longest / 1e9 <= settings.longest_s <= (longest + 3 * times_ms[-1] * MS) / 1e9
