@@ -1,13 +1,20 @@
 """The observed conditions of a run: from complete and from damaged records."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import read_conditions
+from cosim.analysis.summary_model import ClaimVerdict
+from cosim.output.certificate_report import Certificates
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
+from noack.core.errors import CallerError
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -16,36 +23,26 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.terms import NetworkConditions
+from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import nominal_conditions
-from tests.cosim.analysis.claims.conftest import (
-    Make,
-    event_s,
-    network_of,
-    without,
-)
+from tests.cosim.analysis.claims.conftest import Make, network_of, without
 from tests.cosim.record.changed_records import changed
 
 PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]
 
 
-def allowed(record: RunRecord) -> NetworkConditions:
-    return nominal_conditions(record.scenario, 0)
-
-
 def violation_of(record: RunRecord) -> tuple[float, str]:
-    found = read_conditions(record).first_violation(allowed(record))
+    found = read_conditions(record).first_violation(nominal_conditions(record.scenario, 0))
     assert found is not None
     return found
 
 
-def busy(
-    step_ns: int, tick_ns: int, every: int, phase: float, sync: str, horizon_s: float, make: Make
-) -> Scenario:
+def busy(make: Make, step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> Scenario:
     """Almost every measurement is an event."""
     return make(
-        horizon_s=horizon_s,
+        horizon_s=0.6,
         plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
         controller={"rate_hz": 1e9 / tick_ns, "phase": phase},
         trigger={"beta": 1e-12},
@@ -61,7 +58,7 @@ def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make
         st.sampled_from(["first_packet", "known_state"]),
     )  # fmt: skip
     def check(step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> None:
-        resolved = busy(step_ns, tick_ns, every, phase, sync, 0.3, make)
+        resolved = busy(make, step_ns, tick_ns, every, phase, sync)
         record = simulate(resolved)
         assert read_conditions(record).first_violation(nominal_conditions(resolved, 0)) is None
 
@@ -83,45 +80,53 @@ def test_the_worst_case_of_a_schedule_occurs(
     step_ns: int, tick_ns: int, every: int, phase: float, make: Make
 ) -> None:
     """The assumed delays and ages occur exactly, to the nanosecond."""
-    resolved = busy(step_ns, tick_ns, every, phase, "first_packet", 0.6, make)
+    resolved = busy(make, step_ns, tick_ns, every, phase, "first_packet")
     seen, assumed = read_conditions(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
     for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
         assert seen[name] == pytest.approx(getattr(assumed, name), abs=1e-12), name
 
 
-# --- violation of each condition, reported with the right time ------------------------------------
+# --- violations that test_assumption_monitor.py does not make -------------------------------------
+
+
+def older_inputs(run: RunRecord, by: int) -> RunRecord:
+    """Steps 200 to 202 apply inputs that are older by ``by`` steps."""
+    steps = run[PLANT_STEP].copy()
+    steps["actuation"][200:203] -= by
+    return changed(run, {PLANT_STEP: steps})
+
+
+def without_any_input(run: RunRecord) -> RunRecord:
+    steps = run[PLANT_STEP].copy()
+    steps["actuation"] = NO_SEQUENCE
+    return changed(run, {PLANT_STEP: steps})
 
 
 @pytest.mark.parametrize(
-    ("delays_ms", "number", "why"),
+    ("damage", "when_s", "why"),
     [
-        (dict.fromkeys((4, 5, 8, 9, 10, 11), None), 10, "4 consecutive updates lost, 2 allowed"),
-        (dict.fromkeys((7, 8, 9), 2000), 9, "3 consecutive updates lost, 2 allowed"),
-        # 33 ms later, at the next tick, and at the plant's step after that tick.
-        ({7: 33}, 7, "an update took effect after 0.04 s, 0.01 s allowed"),
-        (dict.fromkeys(range(20, 100), None), 22, " consecutive updates lost, 2 allowed"),
+        (lambda run: older_inputs(run, 3), 2.0, "an input was 0.045 s old, 0.015 s allowed"),
+        # A plant that is 3.5 steps late latches an input computed for a later time.
+        (lambda run: older_inputs(run, -4), 2.0, "an input was 0.035 s old, 0.015 s allowed"),
+        (
+            lambda run: changed(run, {SENSOR_MEASUREMENT: run[SENSOR_MEASUREMENT][:300]}), 2.99,
+            "no measurement for 3.01 s, 0.01 s allowed",
+        ),
+        (without_any_input, 0.0, "the plant applied no input at all, the first within 0.0"),
     ],
-    ids=["too many", "stale", "late", "up to the end"],
-)
-def test_lost_and_late_updates_are_reported_at_their_events(
-    delays_ms: dict[int, int | None], number: int, why: str, make: Make
+)  # fmt: skip
+def test_a_damaged_record_violates_a_condition_from_its_time_on(
+    run: RunRecord, damage: Callable[[RunRecord], RunRecord], when_s: float, why: str
 ) -> None:
-    record = simulate(make(), network_of(lambda n: delays_ms.get(n, 0)))
-    when_s, found = violation_of(record)
-    assert when_s == pytest.approx(event_s(record, number))
-    assert found.endswith(why)
+    found_s, found = violation_of(damage(run))
+    assert found_s == pytest.approx(when_s)
+    assert found.startswith(why)
 
 
-@pytest.mark.parametrize(
-    ("gone", "when_s", "gap_s"),
-    [(slice(100, 103), 0.99, 0.04), (slice(5), 0.0, 0.05), (slice(300, None), 2.99, 3.01)],
-)
-def test_missing_measurements_are_reported_at_the_last_measurement_before_them(
-    run: RunRecord, gone: slice, when_s: float, gap_s: float
-) -> None:
-    rows = np.delete(run[SENSOR_MEASUREMENT], gone)
-    found = violation_of(changed(run, {SENSOR_MEASUREMENT: rows}))
-    assert found == (pytest.approx(when_s), f"no measurement for {gap_s} s, 0.01 s allowed")
+def test_a_known_initial_state_starts_without_an_update(make: Make) -> None:
+    network = network_of(lambda n: 500 if n < 3 else 0)
+    known = simulate(make(network={"initial_sync": "known_state"}), network)
+    assert read_conditions(known).start_s == pytest.approx(0.01)
 
 
 def test_a_stale_update_is_not_lost_if_the_newer_one_arrived_in_time(make: Make) -> None:
@@ -137,69 +142,7 @@ def test_a_stale_update_is_not_lost_if_the_newer_one_arrived_in_time(make: Make)
     assert observed.losses.consecutive(allowance_s).largest() == 0
 
 
-def held(run: RunRecord, first: int, last: int, by: int) -> RunRecord:
-    """Steps ``first`` to ``last`` − 1 apply inputs that are older by ``by`` steps."""
-    steps = run[PLANT_STEP].copy()
-    steps["actuation"][first:last] -= by
-    return changed(run, {PLANT_STEP: steps})
-
-
-def test_an_old_input_is_reported_when_it_exceeds_the_maximum_age(run: RunRecord) -> None:
-    assert read_conditions(run).summary()["hold_s"] == pytest.approx(0.015)
-    assert violation_of(held(run, 200, 210, 3)) == (
-        pytest.approx(2.0), "an input was 0.045 s old, 0.015 s allowed",
-    )  # fmt: skip
-
-
-def test_an_input_from_the_future_violates_the_maximum_age(run: RunRecord) -> None:
-    """A plant that is 3.5 steps late latches an input computed for a later time."""
-    assert read_conditions(held(run, 200, 203, -2)).first_violation(allowed(run)) is None
-    assert violation_of(held(run, 200, 203, -4)) == (
-        pytest.approx(2.0), "an input was 0.035 s old, 0.015 s allowed",
-    )  # fmt: skip
-
-
-def test_an_update_late_at_the_model_is_late_even_if_the_plant_was_later(
-    run: RunRecord,
-) -> None:
-    deliveries = run[CONTROLLER_DELIVERY].copy()
-    deliveries["model_t_ns"][5] += 30_000_000
-    when_s, why = violation_of(changed(run, {CONTROLLER_DELIVERY: deliveries}))
-    assert when_s == pytest.approx(deliveries["t_ns"][5] * 1e-9)
-    assert why == "an update took effect after 0.03 s, 0.01 s allowed"
-
-
-def test_the_start_is_late_unless_the_initial_state_is_known(make: Make) -> None:
-    network = network_of(lambda n: 500 if n < 3 else 0)
-    known = simulate(make(network={"initial_sync": "known_state"}), network)
-    assert read_conditions(known).start_s == pytest.approx(0.01)
-    when_s, why = violation_of(simulate(make(), network))
-    assert when_s == 0.0
-    assert why.startswith("the plant applied no input until")
-
-
-def test_a_plant_without_any_input_has_no_time_of_the_first(make: Make) -> None:
-    run = simulate(make())
-    steps = run[PLANT_STEP].copy()
-    steps["actuation"] = NO_SEQUENCE
-    _, why = violation_of(changed(run, {PLANT_STEP: steps}))
-    assert why.startswith("the plant applied no input at all, the first within 0.0")
-
-
 # --- incomplete records ---------------------------------------------------------------------------
-
-
-def test_losses_are_derived_from_the_controller_without_network_rows(
-    run: RunRecord,
-) -> None:
-    whole, blind = read_conditions(run), read_conditions(without(run, "netem"))
-    assert blind.losses.consecutive(0.0).largest() == whole.losses.consecutive(0.0).largest() == 2
-    assert blind.hold.largest() == whole.hold.largest()
-
-
-def until(run: RunRecord, end_s: float, *names: str) -> RunRecord:
-    cut = {name: run[name][run[name]["now_ns"] < end_s * 1e9] for name in names}
-    return changed(run, cut)
 
 
 def test_inputs_of_unrecorded_ticks_have_the_largest_possible_age(run: RunRecord) -> None:
@@ -218,19 +161,76 @@ def test_every_table_may_be_empty(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
     found = read_conditions(empty)
     assert set(found.summary().values()) == {None}
-    assert found.first_violation(allowed(run)) is not None
+    assert found.first_violation(nominal_conditions(run.scenario, 0)) is not None
     step = np.zeros(1, run[PLANT_STEP].dtype)
     step["actuation"] = NO_SEQUENCE
     assert read_conditions(changed(empty, {PLANT_STEP: step})).start_s == np.inf
 
 
-def test_a_stale_update_at_the_end_of_the_run_is_not_lost(make: Make) -> None:
-    """The controller has the newer update, but no plant step is left that could apply it."""
-    busy = make(trigger={"beta": 1e-6}, horizon_s=1.0)
-    events = simulate(busy, network_of(lambda n: 0))[SENSOR_MEASUREMENT]["event"]
-    late = int(events.max()) - 1
-    assert (events[-2:] == [late, late + 1]).all()  # an event at each of the last measurements
-    record = simulate(busy, network_of(lambda n: 18 if n == late else 0))
-    assert late not in record[CONTROLLER_DELIVERY]["sequence"]
-    assert late + 1 in record[CONTROLLER_DELIVERY]["sequence"]
-    assert read_conditions(record).losses.consecutive(0.02).largest() == 0
+# --- actuations that cross the network ------------------------------------------------------------
+
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+WORST = 'loss={model="worst_case"}'
+RANDOM = 'loss={model="bernoulli", probability=0.4}'
+DELAY = 'impairments=[{kind="delay", delay_s=0.013}]'
+JITTER = 'impairments=[{kind="delay", delay_s=0.02, jitter_s=0.02}]'
+
+
+def actuated(actuation: str, *more: str) -> Scenario:
+    path = SCENARIOS / "lane_following.toml"
+    base = ["horizon_s=3", "trigger.beta=0.05", f"network.actuation={{{actuation}}}"]
+    return resolve(load(path, [*base, *more]))
+
+
+@pytest.mark.parametrize("predictions", [1, 4])
+@pytest.mark.parametrize(
+    ("actuation", "reached"),
+    [
+        (f"mansd=0, {RANDOM}", True), (f"mansd=1, {WORST}", True), (f"mansd=3, {WORST}", True),
+        (f"mansd=3, {RANDOM}, {DELAY}", False), (f"mansd=2, {RANDOM}, {JITTER}", False),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("rates", [(100, 100, 0.5), (100, 50, 0.0), (500, 100, 0.3)])
+def test_no_run_leaves_the_conditions_of_its_schedule_and_some_reach_them(
+    actuation: str, reached: bool, predictions: int, rates: tuple[float, float, float]
+) -> None:
+    plant_hz, controller_hz, phase = rates
+    run = actuated(
+        actuation, f"controller.predictions={predictions}", f"plant.rate_hz={plant_hz}",
+        f"controller.rate_hz={controller_hz}", f"controller.phase={phase}",
+    )  # fmt: skip
+    allowed, found = nominal_conditions(run, 0), read_conditions(simulate(run)).summary()
+    for name in ("delay_s", "hold_s", "start_s"):
+        assert found[name] is not None
+        assert found[name] <= getattr(allowed, name) + 1e-9, name  # type: ignore[operator]
+    if reached and predictions == 1:
+        assert found["hold_s"] == pytest.approx(allowed.hold_s, abs=1e-9)
+
+
+@pytest.mark.parametrize("predictions", [1, 4])
+@pytest.mark.parametrize("policy", ["hold", "zero"])
+@pytest.mark.parametrize("actuation", [f"mansd=3, {WORST}", f"mansd=3, {RANDOM}"])
+def test_the_claims_of_a_run_are_judged_where_the_watchdog_stays_idle(
+    actuation: str, policy: str, predictions: int
+) -> None:
+    run = actuated(
+        actuation, f"controller.predictions={predictions}", f'plant.watchdog.policy="{policy}"'
+    )
+    verdicts = [claim.verdict for claim in ClaimEvaluation(simulate(run)).judge()]
+    idle = policy == "hold" or predictions == 4
+    assert run.coverage.is_certifiable == idle
+    # (I1) and eq:LossEv3 need no certificate.
+    assert len(verdicts) > 10 if idle else len(verdicts) == 3
+    assert set(verdicts) == {ClaimVerdict.HELD}
+
+
+def test_what_is_not_covered_is_refused_with_the_reason() -> None:
+    for run, says in (
+        (actuated(RANDOM), "the age of the applied input has no bound"),
+        (actuated("mansd=1", 'plant.watchdog.policy="model"'), "use more controller.predictions"),
+    ):
+        with pytest.raises(CallerError, match=says):
+            Certificates(run, 2)
+    with pytest.raises(CallerError, match=r"network\.actuation"):
+        actuated("mansd=1").coverage.require_exact()
