@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import cosim.analysis.fidelity
@@ -65,14 +66,6 @@ def test_the_difference_to_the_ideal_loop_is_explained(fidelity: Fidelity) -> No
     assert fidelity.compared_s == 4.0
 
 
-def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
-    """This rule does not tolerate the losses; a deviation grows between equal events."""
-    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
-    record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
-    with pytest.raises(IncomparableError, match="turns rounding into another run"):
-        compute_fidelity(record)
-
-
 def test_delay_is_attributed_to_delay() -> None:
     prompt, late = (compute_fidelity(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
@@ -86,6 +79,8 @@ def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
     settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
     fidelity = compute_fidelity(lane(None, *settings))
     sampling, delay, held, _ = fidelity.stages
+    at_rest = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    assert (at_rest.explained, at_rest.explained_relative) == (True, 0.0)
     assert fidelity.events_live == 0
     assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
     assert delay.difference.max == 0.0
@@ -97,13 +92,6 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
     assert not compute_fidelity(changed(record, {PLANT_STEP: steps})).explained
-
-
-def test_at_rest_there_is_nothing_to_explain() -> None:
-    fidelity = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
-    assert fidelity.explained
-    assert fidelity.explained_relative == 0.0
-    assert "rounding" in fidelity.verdict
 
 
 def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
@@ -122,21 +110,32 @@ def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "rows", "why"),
+    ("table", "column", "row", "value", "why"),
     [
-        (SENSOR_MEASUREMENT, slice(5), "5 measurements"),
-        (SENSOR_MEASUREMENT, [*range(50), *range(51, 401)], "sensor's record"),
-        (PLANT_STEP, [*range(50), *range(51, 401)], "steps of the plant"),
-        (PLANT_STEP, slice(300), "steps of the plant"),
-        (CONTROLLER_STEP, slice(300), "controller's record"),
-        (CONTROLLER_STEP, [*range(50), *range(51, 400)], "controller's record"),
-        (CONTROLLER_DELIVERY, slice(1, None), "controller's record"),
+        (PLANT_STEP, "x", slice(300, None), math.nan, "diverged"),
+        (SENSOR_MEASUREMENT, "t_ns", None, 2**62, "has times that no run has"),
+        (SENSOR_MEASUREMENT, "t_ns", None, -(2**63), "has times that no run has"),
+        (CONTROLLER_STEP, "model_t_ns", None, 2**63 - 1, "has times that no run has"),
+        (CONTROLLER_DELIVERY, "model_t_ns", None, -1, "has times that no run has"),
+        (PLANT_STEP, None, np.s_[50:51], None, "steps of the plant"),
+        (PLANT_STEP, None, np.s_[300:], None, "steps of the plant"),
+        (SENSOR_MEASUREMENT, None, np.s_[5:], None, "5 measurements"),
+        (SENSOR_MEASUREMENT, None, np.s_[50:51], None, "sensor's record"),
+        (CONTROLLER_STEP, None, np.s_[300:], None, "controller's record"),
+        (CONTROLLER_STEP, None, np.s_[50:51], None, "controller's record"),
+        (CONTROLLER_DELIVERY, None, np.s_[:1], None, "controller's record"),
     ],
 )
-def test_gaps_in_the_record_are_reported(
-    record: RunRecord, table: str, rows: Any, why: str
+def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
+    record: RunRecord, table: str, column: str | None, row: Any, value: Any, why: str
 ) -> None:
-    broken = changed(record, {table: record[table][rows]})
+    """Without a column, rows are missing; without a row, the one in the middle is meant."""
+    rows = record[table].copy()
+    if column is None:
+        rows = np.delete(rows, row)
+    else:
+        rows[column][len(rows) // 2 if row is None else row] = value
+    broken = changed(record, {table: rows})
     with pytest.raises(IncomparableError, match=why):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
@@ -150,19 +149,6 @@ def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None
     fidelity = compute_fidelity(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
-
-
-def test_a_diverged_run_is_reported(record: RunRecord) -> None:
-    steps = record[PLANT_STEP].copy()
-    steps["x"][300:] = math.nan
-    with pytest.raises(IncomparableError, match="diverged"):
-        compute_fidelity(changed(record, {PLANT_STEP: steps}))
-
-
-def test_an_accumulation_of_events_is_reported() -> None:
-    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
-    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
-        compute_fidelity(unstable, max_events=200)
 
 
 def test_the_summary_has_the_comparison_or_the_reason(
@@ -184,21 +170,3 @@ def test_the_summary_has_the_comparison_or_the_reason(
     monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 10 * steps)
     assert fidelity_for_summary(record, loops=10) == bad
     assert "noack fidelity" in str(fidelity_for_summary(record, loops=11).reason)
-
-
-@pytest.mark.parametrize(
-    ("table", "column", "value"),
-    [
-        (SENSOR_MEASUREMENT, "t_ns", 2**62),
-        (SENSOR_MEASUREMENT, "t_ns", -(2**63)),
-        (CONTROLLER_STEP, "model_t_ns", 2**63 - 1),
-        (CONTROLLER_DELIVERY, "model_t_ns", -1),
-    ],
-)
-def test_a_record_with_impossible_times_is_not_compared(
-    record: RunRecord, table: str, column: str, value: int
-) -> None:
-    rows = record[table].copy()
-    rows[column][len(rows) // 2] = value
-    with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
-        compute_fidelity(changed(record, {table: rows}))

@@ -105,10 +105,6 @@ def test_quantiles_of_many_values_have_the_stated_error() -> None:
         exact = float(np.quantile(values, share, method="lower"))
         assert sketch.quantiles(share)[0] == pytest.approx(exact, rel=RESOLUTION)
     assert sketch.quantiles(1.0)[0] == values.max()
-
-
-def test_quantiles_of_few_values_are_exact() -> None:
-    values = np.random.default_rng(1).lognormal(3, 2, 5000)
-    sketch = QuantileSketch.of(np.array_split(values, 7))
-    assert sketch.quantiles(0.99)[0] == np.quantile(values, 0.99)
+    few = QuantileSketch.of(np.array_split(values[-5000:], 7))
+    assert few.quantiles(0.99)[0] == np.quantile(values[-5000:], 0.99)
     assert QuantileSketch().quantiles(0.5) == [None]

@@ -78,58 +78,51 @@ def test_a_threshold_that_underflows_makes_every_error_an_event(
     assert not (late["event"] >= 0)[late["compared"] == 0].any()
 
 
-def test_a_run_with_the_longest_horizon_is_possible(content: dict[str, Any]) -> None:
-    resolved = scenario(
-        content, rate_hz=1e-4, horizon_s=1e7, trigger={"beta": 0.1, "alpha_per_s": 1e-6},
-        **plant([[-1e-5]], [[1e-5]], [[-0.5]]),
-    )  # fmt: skip
-    found = require_sound(simulate(resolved))
-    assert found["reached_s"] == 1e7
-
-
-@pytest.mark.parametrize("size", [1e300, 1e150, 1e-160, 5e-324])
-def test_states_of_any_magnitude_are_judged_alike(content: dict[str, Any], size: float) -> None:
-    resolved = scenario(
-        content,
-        **plant([[0.0, 1.0], [0.1, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1)
-        | {"plant__initial_state": [size, 0.0]},
-        trigger={"beta": max(0.1 * size, 5e-324), "alpha_per_s": 0.25},
-    )
-    require_sound(simulate(resolved))
-
-
 STIFF = np.diag([-1e6, -1e3, -1.0, -1e-3])
-PLANTS = {
-    "stiff": plant(STIFF, [[1.0]] * 4, [[0.0, 0.0, -0.1, 0.0]]),
-    "defective": plant(-np.eye(3) + np.eye(3, k=1), [[0], [0], [1]], [[0.0, 0.0, 0.0]]),
-    "badly_scaled": plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
-    "far_from_normal": plant(
-        -np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]
-    ),
+FAST: dict[str, Any] = {"horizon_s": 0.2, "trigger": {"beta": 1e-3, "alpha_per_s": 0.25}}
+SLOW = {"rate_hz": 1e-4, "horizon_s": 1e7, "trigger": {"beta": 0.1, "alpha_per_s": 1e-6}}
+
+
+def of_size(size: float) -> dict[str, Any]:
+    """A loop whose state and threshold have a magnitude."""
+    return plant([[0.0, 1.0], [0.1, 0.0]], [[0], [1]], [[-1.0, -1.7]], 1.1) | {
+        "plant__initial_state": [size, 0.0],
+        "trigger": {"beta": max(0.1 * size, 5e-324), "alpha_per_s": 0.25},
+    }
+
+
+LOOPS = {
+    "stiff": FAST | plant(STIFF, [[1.0]] * 4, [[0.0, 0.0, -0.1, 0.0]]),
+    "defective": FAST | plant(-np.eye(3) + np.eye(3, k=1), [[0], [0], [1]], [[0.0, 0.0, 0.0]]),
+    "badly scaled": FAST | plant([[-1.0, 1e12], [0.0, -2.0]], [[0], [1e-12]], [[0.0, -1.0]]),
+    "far from normal": FAST
+    | plant(-np.eye(20) + 10 * np.eye(20, k=1), [[0.0]] * 19 + [[1.0]], [[0.0] * 20]),
+    "the longest horizon": SLOW | plant([[-1e-5]], [[1e-5]], [[-0.5]]),
+    "huge": of_size(1e300),
+    "large": of_size(1e150),
+    "small": of_size(1e-160),
+    "subnormal": of_size(5e-324),
+    "a negative zero": {"plant__initial_state": [-0.0, 5e-324]},
+    "both subnormal": {"plant__initial_state": [-5e-324, -1e-310]},
 }
 
 
-@pytest.mark.parametrize("name", PLANTS)
-def test_unusual_plants_run_and_replay(content: dict[str, Any], name: str) -> None:
-    trigger = {"beta": 1e-3, "alpha_per_s": 0.25}
-    record = simulate(scenario(content, horizon_s=0.2, trigger=trigger, **PLANTS[name]))
-    require_sound(record)
+@pytest.mark.parametrize("name", LOOPS)
+def test_unusual_loops_are_judged_and_replayed(content: dict[str, Any], name: str) -> None:
+    resolved = scenario(content, **LOOPS[name])
+    record = simulate(resolved)
+    x0 = np.array(resolved.plant.initial_state)
+    assert record["sensor_measurement"]["x"][0].tobytes() == x0.tobytes()
+    assert require_sound(record)["reached_s"] == resolved.horizon_s
 
 
-@pytest.mark.parametrize("x", [[-0.0, 5e-324], [-5e-324, -1e-310]])
-def test_signs_of_zero_and_subnormal_numbers_are_replayed(
-    content: dict[str, Any], x: list[float]
-) -> None:
-    record = simulate(scenario(content, plant__initial_state=x))
-    assert record["sensor_measurement"]["x"][0].tobytes() == np.array(x).tobytes()
-    require_sound(record)
-
-
-def test_a_diverged_run_reports_the_time_of_divergence(content: dict[str, Any]) -> None:
+def test_a_loop_that_overflows_is_refused_or_has_diverged(content: dict[str, Any]) -> None:
     resolved = scenario(content, 20.0, horizon_s=20.0, **plant([[50.0]], [[1.0]], [[-0.1]]))
     found = require_sound(simulate(resolved), ExitStatus.FAILED)
     assert 10 < found["diverged_at_s"] < 20
     assert found["exit"]["reason"].startswith("diverged: x is not finite at")
+    with pytest.raises(CallerError, match="take one step to infinity"):
+        simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[1e308]])))
 
 
 def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
@@ -146,8 +139,3 @@ def test_a_non_finite_input_is_not_applied(content: dict[str, Any]) -> None:
     assert np.isfinite(record["plant_step"]["x"]).all()
     found = summarise(record, 0, "horizon").to_json()
     assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
-
-
-def test_a_model_that_overflows_in_one_step_is_refused(content: dict[str, Any]) -> None:
-    with pytest.raises(CallerError, match="take one step to infinity"):
-        simulate(scenario(content, **plant([[-1.0]], [[1.0]], [[1e308]])))

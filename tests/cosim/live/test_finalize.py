@@ -1,17 +1,22 @@
 """The end of a run: its summary, and how faults of record and analysis change it."""
 
 import json
+import os
 import shutil
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import cosim.live.finalize
+from cosim.live import end_helpers
+from cosim.live.end_helpers import EndHelpers, PreparedEnding
 from cosim.live.finalize import finalize, reopen
-from cosim.record.processes import write_reports
+from cosim.live.simulated_run import simulate_run
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -84,30 +89,6 @@ def summary_of(run_dir: Path) -> dict[str, Any]:
     return summary
 
 
-def test_a_run_directory_that_was_deleted_is_not_created_again(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def delete(*_: object) -> NoReturn:
-        shutil.rmtree(run_dir)
-        raise RuntimeError("the results need the directory")
-
-    monkeypatch.setattr(cosim.live.finalize, "replay", delete)
-    with pytest.raises(MachineError, match=r"summary\.json: cannot be written: No such file"):
-        finalize(ended_well(run_dir), report=False)
-    with pytest.raises(MachineError, match=r"reports\.json: cannot be written: No such file"):
-        write_reports(run_dir, [])
-    assert not run_dir.exists()
-
-
-def test_the_reason_is_told_if_the_run_directory_was_replaced(tmp_path: Path) -> None:
-    ending = RunEnding(tmp_path, 1, ExitStatus.FAILED, "the record was moved", None)
-    with pytest.raises(MachineError) as caught:
-        finalize(ending)
-    reason, error = str(caught.value).splitlines()
-    assert reason == "the run failed: the record was moved"
-    assert error == f"{tmp_path / SCENARIO_FILE}: no such file"
-
-
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
     record = load_record(run_dir)
     record[PLANT_STEP]["u"][9, 0] = np.nan
@@ -123,55 +104,52 @@ def ended_well(run_dir: Path) -> RunEnding:
     return RunEnding(run_dir, 0, ExitStatus.OK, "horizon")
 
 
-def test_a_run_that_cannot_be_replayed_fails(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def crash(*_: object) -> None:
-        raise RuntimeError("a mistake of ours")
-
-    monkeypatch.setattr(cosim.live.finalize, "replay", crash)
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert outcome.status == ExitStatus.FAILED
-    assert outcome.reason == ("the run cannot be replayed: RuntimeError('a mistake of ours')")
-    assert summary_of(run_dir)["exit"] == {"status": 1, "reason": outcome.reason}
-
-
-def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
+def no_rows(run_dir: Path) -> None:
     record = load_record(run_dir)
-    no_rows = {table: record[table][:0] for table in record.tables}
-    write_run(alone(changed(record, no_rows, reports={})), run_dir)
+    empty = {table: record[table][:0] for table in record.tables}
+    write_run(alone(changed(record, empty, reports={})), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert outcome.status == ExitStatus.FAILED
-    assert outcome.reason == "the run cannot be replayed: the record has no inputs"
 
 
-@pytest.mark.parametrize("cut", [slice(-40, None), slice(100, 140)])
-def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
+def missing_rows(run_dir: Path, cut: slice) -> None:
     record = load_record(run_dir)
-    steps = record[PLANT_STEP]
-    lost = len(steps[cut])
-    write_run(alone(changed(record, {PLANT_STEP: np.delete(steps, cut)})), run_dir)
-    with EndingFile(run_dir) as file:
-        file.store(ExitStatus.OK, "horizon", 1.5)
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert outcome.status == ExitStatus.FAILED
-    stored = json.loads((run_dir / ENDING_FILE).read_text())
-    assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
-    assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
-    stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
-    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
+    write_run(alone(changed(record, {PLANT_STEP: np.delete(record[PLANT_STEP], cut)})), run_dir)
 
 
-def test_a_run_with_more_rows_than_were_reported_fails(run_dir: Path) -> None:
+def more_rows(run_dir: Path) -> None:
     reports = json.loads((run_dir / REPORTS_FILE).read_text())
     reports["plant"]["rows_by_loop"][PLANT_STEP][0] -= 7
     (run_dir / REPORTS_FILE).write_text(json.dumps(reports))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (no_rows, "the run cannot be replayed: the record has no inputs"),
+        (
+            lambda run_dir: missing_rows(run_dir, slice(-40, None)),
+            "rows are missing from the record: 40 of plant_step",
+        ),
+        (
+            lambda run_dir: missing_rows(run_dir, slice(100, 140)),
+            "rows are missing from the record: 40 of plant_step",
+        ),
+        (more_rows, "the record has more rows than the processes reported: 7 of plant_step"),
+    ],
+)
+def test_a_run_whose_record_is_not_complete_fails(
+    run_dir: Path, damage: Callable[[Path], None], reason: str
+) -> None:
+    damage(run_dir)
+    with EndingFile(run_dir) as file:
+        file.store(ExitStatus.OK, "horizon", 1.5)
     outcome = finalize(ended_well(run_dir), report=False)
-    assert (outcome.status, outcome.reason) == (
-        ExitStatus.FAILED,
-        "the record has more rows than the processes reported: 7 of plant_step",
-    )
+    assert (outcome.status, outcome.reason) == (ExitStatus.FAILED, reason)
+    assert summary_of(run_dir)["exit"] == {"status": 1, "reason": reason}
+    stored = json.loads((run_dir / ENDING_FILE).read_text())
+    assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
+    stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
+    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
 
 
 def test_an_interrupted_replay_leaves_a_summary(
@@ -187,13 +165,6 @@ def test_an_interrupted_replay_leaves_a_summary(
     assert reopen(run_dir).summary.loops[0].replay is None
 
 
-@pytest.mark.parametrize("end", [None, {"status": 99, "reason": ""}])
-def test_a_damaged_summary_is_written_again(whole: Path, end: Any) -> None:
-    before = summary_of(whole)
-    (whole / SUMMARY_FILE).write_text(json.dumps(before | {"exit": end}))
-    assert reopen(whole).summary.to_json() == before
-
-
 def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     """An empty file comes from a launcher that ended before the run."""
     with EndingFile(run_dir) as file:
@@ -206,19 +177,11 @@ def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     assert outcome.summary.startup_s == 1.5
     (run_dir / SUMMARY_FILE).write_text("damaged")
     assert reopen(run_dir).reason == "stopped by SIGTERM"
-
-
-def test_an_error_of_the_launcher_is_stored_as_the_end(run_dir: Path) -> None:
     with pytest.raises(CallerError), EndingFile(run_dir):
         raise CallerError("the port is taken")
+    (run_dir / SUMMARY_FILE).unlink()
     outcome = reopen(run_dir)
     assert (outcome.status, outcome.reason) == (2, "the port is taken")
-
-
-def test_a_damaged_log_is_one_clear_line(run_dir: Path) -> None:
-    (run_dir / "record/notices.jsonl").write_bytes(b"\xae\xff")
-    with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
-        reopen(run_dir)
 
 
 def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
@@ -245,3 +208,36 @@ def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
     (whole / RECORDING_FILE).write_bytes(b"cut")
     reopen(whole)
     assert (whole / RECORDING_FILE).stat().st_size > 10_000
+
+
+# --- processes that help with the end of a long run -----------------------------------------------
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_prepared_end_is_that_of_a_run_without_preparation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
+) -> None:
+    """The run has more loops than are prepared at once."""
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
+    assert scenario.loops is not None
+    loops = (scenario.loops[0].model_copy(update={"count": 20}),)
+    run_dir = simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
+    expected = finalize(ended_well(run_dir), report=False, view=False).summary
+    helpers = EndHelpers(load(run_dir / SCENARIO_FILE))
+    helpers.prepare(run_dir)
+    for thread in helpers._threads:
+        thread.join()
+    assert helpers.expectations(range(20)) is not None
+    monkeypatch.setattr(cosim.live.finalize, "_expectations", fail)
+    if is_killed:
+        assert helpers.submit(os.getpid).result() != os.getpid()
+        with pytest.raises(BrokenProcessPool):
+            helpers.submit(os._exit, 1).result()
+    ending = PreparedEnding(run_dir, 0, ExitStatus.OK, "horizon", helpers=helpers)
+    assert finalize(ending, report=False, view=False).summary == expected
+
+
+def fail(*_: object) -> None:
+    raise MemoryError

@@ -7,8 +7,6 @@ import pytest
 import rerun.chunk
 from typer.testing import CliRunner, Result
 
-import cosim.live.finalize
-from cosim.analysis.summary_model import RunSummary
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
@@ -21,9 +19,8 @@ from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 
-ROOT = Path(__file__).parents[3]
+PATH = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 SHORT = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
-PATH = ROOT / "scenarios" / "double_integrator.toml"
 
 
 def noack(*arguments: str) -> Result:
@@ -32,11 +29,15 @@ def noack(*arguments: str) -> Result:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run without a report, of which one was written later."""
     folder = tmp_path_factory.mktemp("runs")
     settings = [word for setting in SHORT for word in ("--set", setting)]
-    done = noack("simulate", str(PATH), "--runs", str(folder), "--json", *settings)
+    words = ("simulate", str(PATH), "--runs", str(folder), "--json", "--no-report")
+    done = noack(*words, *settings)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    assert not (folder / "latest/report.html").exists()
+    assert noack("report", "--runs", str(folder)).exit_code == 0
     return folder
 
 
@@ -46,34 +47,15 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
         "scenario.toml", "environment.json", "record", "recording.rrd", "reports.json",
         "summary.json", "report.html", "ending.json", "logs", ".lock",
     }  # fmt: skip
-    assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
     assert {path.name for path in (run_dir / "record").iterdir()} == {
         *(f"{table}.parquet" for table in tables(2, 1)),
         "notices.jsonl",
     }
-
-
-@pytest.fixture
-def reported(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Run directories for which a report would be written."""
-    written: list[Path] = []
-
-    def report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
-        written.append(run_dir)
-        return run_dir / "report.html"
-
-    monkeypatch.setattr(cosim.live.finalize, "_write_report", report)
-    return written
-
-
-def test_a_report_can_be_omitted_and_written_later(tmp_path: Path, reported: list[Path]) -> None:
-    settings = [word for setting in SHORT for word in ("--set", setting)]
-    done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
-    assert done.exit_code == 0, done.output
-    assert "report.html" not in done.stdout
-    assert reported == []
-    assert noack("report", "--runs", str(tmp_path)).exit_code == 0
-    assert reported == [(tmp_path / "latest").resolve()]
+    reader = rerun.chunk.RrdReader(run_dir / "recording.rrd")
+    (store,) = reader.recordings()
+    paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
+    assert {blueprint.EVENT, blueprint.INPUT} <= paths
+    assert not [path for path in paths if path.startswith("lateness")]
 
 
 def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
@@ -83,15 +65,6 @@ def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
     assert loaded.kind == again.kind == "simulated"
     assert loaded.reports == again.reports
     assert loaded.notices == again.notices
-
-
-def test_the_recording_of_a_simulated_run_has_no_lateness(runs: Path) -> None:
-    reader = rerun.chunk.RrdReader(runs / "latest" / "recording.rrd")
-    (store,) = reader.recordings()
-    paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
-    assert blueprint.EVENT in paths
-    assert blueprint.INPUT in paths
-    assert not [path for path in paths if path.startswith("lateness")]
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
@@ -109,14 +82,12 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
 
 
 def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "old"
-    folder.mkdir()
     for path in (runs / "latest").iterdir():
-        (folder / path.name).symlink_to(path)
-    (folder / "environment.json").unlink()
-    assert load_record(folder).kind == "live"
-    write_environment(folder, "simulated")
-    assert load_record(folder).kind == "simulated"
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / "environment.json").unlink()
+    assert load_record(tmp_path).kind == "live"
+    write_environment(tmp_path, "simulated")
+    assert load_record(tmp_path).kind == "simulated"
 
 
 def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:

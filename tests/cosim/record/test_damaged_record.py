@@ -29,51 +29,30 @@ def run_dir(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def change(run_dir: Path, do: Callable[[pa.Table], pa.Table]) -> None:
-    path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
-    pq.write_table(do(pq.read_table(path)), path)
+COLUMNS: list[tuple[Callable[[int], Any], str]] = [
+    (lambda n: pa.array(["0"] * n), "column t_ns is not one of int64"),
+    (lambda n: pa.array([0.5] * n), "column t_ns is not one of int64"),
+    (lambda n: pa.array([None] + [0] * (n - 1), pa.int64()), "column t_ns has holes"),
+]
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        (lambda n: pa.array(["0"] * n), "column t_ns is not one of int64"),
-        (lambda n: pa.array([0.5] * n), "column t_ns is not one of int64"),
-        (lambda n: pa.array([None] + [0] * (n - 1), pa.int64()), "column t_ns has holes"),
-    ],
-)
-def test_a_column_of_another_type_or_with_missing_values_is_refused(
-    run_dir: Path, values: Callable[[int], Any], expected: str
-) -> None:
-    change(
-        run_dir,
-        lambda table: table.set_column(
-            table.column_names.index("t_ns"), "t_ns", values(len(table))
-        ),
-    )
-    with pytest.raises(CallerError, match=expected):
-        load_record(run_dir)
-
-
-def test_a_repeated_column_is_refused(run_dir: Path) -> None:
-    change(run_dir, lambda table: table.append_column("t_ns", table["t_ns"]))
+def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None:
+    path, reports = run_dir / RECORD / f"{PLANT_STEP}.parquet", run_dir / REPORTS_FILE
+    whole, given = pq.read_table(path), json.loads(reports.read_text())
+    text = {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}}
+    for report in (None, [], {"rows": {}}, text):
+        reports.write_text(json.dumps(given | {"plant": report}))
+        record = load_record(run_dir)
+        assert record.reports.keys() == {"sensor", "netem", "controller"}
+        assert summarise(record, 0, "").to_json()["missing_samples"] == 0
+    number = whole.column_names.index("t_ns")
+    for values, expected in COLUMNS:
+        pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
+        with pytest.raises(CallerError, match=expected):
+            load_record(run_dir)
+    pq.write_table(whole.append_column("t_ns", whole["t_ns"]), path)
     with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
         load_record(run_dir)
-
-
-@pytest.mark.parametrize(
-    "report",
-    [
-        None, [], {}, {"rows": {}}, {"ended": "horizon", "channel": {}, "rows": {"plant_step": 1}},
-        {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}},
-    ],
-)  # fmt: skip
-def test_an_invalid_report_is_ignored(run_dir: Path, report: object) -> None:
-    path = run_dir / REPORTS_FILE
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"plant": report}))
-    record = load_record(run_dir)
-    assert record.reports.keys() == {"sensor", "netem", "controller"}
-    assert json.loads(summarise(record, 0, "").model_dump_json())["missing_samples"] == 0
 
 
 def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:

@@ -36,8 +36,3 @@ def test_each_column_keeps_its_extremes_and_its_ends(
             assert np.nanmax(y[kept]) >= seen.max()
     assert keep[0] == 0
     assert keep[-1] == len(y) - 1
-
-
-def test_samples_at_one_instant_are_all_one_column() -> None:
-    keep = decimate(np.zeros(100), np.arange(100.0), 5)
-    assert keep.tolist() == [0, 99]

@@ -47,15 +47,11 @@ def test_an_unstable_loop_has_diverged(content: dict[str, Any], rate_per_s: floa
     assert 0 < found.at_s < 10
     assert "still growing at the end" in found.text
     assert "\n" not in found.text
-
-
-def test_a_state_that_is_not_finite_has_diverged(content: dict[str, Any]) -> None:
-    x = exponential(-1.0)
+    x = exponential(-rate_per_s)
     x[300:, 1] = np.inf
     found = diverged(x, [scenario(content)])
     assert found is not None
-    assert found.at_s == T_S[300]
-    assert found.text == f"diverged: x is not finite at {T_S[300]:g} s"
+    assert (found.at_s, found.text) == (3.0, "diverged: x is not finite at 3 s")
 
 
 def shapes() -> dict[str, Matrix]:
@@ -111,9 +107,6 @@ def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     stopped = summarise(simulate(resolved), 130, "stopped by the user (SIGINT)").to_json()
     assert stopped["exit"] == {"status": 130, "reason": "stopped by the user (SIGINT)"}
     assert stopped["diverged_at_s"] == sampled["diverged_at_s"]
-
-
-def test_a_run_too_short_to_show_divergence_does_not_fail(content: dict[str, Any]) -> None:
-    found = summarise(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
-    assert found["final_state_norm"] < GROWTH * found["initial_state_norm"]
-    assert (found["exit"]["status"], found["diverged_at_s"]) == (0, None)
+    short = summarise(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
+    assert short["final_state_norm"] < GROWTH * short["initial_state_norm"]
+    assert (short["exit"]["status"], short["diverged_at_s"]) == (0, None)

@@ -40,15 +40,6 @@ def require_root() -> None:
         pytest.skip("only root may give a file to another user")
 
 
-def test_latest_is_the_target_of_the_link(runs: Path) -> None:
-    with pytest.raises(CallerError, match="no run yet"):
-        latest_run(runs)
-    for name in ("first", "second"):
-        point_to_latest(runs / name)
-        assert latest_run(runs) == chosen_run(runs / LATEST, runs) == (runs / name).resolve()
-    assert chosen_run(runs / "first", runs) == runs / "first"
-
-
 @pytest.mark.parametrize("whose", ["link", "run"])
 def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
     require_root()
@@ -87,13 +78,10 @@ def test_a_link_that_cannot_be_replaced_is_reported(runs: Path) -> None:
     assert sorted(path.name for path in runs.iterdir()) == ["first", "latest", "second"]
 
 
-def test_a_folder_whose_name_is_not_utf_8_is_refused(tmp_path: Path) -> None:
+def test_names_of_folders_and_of_files_of_loops(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"r\xff")
     for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
         with pytest.raises(CallerError, match="is not UTF-8; rename it"):
             refused()
-
-
-def test_the_files_of_a_loop_have_its_name() -> None:
     for name in (None, "a", "b-1"):
         assert loop_of_file(file_of_loop("report.html", name), "report.html") == name

@@ -1,17 +1,17 @@
-"""The acknowledgement baseline in the whole loop in virtual time, and in replay."""
+"""Loops whose controller sends over the network: acknowledgements or actuations."""
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.replay import replay
+from cosim.analysis.loop_statistics import from_controller, unintended_losses
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
@@ -23,31 +23,21 @@ from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
-    NETEM_RELEASE,
-    NO_SEQUENCE,
+    PLANT_ACTUATION,
     SENSOR_ACKNOWLEDGEMENT,
-    SENSOR_MEASUREMENT,
     UPDATES,
     Fate,
 )
+from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
-from tests.cosim.record.changed_records import flipped
+from tests.cosim.record.changed_records import changed
 from tests.oracles.link import Link
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
-MESSY = (
-    "network.loss.probability=0.3",
-    'network.impairments=[{kind="delay", delay_s=0.01, jitter_s=0.02},'
-    ' {kind="duplicate", probability=0.3}, {kind="corrupt", probability=0.2}]',
-    'network.acknowledgements={timeout_s=0.05, loss={model="bernoulli", probability=0.3},'
-    ' impairments=[{kind="delay", delay_s=0.01, jitter_s=0.02},'
-    ' {kind="duplicate", probability=0.3}, {kind="corrupt", probability=0.2}]}',
-    "trigger.beta=0.02",
-)
 
 
 def acknowledged(*overrides: str) -> Scenario:
@@ -61,16 +51,6 @@ def plain(*overrides: str) -> Scenario:
 @cache
 def run_of(*overrides: str) -> RunRecord:
     return simulate(acknowledged(*overrides))
-
-
-@pytest.fixture(scope="module")
-def messy() -> RunRecord:
-    return run_of(*MESSY)
-
-
-def events(record: RunRecord) -> Any:
-    rows = record[SENSOR_MEASUREMENT]
-    return rows[rows["event"] != NO_SEQUENCE]
 
 
 def fates(record: RunRecord, flow: int) -> list[int]:
@@ -110,60 +90,17 @@ def test_the_cap_of_the_reverse_direction_holds() -> None:
     assert [Fate(fate).effective for fate in found] == [k % 3 == 2 for k in range(len(found))]
 
 
-def test_the_summary_counts_acknowledgements(messy: RunRecord) -> None:
-    for record in (messy, run_of()):
-        summary = summarise(record, 0, "horizon").to_json()
-        found = summary["acknowledgements"]
-        assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
-        assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
-        assert found["lost"] > 0
-        assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
-        assert summary["unintended_losses"] == summary["missing_samples"] == 0
-        assert summary["identity_residual_max"] is None
-    assert summarise(messy, 0, "horizon").to_json()["rejected_datagrams"]["sensor"].keys() <= {
-        "length", "version", "run", "flow", "loop", "tag", "stale",
-    }  # fmt: skip
+def test_the_summary_counts_acknowledgements() -> None:
+    record = run_of()
+    summary = summarise(record, 0, "horizon").to_json()
+    found = summary["acknowledgements"]
+    assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
+    assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
+    assert found["lost"] > 0
+    assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
+    assert summary["unintended_losses"] == summary["missing_samples"] == 0
+    assert summary["identity_residual_max"] is None
     assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
-
-
-def test_a_run_is_replayed_bit_for_bit(messy: RunRecord) -> None:
-    found = replay(messy)
-    assert found.bit_exact
-    assert found.gaps == []
-    assert found.inputs == sum(len(messy[table]) for table in messy.tables)
-    compared = {leg.leg: leg.compared for leg in found.messages}
-    packets = messy[NETEM_PACKET]
-    assert compared["sensor → netem"] == (packets["flow"] == UPDATES).sum() > 10
-    assert compared["controller → netem"] == (packets["flow"] == ACKNOWLEDGEMENTS).sum() > 10
-    assert compared["netem → sensor"] == len(messy[SENSOR_ACKNOWLEDGEMENT]) > 5
-    assert (messy[NETEM_RELEASE]["flow"] == ACKNOWLEDGEMENTS).any()
-
-
-@pytest.mark.parametrize("bit", [0, 62])
-def test_a_flipped_bit_of_an_acknowledgement_is_found(messy: RunRecord, bit: int) -> None:
-    rows = messy[SENSOR_ACKNOWLEDGEMENT]
-    for column in rows.dtype.names:
-        if column == "now_ns" and bit < 62:
-            continue  # nothing that the sensor does depends on it
-        other = flipped(messy, SENSOR_ACKNOWLEDGEMENT, len(rows) // 2, column, bit)
-        first = replay(other).first_difference
-        assert first is not None
-        if column not in ("input", "now_ns"):
-            assert first.table in (SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT)
-
-
-@pytest.mark.parametrize("flow", [UPDATES, ACKNOWLEDGEMENTS])
-@pytest.mark.parametrize("column", ["head", "fate", "flow", "size_bytes", "sequence"])
-def test_a_flipped_bit_of_a_packet_is_found_in_its_row(
-    messy: RunRecord, flow: int, column: str
-) -> None:
-    row = int(np.flatnonzero(messy[NETEM_PACKET]["flow"] == flow)[5])
-    # Two bits of the flow: one changes the direction, the other makes it invalid.
-    for bit in (0, 5) if column == "flow" else (0,):
-        first = replay(flipped(messy, NETEM_PACKET, row, column, bit)).first_difference
-        assert first is not None
-        assert first.table == NETEM_PACKET
-        assert column == "flow" or first.row == row
 
 
 def test_the_baseline_has_no_claims() -> None:
@@ -177,15 +114,62 @@ def test_the_baseline_has_no_claims() -> None:
     for refuse in (continuous_loop_of, lambda scenario: Certificates(scenario, 2)):
         with pytest.raises(CallerError, match=r'network\.protocol = "ack": x_s is reset'):
             refuse(record.scenario)
-
-
-def test_settings_of_the_reverse_direction_need_acknowledgements() -> None:
-    with pytest.raises(
-        CallerError, match=r"network\.acknowledgements.*there are none unless protocol"
-    ):
+    with pytest.raises(CallerError, match=r"network\.acknowledgements.*there are none unless"):
         plain("network.acknowledgements.timeout_s=0.1")
-
-
-def test_settings_of_the_reverse_direction_have_no_effect_with_protocol_none() -> None:
     back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
     assert not plain(*back).protocol.acknowledges
+
+
+# --- actuations over the network ------------------------------------------------------------------
+
+
+MESSY = """{mansd=2, loss={model="bernoulli", probability=0.4}, impairments=[
+ {kind="delay", delay_s=0.01, jitter_s=0.02}, {kind="duplicate", probability=0.3},
+ {kind="corrupt", probability=0.1}]}""".replace("\n", "")
+
+
+@pytest.fixture(scope="module")
+def messy() -> RunRecord:
+    return simulate(
+        resolve(
+            load(
+                SCENARIOS / "lane_following.toml",
+                [
+                    "plant.rate_hz=100", "controller.rate_hz=50", "horizon_s=6",
+                    f"network.actuation={MESSY}", "controller.predictions=4",
+                    'plant.watchdog.policy="model"', 'network.impairments=[{kind="delay", '
+                    "delay_s=0.01, jitter_s=0.02}]", "trigger.beta=0.05",
+                    "changes=[{at_s=2, set={'network.loss.probability'=0.3}}]",
+                ],
+            )
+        )
+    )  # fmt: skip
+
+
+def test_each_direction_has_its_own_losses_and_guarantee(messy: RunRecord) -> None:
+    updates, actuations = (packet_outcomes(messy, one) for one in messy.scenario.network.flows)
+    assert actuations.longest_loss_burst() == 2
+    assert updates.longest_loss_burst() in (3, 4)
+    part = from_controller(messy, Flow.ACTUATION)
+    assert part is not None
+    assert part.sent == len(actuations.lost) == 300
+    assert part.lost == actuations.lost.sum() > 90
+    assert set(messy[NETEM_PACKET]["flow"].tolist()) == {0, 1}
+    assert sum(unintended_losses(messy).values()) == 0
+
+
+@pytest.mark.parametrize(("after_end_ms", "lost"), [(90, 1), (120, 0)])
+def test_a_receiver_that_may_have_ended_loses_nothing(
+    messy: RunRecord, after_end_ms: int, lost: int
+) -> None:
+    """An actuation that was delayed leaves the emulator after the end, and does not arrive."""
+    received, packets = messy[PLANT_ACTUATION], messy[NETEM_PACKET].copy()
+    outcomes = packet_outcomes(messy, Flow.ACTUATION)
+    of_plant = np.isin(outcomes.sequence, received["sequence"])
+    delayed = np.flatnonzero(of_plant & (outcomes.due_ns > outcomes.now_ns))[-1]
+    place = np.flatnonzero(packets["flow"] == 1)[delayed]
+    assert packets["bit"][place] == -1
+    packets["release_ns"][place] = messy.scenario.timing.horizon_ns + after_end_ms * 10**6
+    others = received[received["sequence"] != outcomes.sequence[delayed]]
+    late = changed(messy, {PLANT_ACTUATION: others, NETEM_PACKET: packets})
+    assert sum(unintended_losses(late).values()) == lost

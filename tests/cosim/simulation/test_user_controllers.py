@@ -40,8 +40,8 @@ def example(name: str, class_name: str, period_s: float, **parameters: Any) -> A
     return made
 
 
-def predictive(state_limit: float = LIMIT) -> Any:
-    limits = {"input_limit": [LIMIT], "state_limit": [0.0, state_limit]}
+def predictive() -> Any:
+    limits = {"input_limit": [LIMIT], "state_limit": [0.0, LIMIT]}
     return example("model_predictive", "ModelPredictive", 0.05, horizon=30, **limits)
 
 
@@ -51,15 +51,11 @@ def discrete_gain(period_s: float) -> np.ndarray:
     return gain
 
 
-def test_the_saturated_regulator_has_another_packages_gain_within_its_limits() -> None:
+def test_the_regulators_have_another_packages_gain_within_their_limits() -> None:
     law = example("saturated_lqr", "SaturatedLqr", 0.01, limit=[LIMIT])
     x = np.array([0.1, 0.05])
     assert law.on_tick(0.0, x) == pytest.approx(-discrete_gain(0.01) @ x, rel=1e-9)
     assert law.on_tick(0.0, np.array([9.0, 0.0])).tolist() == [-LIMIT]
-
-
-def test_the_predictive_controller_without_active_limits_is_the_regulator() -> None:
-    x = np.array([0.1, 0.05])
     assert predictive().solve(x)[0] == pytest.approx((-discrete_gain(0.05) @ x)[0], rel=1e-6)
 
 
@@ -79,31 +75,15 @@ def test_the_predictive_controller_solves_its_quadratic_programme(x: tuple[float
     np.testing.assert_allclose(law.solve(x0), found.x, atol=1e-4)
 
 
-def test_input_limits_hold_if_state_limits_are_infeasible() -> None:
-    z = predictive().solve(np.array([0.0, 5.0]))  # ten times the velocity limit
-    assert z[0] == pytest.approx(-LIMIT)
-    assert (np.abs(z) <= LIMIT * (1 + 1e-9)).all()
-
-
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_run_keeps_the_class_and_is_replayed_bit_for_bit(name: str, tmp_path: Path) -> None:
-    folder = tmp_path / "given"
-    folder.mkdir()
     for suffix in (".py", ".toml"):
-        (folder / f"{name}{suffix}").write_bytes((SCENARIOS / f"{name}{suffix}").read_bytes())
-    ending = simulate_run(load(folder / f"{name}.toml", ["horizon_s=2.0"]), tmp_path / "runs")
+        (tmp_path / f"{name}{suffix}").write_bytes((SCENARIOS / f"{name}{suffix}").read_bytes())
+    ending = simulate_run(load(tmp_path / f"{name}.toml", ["horizon_s=2.0"]), tmp_path / "runs")
     assert ending.status == ExitStatus.OK
-    (folder / f"{name}.py").unlink()
-    record = load_record(ending.run_dir)
+    (tmp_path / f"{name}.py").unlink()
     assert (ending.run_dir / "controller" / f"{name}.py").is_file()
-    assert replay(record).bit_exact
-
-
-def test_uncovered_theory_is_named_in_one_line() -> None:
-    coverage = resolve(load(SCENARIOS / "saturated_lqr.toml")).coverage
-    assert coverage.beyond_theory == 'controller.kind = "python": u is not K x_c'
-    with pytest.raises(CallerError, match=r"^controller\.kind = .*: u is not K x_c; this needs"):
-        coverage.require_exact()
+    assert replay(load_record(ending.run_dir)).bit_exact
 
 
 @pytest.mark.parametrize(
@@ -111,16 +91,18 @@ def test_uncovered_theory_is_named_in_one_line() -> None:
     [
         ("controller.setpoint=[1.0, 0.0]", 'controller.setpoint.*: not with controller.kind = "py'),
         ("plant.watchdog.policy=model", 'plant.watchdog.policy.*"model" predicts u = K x_c; not'),
-        ("controller.kind=pyton", "controller.kind.*must be one of linear, python; did you mean"),
         ("controller.file=nothing.py", "controller.file = .nothing.py.: cannot be read: No such"),
         ("controller.name=Other", "controller.name = .Other.: LookupError: saturated_lqr.py has"),
         ("controller.parameters={}", "SaturatedLqr.: TypeError: .*missing 3 required positional"),
     ],
 )
 def test_mistakes_in_the_settings_give_one_line(setting: str, message: str) -> None:
+    path = SCENARIOS / "saturated_lqr.toml"
     with pytest.raises(CallerError, match=message) as refused:
-        simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", [setting])))
+        simulate(resolve(load(path, [setting])))
     assert "\n" not in str(refused.value)
+    with pytest.raises(CallerError, match=r"^controller\.kind = .*: u is not K x_c; this needs"):
+        resolve(load(path)).coverage.require_exact()
 
 
 CODE = """
@@ -155,7 +137,6 @@ def run_of(tmp_path: Path, **methods: str) -> RunRecord:
         ({"on_tick": "x_c[0] = 1.0"}, "assignment destination is read-only (law.py, line 10)"),
         ({"on_update": "raise KeyError('x')"}, "KeyError: 'x' (law.py, line 7)"),
         ({"on_tick": "raise SystemExit(3)"}, "SystemExit: 3 (law.py, line 10)"),
-        ({"on_tick": "import noack; noack.load('no')"}, "CallerError: no: no such file"),
     ],
 )
 def test_the_safe_input_is_sent_after_a_control_law_fails(
@@ -168,18 +149,4 @@ def test_the_safe_input_is_sent_after_a_control_law_fails(
     assert set(record[CONTROLLER_STEP]["u"][:, 0]) <= {0.0, 0.25}
     assert record[CONTROLLER_STEP]["u"][-1] == 0.25
     end = summarise(record, ExitStatus.OK, "").exit
-    assert end.status == ExitStatus.FAILED
-    assert message in end.reason
-
-
-def test_the_control_law_receives_each_update_with_its_own_time(tmp_path: Path) -> None:
-    methods = {
-        "on_update": "self.updates.append((t_s, *x))",
-        "on_tick": "return [self.updates[-1][0]]",  # the time of the newest update, as the input
-    }
-    record = run_of(tmp_path, **methods)
-    deliveries, steps = record["controller_delivery"], record[CONTROLLER_STEP]
-    for row in steps[1:]:
-        received = deliveries["t_ns"][deliveries["now_ns"] <= row["now_ns"]]
-        if len(received):
-            assert row["u"][0] == pytest.approx(received.max() * 1e-9)
+    assert (end.status, message in end.reason) == (ExitStatus.FAILED, True)

@@ -1,23 +1,20 @@
-"""Simulated runs against hand calculation and each other; more in integration/test_run.py."""
+"""Simulated runs: violations, long runs, and a controller that stands still."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cosim.analysis.fidelity import IncomparableError, live_run
+from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import RowMemory, simulate
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    NETEM_PACKET,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import validate
-
-MS = 1_000_000
+from noack.scenario.scenario_file import load, validate
+from tests.cosim.live.outage import CASES, SCENARIOS, row, with_outage
 
 
 @pytest.fixture
@@ -29,21 +26,6 @@ def busy_content(content: dict[str, Any]) -> dict[str, Any]:
     content["controller"] = {"rate_hz": 100.0}
     content["trigger"]["beta"] = 0.01
     return content
-
-
-@pytest.fixture
-def busy(busy_content: dict[str, Any]) -> Scenario:
-    return resolve(validate(busy_content, "test"))
-
-
-def equal(one: RunRecord, other: RunRecord) -> bool:
-    return all(one[table].tobytes() == other[table].tobytes() for table in one.tables)
-
-
-def test_a_perfect_network_is_the_lossless_one(busy_content: dict[str, Any]) -> None:
-    busy_content["network"]["loss"] = {"model": "lossless"}
-    lossless = resolve(validate(busy_content, "test"))
-    assert equal(simulate(lossless), simulate(lossless, lambda data, now_ns: 0))
 
 
 def test_the_controller_reports_a_violated_assumption(busy_content: dict[str, Any]) -> None:
@@ -75,21 +57,18 @@ def test_a_violation_without_a_later_delivery_is_reported(busy_content: dict[str
     assert summary["longest_loss_burst"] == len(event_ns) - 1 > 2
 
 
-def test_progress_is_reported_during_a_run(busy: Scenario) -> None:
-    reported_ns: list[int] = []
-    longer = busy.model_copy(update={"horizon_s": 25.0})
-    simulate(longer, progress=reported_ns.append)
-    assert len(reported_ns) > 2
-    assert reported_ns == sorted(reported_ns)
-    assert 0 <= reported_ns[0] < reported_ns[-1] <= longer.timing.horizon_ns
-
-
-def test_each_packet_of_a_long_run_is_recorded_once(busy_content: dict[str, Any]) -> None:
+def test_each_packet_of_a_long_run_is_recorded_once_and_progress_is_reported(
+    busy_content: dict[str, Any],
+) -> None:
     """The network's memory for rows is full three times."""
     busy_content["trigger"] = {"policy": "periodic", "period_s": 0.01}
     busy_content["horizon_s"] = 150.0
-    record = simulate(resolve(validate(busy_content, "test")))
+    reported_ns: list[int] = []
+    record = simulate(resolve(validate(busy_content, "test")), progress=reported_ns.append)
     assert record[NETEM_PACKET]["input"].tolist() == list(range(15_001))
+    assert len(reported_ns) > 2
+    assert reported_ns == sorted(reported_ns)
+    assert 0 <= reported_ns[0] < reported_ns[-1] <= record.scenario.timing.horizon_ns
 
 
 def test_no_two_tables_share_memory() -> None:
@@ -99,3 +78,40 @@ def test_no_two_tables_share_memory() -> None:
     for number, rows in enumerate(tables):
         rows["b"] = number
     assert all((rows["b"] == number).all() for number, rows in enumerate(tables))
+
+
+# --- a controller that stands still ---------------------------------------------------------------
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+@pytest.fixture(scope="module", params=["hold", "zero", "model"])
+def run(request: pytest.FixtureRequest) -> RunRecord:
+    """The controller stands still from 1 s to 1.4 s; its last tick before that is at 0.999 s."""
+    changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
+    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", changes)), 1.0, 1.4)
+
+
+def test_the_beginning_and_end_of_a_trip_are_reported_and_replayed(run: RunRecord) -> None:
+    trips = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
+    assert trips == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
+    policy = run.scenario.plant.watchdog.policy
+    assert summarise(run, 0, "horizon").to_json()["watchdog"] == {
+        "policy": policy, "timeout_s": pytest.approx(0.1), "trips": 1,
+        "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
+    }  # fmt: skip
+    assert replay(run).bit_exact
+    if policy == "hold":
+        live_run(run)
+        return
+    with pytest.raises(IncomparableError, match="no watchdog and no safe input"):
+        live_run(run)
+
+
+def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
+    """One row is simulated again; `python -m tests.cosim.live.outage` prints all rows."""
+    text = (DOCS / "scenarios.md").read_text()
+    assert row(*CASES[4]) in text.splitlines()
+    for name, mode, lasts_s in CASES:
+        assert f"| `{name}`, `{mode}` | {lasts_s:g} s |" in text

@@ -1,6 +1,5 @@
 """The loop on the plant's grid, against step-by-step exponentials and against the machines."""
 
-import itertools
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from cosim.analysis.fidelity import live_run
-from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import ContinuousLoop
 from cosim.simulation.plant_grid_loop import PlantGridLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
@@ -20,6 +18,7 @@ from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import LoopMatrices, policy_of, resolve
 from noack.scenario.scenario_file import validate
 from noack.trigger.trigger_rule import TriggerRule
+from tests.oracles.random_scenarios import POLICIES, random_scenario
 from tests.trigger_rules import decaying_rule
 
 PERIOD_NS = 10_000_000
@@ -130,82 +129,31 @@ def test_it_is_what_one_exponential_after_another_gives(delay: bool, case: Case)
     np.testing.assert_allclose(x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def policies(n: int) -> list[dict[str, Any]]:
-    """One policy of each kind, with a rule that is met occasionally."""
-    form = np.kron(np.diag([-0.01, 1.0]), np.eye(n))
-    watched: list[dict[str, Any]] = [
-        {"beta": 0.01, "alpha_per_s": 0.3},
-        {"beta": 0.1, "alpha_per_s": 0.3},
-        {"policy": "absolute", "delta": 0.05},
-        {"policy": "relative", "sigma": 0.1, "weight": np.diag(np.arange(1.0, n + 1)).tolist()},
-        {"policy": "mixed", "sigma": 0.05, "epsilon": 0.02},
-        {"policy": "lyapunov", "rate_per_s": 0.1},
-        {
-            "policy": "dynamic",
-            "sigma": 0.3,
-            "theta_s": 0.1,
-            "decay_per_s": 0.5,
-            "eta_0": 0.01,
-        },
-    ]
-    timed = [
-        {"policy": "quadratic", "Q": form.tolist(), "period_s": 0.06, "heartbeat": 3},
-        {"policy": "periodic", "period_s": 0.13},
-        {"policy": "self_triggered", "beta": 0.1, "alpha_per_s": 0.3, "growth_per_s": 1.0,
-         "mismatch_per_s": 1.0, "shortest_s": 0.02, "longest_s": 0.5},
-    ]  # fmt: skip
-    combined = [
-        {"policy": kind, "rule": rule, "interval_s": 0.055}
-        for kind, rule in itertools.product(("deadline", "dwell"), watched[-2:])
-    ]
-    return [*watched, *timed, *combined]
+def comparable(number: int) -> dict[str, Any]:
+    """A random scenario without what the loop on the plant's grid does not have."""
+    content = random_scenario(number)
+    plant, network, controller = content["plant"], content["network"], content["controller"]
+    for section, keys in (
+        (content, ("observer", "changes")),
+        (plant, ("disturbances", "measurement", "watchdog")),
+        (network, ("protocol", "acknowledgements", "actuation")),
+        (controller, ("setpoint", "safe_input", "predictions")),
+    ):
+        for key in keys:
+            section.pop(key, None)
+    return content
 
 
-@st.composite
-def records(draw: st.DrawFn) -> RunRecord:
-    """Machines in virtual time: losses, delays, reordering, all kinds of rates and phases."""
-    n = draw(st.integers(1, 3))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    A, B, K = (rng.uniform(-1, 1, shape) for shape in ((n, n), (n, 1), (1, n)))
-    trigger = draw(st.sampled_from(policies(n)))
-    A -= (np.linalg.eigvals(A + B @ K).real.max() + 0.2) * np.eye(n)  # for a Lyapunov function
-    mismatch = draw(st.sampled_from([0.0, 0.3]))
-    content = {
-        "name": "random",
-        "mode": draw(st.sampled_from(["model", "zoh"])),
-        "horizon_s": 1.0,
-        "model": {"A": A.tolist(), "B": B.tolist(), "gain": K.tolist()},
-        "plant": {
-            "initial_state": rng.uniform(-1, 1, n).tolist(),
-            "draw": "given",
-            "A": (A + mismatch * rng.uniform(-1, 1, (n, n))).tolist(),
-            "B": B.tolist(),
-            "rate_hz": 100.0,
-            "measure_every": draw(st.sampled_from([1, 2])),
-        },
-        "controller": {
-            "rate_hz": draw(st.sampled_from([50.0, 100.0, 250.0])),
-            "phase": draw(st.sampled_from([0.0, 0.3, 0.5])),
-        },
-        "trigger": trigger,
-        "network": {
-            "mansd": 2,
-            "loss": {"model": "lossless"},
-            "initial_sync": draw(st.sampled_from(["first_packet", "known_state"])),
-        },
-    }
-    delays = st.lists(st.one_of(st.none(), st.integers(0, 5 * PERIOD_NS)), min_size=1, max_size=6)
-    pattern = itertools.cycle(draw(delays))
-    return simulate(resolve(validate(content, "test")), lambda data, now_ns: next(pattern))
-
-
-@given(records())
-@settings(max_examples=35)
-def test_with_all_effects_it_is_what_the_machines_do(record: RunRecord) -> None:
-    live = live_run(record)
-    system = ContinuousLoop(record.loop, policy_of(record.scenario))
-    known = record.scenario.network.initial_sync == "known_state"
-    run = PlantGridLoop(system, live.schedule, known_start=known).run(delay=True, hold=True)
-    expected = record[PLANT_STEP]["x"][: len(run.x)]
-    np.testing.assert_allclose(run.x, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
-    np.testing.assert_allclose(run.event_steps * (PERIOD_NS * 1e-9), live.event_s, rtol=1e-12)
+@pytest.mark.parametrize("first", range(len(POLICIES)))
+def test_with_all_effects_it_is_what_the_machines_do(first: int) -> None:
+    """Losses, delays, reordering, all kinds of rates and phases."""
+    for number in range(first, 6 * len(POLICIES), len(POLICIES)):
+        record = simulate(resolve(validate(comparable(number), "random")))
+        live = live_run(record)
+        system = ContinuousLoop(record.loop, policy_of(record.scenario))
+        known = record.scenario.network.initial_sync == "known_state"
+        run = PlantGridLoop(system, live.schedule, known_start=known).run(delay=True, hold=True)
+        expected = record[PLANT_STEP]["x"][: len(run.x)]
+        np.testing.assert_allclose(run.x, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        period_s = record.scenario.timing.plant_period_ns * 1e-9
+        np.testing.assert_allclose(run.event_steps * period_s, live.event_s, rtol=1e-12)

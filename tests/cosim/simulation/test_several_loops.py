@@ -1,0 +1,185 @@
+"""Several loops on one network in virtual time, against the same loops alone and the link's law."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.analysis.replay.machine_replay import SharedMachines
+from cosim.record.record_source import NetworkRows, RowsInMemory
+from cosim.record.run_record import RecordedRun, RunRecord
+from cosim.shipped_files import find_shipped
+from cosim.simulation.virtual_time import simulate, simulate_loops
+from noack.protocol.machine_interface import GENERATION
+from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
+from noack.protocol.wire_format import datagram_bytes
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import loop_names, loops_of, phases_ns
+from noack.scenario.scenario_file import load, validate
+from tests.cosim.record.changed_records import changed
+
+Content = dict[str, Any]
+UDP_AND_IP_BYTES = 28
+DIFFERENT = find_shipped("different_loops", "scenarios")
+"""Loops of different plants, sizes and rates; the double integrator is in another file."""
+
+NETWORKS: dict[str, Sequence[str]] = {
+    "no losses": ('network.loss={ model = "lossless" }',),
+    "numbered losses": ('network.loss={ model = "periodic", period = 3, burst = 2 }',),
+    "most losses and a delay": (
+        'network.loss={ model = "worst_case" }',
+        'network.impairments=[{ kind = "delay", delay_s = 0.011 }]',
+    ),
+    "lost actuations": (
+        'network.loss={ model = "lossless" }',
+        'network.actuation={ mansd = 2, loss = { model = "periodic", period = 4, burst = 1 } }',
+    ),
+}  # fmt: skip
+"""Networks that decide for each flow alone, without a draw."""
+
+
+def same(alone: RunRecord, record: RunRecord) -> None:
+    """Compare all rows; the heads of the packets have the loop's number."""
+    for table in alone.tables:
+        for name in alone[table].dtype.names or ():
+            if name != "head":
+                assert alone[table][name].tobytes() == record[table][name].tobytes(), (table, name)
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_each_loop_has_the_bits_of_the_loop_alone(network: str) -> None:
+    given = load(DIFFERENT, ["horizon_s=4.0"])
+    other = load(DIFFERENT.with_name("lane_following.toml"), NETWORKS[network]).network
+    scenario = given.model_copy(update={"network": other})
+    run = simulate_loops(scenario)
+    for own, record in zip(loops_of(scenario), run.loops, strict=True):
+        same(simulate(resolve(own)), record)
+
+
+def test_a_change_applies_to_loops_of_all_sizes_at_its_time() -> None:
+    change = 'changes=[{ at_s = 2.0, set = { mansd = 1, "trigger.beta" = 0.001 } }]'
+    entries = 'loops=[{ name = "lane" }, { name = "slow", plant = { rate_hz = 50.0 } }]'
+    run = simulate_loops(load(DIFFERENT, ["horizon_s=4.0", entries, change]))
+    phases = dict(zip(loop_names(run.scenario), phases_ns(run.scenario), strict=True))
+    for record in run.loops:
+        (row,) = record["sensor_setting"]
+        assert row["since_ns"] == max(2_000_000_000 - phases[record.scenario.name], 0)
+        assert replay(record).bit_exact
+
+
+@pytest.fixture
+def short(content: Content) -> Content:
+    """Two seconds at 100 Hz, with plants that are drawn and disturbed at random."""
+    content["horizon_s"] = 2.0
+    content["plant"] |= {
+        "rate_hz": 100.0,
+        "draw": "uniform", "uncertainty_A": [[0.0, 0.0], [0.5, 0.5]],
+        "initial_state_halfwidth": [0.5, 0.5],
+        "disturbances": [{"kind": "uniform", "bound": [0.5]}],
+    }  # fmt: skip
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"]["beta"] = 0.01
+    return content
+
+
+def run(content: Content, *loops: Content) -> RecordedRun:
+    return simulate_loops(validate(content | {"loops": list(loops)}, "here"))
+
+
+@pytest.mark.parametrize("protocol", ["none", "ack"])
+@pytest.mark.parametrize("delay", [[], [{"kind": "delay", "delay_s": 0.012, "jitter_s": 0.009}]])
+def test_the_first_loop_is_the_run_without_loops(
+    short: Content, protocol: str, delay: list[Content]
+) -> None:
+    """Losses and delays are drawn per flow: other loops do not change the first."""
+    short["network"] |= {"protocol": protocol, "impairments": delay}
+    alone = simulate(resolve(validate(short, "here")))
+    assert len(alone[NETEM_PACKET]) > 10
+    only = run(short, {"name": "only"}).loops[0]
+    assert all(only[t].tobytes() == alone[t].tobytes() for t in alone.tables)
+    assert (only.notices, only.reports) == (alone.notices, alone.reports)
+    if protocol == "none":  # the flow of an acknowledgement has another number among four loops
+        same(alone, run(short, {"name": "a", "count": 4}).loops[0])
+
+
+@pytest.fixture
+def crowded(short: Content) -> Content:
+    """20 loops send more than twice what the bottleneck carries."""
+    size_bits = 8 * (datagram_bytes(2) + UDP_AND_IP_BYTES)
+    rate_bps = 20 * 20 * size_bits * 2 // 5
+    short["network"] |= {
+        "mansd": 3,
+        "loss": {"model": "bernoulli", "probability": 0.1},
+        "impairments": [{"kind": "rate", "rate_bps": rate_bps, "queue": 5}],
+    }
+    short["trigger"] = {"policy": "periodic", "period_s": 0.05}
+    return short
+
+
+def test_the_guarantee_holds_per_loop_when_the_shared_queue_overflows(crowded: Content) -> None:
+    """All packets leave one after the other: the gaps are at least their transmission time."""
+    shared = run(crowded, {"name": "a", "count": 20})
+    fates = shared.network[NETEM_PACKET]["fate"]
+    assert (fates == Fate.OVERFLOWED).sum() > 100
+    assert (fates == Fate.FORCED).sum() > 10
+    longest = []
+    for one in shared.loops:
+        lost = ~np.isin(one[NETEM_PACKET]["fate"], (Fate.DELIVERED, Fate.FORCED))
+        runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], lost, [0]]))))[::2]
+        longest.append(int(runs.max(initial=0)))
+    assert max(longest) == 3
+    left_ns = np.sort(shared.network[NETEM_RELEASE]["t_ns"])
+    (rate,) = crowded["network"]["impairments"]
+    gap_ns = 8 * (datagram_bytes(2) + UDP_AND_IP_BYTES) * 10**9 // rate["rate_bps"]
+    gaps_ns = np.diff(left_ns)
+    assert len(left_ns) > 200
+    assert gaps_ns.min() >= gap_ns
+    # The link is loaded above its rate: it is hardly ever idle.
+    assert (gaps_ns <= gap_ns + 1).mean() > 0.95
+
+
+def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
+    shared = run(crowded, {"name": "a", "count": 3}, {"name": "b", "mode": "zoh"})
+    found = replay(shared.network)
+    assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 1)
+    machines = SharedMachines(shared.loops)
+    for record in shared.loops:
+        found = replay(record, machines)
+        assert found == replay(record)
+        assert (found.bit_exact, found.gaps, len(found.processes)) == (True, [], 3)
+        assert all(hop.compared > 20 for hop in found.messages)
+    packets = shared.network[NETEM_PACKET].copy()
+    packets["release_ns"][-1] += 1
+    assert replay(changed(shared.network, {NETEM_PACKET: packets})).bit_exact is False
+    packets = shared.loops[2][NETEM_PACKET].copy()
+    head = bytearray(packets["head"][3].tobytes())
+    head[6] = 1  # the number of another loop
+    packets["head"][3] = bytes(head)
+    other = changed(shared.loops[2], {NETEM_PACKET: packets})
+    found = replay(other)
+    assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
+    assert found.first_difference is not None
+    assert found.first_difference.column == "head"
+
+
+def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -> None:
+    scenario = validate(crowded | {"loops": [{"name": "a", "count": 3}]}, "here")
+    network = simulate_loops(scenario).network
+    rows = {table: network[table].copy() for table in network.tables}
+    # The second half is of a restarted emulator.
+    halves = {one: rows[one]["now_ns"] > 10**9 for one in (NETEM_PACKET, NETEM_RELEASE)}
+    first = min(rows[one]["input"][half].min() for one, half in halves.items())
+    for table, half in halves.items():
+        rows[table]["input"][half] += GENERATION - first
+    for missing in (0, 2):
+        rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
+        found = NetworkRows(RowsInMemory(rows), phases_ns(scenario))
+        for loop in range(len(phases_ns(scenario))):
+            batches = (one["input"] for table in rows for one in found.of_loop(table, loop))
+            inputs = np.sort(np.concatenate([*batches]))
+            for generation in (0, 1):
+                numbers = inputs[inputs // GENERATION == generation] % GENERATION
+                assert numbers[0] == 0
+                assert (np.diff(numbers) - 1).sum() == missing * (generation == 0)
