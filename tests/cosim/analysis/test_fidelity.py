@@ -1,13 +1,17 @@
-"""Fidelity: the difference to the ideal loop is explained if the record is the scenario's."""
+"""The difference to the ideal loop is explained if the record is the scenario's; the commands."""
 
-import itertools
 import json
 import math
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner, Result
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import (
@@ -15,11 +19,12 @@ from cosim.analysis.fidelity import (
     IncomparableError,
     compute_fidelity,
     fidelity_for_summary,
-    live_run,
 )
 from cosim.analysis.summary_model import NoFidelityPart
+from cosim.cli import app
+from cosim.live.finalize import finalize
+from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -81,6 +86,7 @@ def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
     sampling, delay, held, _ = fidelity.stages
     at_rest = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
     assert (at_rest.explained, at_rest.explained_relative) == (True, 0.0)
+    assert "rounding" in at_rest.verdict
     assert fidelity.events_live == 0
     assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
     assert delay.difference.max == 0.0
@@ -88,25 +94,20 @@ def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
     assert held.max_event_difference_s is None
 
 
+def test_a_loop_that_amplifies_rounding_or_accumulates_events_is_not_compared() -> None:
+    """This rule does not tolerate the losses; a deviation grows between equal events."""
+    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
+    with pytest.raises(IncomparableError, match="turns rounding into another run"):
+        compute_fidelity(lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100"))
+    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
+    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
+        compute_fidelity(unstable, max_events=200)
+
+
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
     assert not compute_fidelity(changed(record, {PLANT_STEP: steps})).explained
-
-
-def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
-    waits_ns = itertools.cycle([10_000_000, 10_000_000, 30_000_000])
-    late = lane(lambda data, now_ns: next(waits_ns), "trigger.beta=0.02")
-    schedule = live_run(late).schedule
-    events = int(late[SENSOR_MEASUREMENT]["event"].max()) + 1
-    assert events > 6
-    fates = network_fates(late.scenario)
-    beyond = range(events, events + 50)
-    assert [schedule.delivered(i) for i in beyond] == [fates(i) for i in beyond]
-    assert {schedule.delivered(i) for i in beyond} == {True, False}
-    # 10 ms in flight, then 5 ms to the tick that uses it, or to the next step.
-    assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
-    assert {schedule.delay_steps(i) for i in beyond} == {2}
 
 
 @pytest.mark.parametrize(
@@ -170,3 +171,108 @@ def test_the_summary_has_the_comparison_or_the_reason(
     monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 10 * steps)
     assert fidelity_for_summary(record, loops=10) == bad
     assert "noack fidelity" in str(fidelity_for_summary(record, loops=11).reason)
+
+
+# --- noack replay and noack fidelity --------------------------------------------------------------
+
+
+COMMANDS = ("replay", "fidelity")
+
+
+def noack(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    scenario = load(LANE, ["horizon_s=1", "plant.rate_hz=50", "controller.rate_hz=50"])
+    finalize(simulate_run(scenario, folder), report=False, view=False)
+    return folder
+
+
+@pytest.fixture
+def runs(simulated: Path, tmp_path: Path) -> Path:
+    """An own folder of runs."""
+    return Path(shutil.copytree(simulated, tmp_path / "runs", symlinks=True))
+
+
+def rewrite(runs: Path, table: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    path = runs / "latest" / "record" / f"{table}.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def alter(runs: Path, table: str, column: str, by: float) -> None:
+    """Add a ramp to a column."""
+
+    def changed(rows: pa.Table) -> pa.Table:
+        values = rows[column].to_numpy() + np.linspace(0, by, len(rows))
+        return rows.set_column(rows.schema.get_field_index(column), column, pa.array(values))
+
+    rewrite(runs, table, changed)
+
+
+def test_the_last_run_is_replayed_and_compared_with_the_ideal_loop(simulated: Path) -> None:
+    for command, text in (("replay", "bit-exact: "), ("fidelity", "held actuation")):
+        done = noack(command, "--runs", simulated)
+        assert (done.exit_code, done.stderr) == (0, "")
+        assert text in done.stdout
+    document = json.loads(noack("replay", "--runs", simulated, "--json").stdout)
+    assert (document["bit_exact"], document["complete"]) == (True, True)
+    assert document["first_difference"] is None
+    assert document["inputs"] == sum(process["inputs"] for process in document["processes"])
+    assert document["changed_since"] == []
+    document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
+    assert document["explained"] is True
+    names = [stage["name"] for stage in document["stages"]]
+    assert names == ["sampling", "delay", "held actuation", "residual"]
+
+
+def test_a_difference_is_reported_and_fails(runs: Path) -> None:
+    alter(runs, "controller_step", "x_c_3", 1e-9)
+    path = runs / "latest/environment.json"
+    environment = json.loads(path.read_text())
+    environment["packages"]["numpy"] = "1.0"
+    path.write_text(json.dumps(environment))
+    done = noack("replay", "--runs", runs)
+    assert done.exit_code == 1
+    assert "controller_step row 1, x_c_3" in done.stdout
+    assert "0x1." in done.stdout
+    assert "numpy was 1.0, is " in done.stdout
+    done = noack("replay", "--runs", runs, "--json")
+    document = json.loads(done.stdout)
+    assert (done.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
+    assert len(document["changed_since"]) == 1
+
+
+def test_an_empty_record_and_an_unexplained_difference_fail(runs: Path) -> None:
+    alter(runs, "plant_step", "x_4", 1.0)
+    done = noack("fidelity", runs / "latest")
+    assert done.exit_code == noack("fidelity", runs / "latest", "--json").exit_code == 1
+    assert "too large" in done.stdout
+    for path in (runs / "latest/record").glob("*.parquet"):
+        rewrite(runs, path.stem, lambda rows: rows.slice(0, 0))
+    done = noack("replay", "--runs", runs)
+    assert done.exit_code == 1
+    assert "nothing to compare" in done.stdout
+
+
+STEPS = "record/plant_step.parquet"
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "no scenario": lambda runs: (runs / "latest/scenario.toml").unlink(),
+    "no record": lambda runs: shutil.rmtree(runs / "latest/record"),
+    "no table": lambda runs: (runs / "latest" / STEPS).unlink(),
+    "no Parquet": lambda runs: (runs / "latest" / STEPS).write_bytes(b"PAR1 no more"),
+    "no column": lambda runs: rewrite(runs, "plant_step", lambda rows: rows.drop_columns(["x_4"])),
+    "no run": lambda runs: (runs / "latest").unlink(),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_an_invalid_run_directory_gives_one_line(runs: Path, how: str) -> None:
+    DAMAGE[how](runs)
+    for command in COMMANDS:
+        done = noack(command, "--runs", runs)
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert done.stderr.startswith("noack: ")
+        assert done.stderr.count("\n") == 1

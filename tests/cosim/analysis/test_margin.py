@@ -73,6 +73,9 @@ def test_constraints_that_cap_the_losses_themselves() -> None:
     assert found.every_m
     assert found.stable_m == 2
     assert "every M ≥ 2" in found.verdict
+    assert found.to_json()["period"] is None
+    with pytest.raises(noack.NoackError, match="most_m 0: expected"):
+        noack.margin("lane_periodic", most_m=0)
 
 
 def test_events_at_unknown_times() -> None:
@@ -96,7 +99,6 @@ def test_events_at_unknown_times() -> None:
         (["double_integrator", *DEADLINE, "--play", "--no-period"], 2, "--play: the times between"),
         (["lane_periodic", "--play", "--json"], 2, "--play"),
         (["lane_periodic", "--play", "--most", "1", "--no-period"], 2, "no destabilising pattern"),
-        (["lane_periodic", "--most", "0"], 2, "--most"),
         (["lane_periodic", "--accuracy", "2"], 2, "accuracy 2: expected"),
         (["lane_periodic", "--set", "trigger.period_s=9", "--no-period"], 1, "destabilises M = 1"),
     ],

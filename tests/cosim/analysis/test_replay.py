@@ -6,6 +6,7 @@ The record is a simulated one; live records are replayed in tests/integration.
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
+from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -28,8 +30,10 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
+from noack.scenario.scenario_file import load, validate
+from tests.cosim.live.outage import Reborn, simulate_with
 from tests.cosim.record.changed_records import changed, flipped
+from tests.machine_parts import controller_of
 
 ROOT = Path(__file__).parents[3]
 SHORT = (
@@ -233,6 +237,32 @@ def test_a_recorded_measurement_after_the_runs_end_is_not_taken() -> None:
     assert sensor.difference is not None
     assert "cannot take this input" in sensor.difference.what
     assert sensor.compared == 20
+
+
+@pytest.mark.parametrize("ticks", [True, False])
+def test_an_update_before_the_first_tick_of_a_restarted_controller_is_replayed(
+    content: dict[str, Any], ticks: bool
+) -> None:
+    """Only the rows of the second generation are recorded."""
+    content |= {"trigger": {"policy": "periodic", "period_s": 0.002}}
+    resolved = resolve(
+        validate(content | {"network": {"mansd": 0, "loss": {"model": "lossless"}}}, "")
+    )
+    at_ns = 500_000_000 - 300_000  # between ticks, just before an update
+    successor = controller_of(resolved, Start(1, at_ns))
+    record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
+    rows = {table: record[table] for table in record.tables}
+    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
+    first = taken[taken["input"] == GENERATION]
+    assert len(first) == 1
+    assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
+    if not ticks:  # the process died before it had one
+        rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
+        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
+    notice = {"process": "controller", "level": RESTART, "t_ns": 0, "text": "restarted"}
+    found = replay(changed(record, rows, notices=[notice], reports={}, kind="live"))
+    assert found.bit_exact, found.verdict()
+    assert found.verdict().inputs == sum(map(len, rows.values()))
 
 
 @settings(max_examples=60)

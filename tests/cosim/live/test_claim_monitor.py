@@ -69,6 +69,9 @@ def found_by(monitor: ClaimMonitor, run: RecordedRun) -> list[Finding]:
 def test_each_loop_is_checked_as_by_its_own_monitor(content: Content) -> None:
     run = simulate_loops(validate(content, "here"))
     scenario = run.network.scenario
+    stopped = ClaimMonitor(scenario)
+    stopped.stop("telemetry is missing")
+    assert {one.notice.level for one in found_by(stopped, run)} == {"diverges"}
     found = found_by(ClaimMonitor(scenario), run)
     voids = 0
     for number, (record, phase_ns) in enumerate(zip(run.loops, phases_ns(scenario), strict=True)):

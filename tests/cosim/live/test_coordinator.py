@@ -99,6 +99,17 @@ def test_a_process_may_join_again_after_a_lost_connection_unless_another_has_its
     )
 
 
+def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
+    for role, text, sent_as, reason in (
+        ("sensor", b"rows", "noack/0/progress", None),
+        ("sensor", b"the disk is full", "", "the disk is full"),
+        ("netem", b"horizon", "", None),
+    ):
+        plane.put("ended", Sample(f"noack/0/ended/{role}/one", text, sent_as=sent_as))
+        barrier.poll()
+        assert barrier.reported_failure(role) == reason
+
+
 def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
     plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

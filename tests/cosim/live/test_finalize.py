@@ -3,19 +3,23 @@
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from threading import Event
+from typing import Any, NoReturn
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import cosim.live.finalize
+from cosim.analysis.replay import replay
 from cosim.live import end_helpers
 from cosim.live.end_helpers import EndHelpers, PreparedEnding
-from cosim.live.finalize import finalize, reopen
+from cosim.live.finalize import ReplayBeside, finalize, reopen
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_directory import (
     ENDING_FILE,
@@ -64,24 +68,6 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
 def run_dir(recorded: Path, tmp_path: Path) -> Path:
     """A copy of the run."""
     return Path(shutil.copytree(recorded, tmp_path / "run"))
-
-
-@pytest.fixture(scope="module")
-def finalized(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = Path(shutil.copytree(recorded, tmp_path_factory.mktemp("finalized") / "run"))
-    assert finalize(reopened(folder), report=False).status == ExitStatus.FAILED
-    return folder
-
-
-@pytest.fixture
-def whole(finalized: Path, tmp_path: Path) -> Path:
-    """A copy of the run with its summary."""
-    return Path(shutil.copytree(finalized, tmp_path / "whole"))
-
-
-def reopened(run_dir: Path) -> RunEnding:
-    """The ending of a run without a stored one."""
-    return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 def summary_of(run_dir: Path) -> dict[str, Any]:
@@ -152,6 +138,27 @@ def test_a_run_whose_record_is_not_complete_fails(
     assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
 
 
+def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A directory that is gone is not created again."""
+
+    def crash(*_: object) -> NoReturn:
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(cosim.live.finalize, "replay", crash)
+    outcome = finalize(ended_well(run_dir), report=False)
+    assert outcome.status == ExitStatus.FAILED
+    assert outcome.reason == "the run cannot be replayed: RuntimeError('a mistake of ours')"
+    monkeypatch.setattr(cosim.live.finalize, "replay", lambda *_: shutil.rmtree(run_dir))
+    with pytest.raises(MachineError, match=r"summary\.json: cannot be written: No such file"):
+        finalize(ended_well(run_dir), report=False)
+    assert not run_dir.exists()
+    run_dir.mkdir()  # it was replaced
+    with pytest.raises(MachineError, match=r"^the run failed: it was moved\n.*: no such file$"):
+        finalize(RunEnding(run_dir, 1, ExitStatus.FAILED, "it was moved", None))
+
+
 def test_an_interrupted_replay_leaves_a_summary(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,13 +191,14 @@ def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     assert (outcome.status, outcome.reason) == (2, "the port is taken")
 
 
-def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
+def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
     """It may have ended while the log, the spool or the viewer's recording was written."""
-    notices, write = whole / "record/notices.jsonl", json.dumps
+    finalize(ended_well(run_dir), report=False)
+    notices, write = run_dir / "record/notices.jsonl", json.dumps
     notices.write_text('{"t_ns": 5, "level": "info", "text": "kept", "process": "plant"}\n')
     before = notices.read_text()
     for name in (SPOOL, f"{SPOOL}.done"):
-        writer = SpoolWriter(whole / name, "plant")
+        writer = SpoolWriter(run_dir / name, "plant")
         writer.append(PLANT_STEP, 0, b"")
         writer.close()
 
@@ -200,44 +208,88 @@ def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
         return write(value, **options)
 
     with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
-        finish_record(whole)
+        finish_record(run_dir)
     assert notices.read_text() == before
-    assert finish_record(whole).loop().notices
-    assert not [*whole.glob(f"{SPOOL}*")]
-    (whole / SUMMARY_FILE).unlink()
-    (whole / RECORDING_FILE).write_bytes(b"cut")
-    reopen(whole)
-    assert (whole / RECORDING_FILE).stat().st_size > 10_000
+    assert finish_record(run_dir).loop().notices
+    assert not [*run_dir.glob(f"{SPOOL}*")]
+    (run_dir / SUMMARY_FILE).unlink()
+    (run_dir / RECORDING_FILE).write_bytes(b"cut")
+    reopen(run_dir)
+    assert (run_dir / RECORDING_FILE).stat().st_size > 10_000
 
 
 # --- processes that help with the end of a long run -----------------------------------------------
 
 
-@pytest.mark.parametrize("is_killed", [False, True])
-def test_a_prepared_end_is_that_of_a_run_without_preparation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
-) -> None:
-    """The run has more loops than are prepared at once."""
+@pytest.fixture
+def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of more loops than are prepared at once, without a summary."""
     monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
     monkeypatch.setattr(end_helpers, "cores", lambda: 2)
     scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
     assert scenario.loops is not None
-    loops = (scenario.loops[0].model_copy(update={"count": 20}),)
-    run_dir = simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
-    expected = finalize(ended_well(run_dir), report=False, view=False).summary
-    helpers = EndHelpers(load(run_dir / SCENARIO_FILE))
-    helpers.prepare(run_dir)
+    loops = (scenario.loops[0].model_copy(update={"count": 17}),)
+    return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_prepared_end_is_that_of_a_run_without_preparation(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
+) -> None:
+    given = (many_loops, 0, ExitStatus.OK, "horizon")
+    expected = finalize(RunEnding(*given), report=False, view=False).summary
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
     for thread in helpers._threads:
         thread.join()
-    assert helpers.expectations(range(20)) is not None
-    monkeypatch.setattr(cosim.live.finalize, "_expectations", fail)
+    assert helpers.expectations(range(17)) is not None
+    monkeypatch.setattr(cosim.live.finalize, "_expectations", _killed)
     if is_killed:
         assert helpers.submit(os.getpid).result() != os.getpid()
         with pytest.raises(BrokenProcessPool):
             helpers.submit(os._exit, 1).result()
-    ending = PreparedEnding(run_dir, 0, ExitStatus.OK, "horizon", helpers=helpers)
-    assert finalize(ending, report=False, view=False).summary == expected
+    ending = PreparedEnding(*given, helpers=helpers)
+    assert finalize(ending, report=False, view=not is_killed).summary == expected
 
 
-def fail(*_: object) -> None:
+def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = Event()
+
+    def endless(helpers: EndHelpers, *_: object) -> None:
+        waiting = helpers.submit(time.sleep, 1e6)
+        begun.set()
+        waiting.result()
+
+    monkeypatch.setattr(EndHelpers, "_prepare_loops", endless)
+    monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    begun.wait()
+    ending = PreparedEnding(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
+    assert len(finalize(ending, report=False, view=False).summary.loops) == 17
+
+
+def _killed(*_: object) -> None:
     raise MemoryError
+
+
+@pytest.mark.parametrize("part", [ReplayBeside.part, _killed])
+def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., Any]
+) -> None:
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    asked = []
+
+    def told(self: ReplayBeside) -> Any:
+        asked.append(self)
+        with suppress(MemoryError):
+            return part(self)
+
+    monkeypatch.setattr(ReplayBeside, "part", told)
+    finalize(ended_well(run_dir), report=False)
+    stored = summary_of(run_dir)["loops"][0]["replay"]
+    assert stored == replay(load_record(run_dir)).verdict().model_dump()
+    assert len(asked) == 1

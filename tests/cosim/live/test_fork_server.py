@@ -35,19 +35,6 @@ def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[Forke
     process.wait()
 
 
-@pytest.mark.parametrize(
-    ("argument", "status", "text"),
-    [("--help", ExitStatus.OK, "usage: noack plant"), ("--no", ExitStatus.CALLER, "--no")],
-)
-def test_status_and_output_are_those_of_the_module(
-    server: ForkServer, tmp_path: Path, argument: str, status: int, text: str
-) -> None:
-    with started(server, tmp_path, argument) as process:
-        assert process.wait() == status
-    assert psutil.Process(server._process.pid).num_threads() == 1  # it forks
-    assert text in (tmp_path / "log").read_text()
-
-
 def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_path: Path) -> None:
     """No other process, and not the server, may hold a lifeline open."""
     with ExitStack() as stack:
@@ -104,6 +91,17 @@ def test_a_command_with_threads_or_another_encoding_starts_the_server_as_a_progr
     if environment and "ForkedProcess" in done.stdout:
         pytest.skip("the system has no such locale")
     assert f"{ExitStatus.CALLER} Popen" in done.stdout
+
+
+def test_an_ignored_sigchld_hides_the_exit_status_only(tmp_path: Path) -> None:
+    """The parent of a program may have ignored it, which is inherited."""
+    usual = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        with closing(ForkServer()) as server, started(server, tmp_path, "--no") as process:
+            assert process.wait() == ExitStatus.OK
+    finally:
+        signal.signal(signal.SIGCHLD, usual)
+    assert "--no" in (tmp_path / "log").read_text()
 
 
 def test_a_server_that_ends_or_cannot_be_started_is_an_error(

@@ -163,15 +163,6 @@ def test_a_restart_that_fails_ends_the_run_with_both_reasons(
     assert policy.check() == (ExitStatus.CALLER, f"{KILLED}; restarted, sensor: no room")
 
 
-def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
-    children = case.children(None)
-    coordinator = FakeCoordinator(1.0, recorder="recorder stopped responding")
-    policy = case.run(children, coordinator)._policy
-    assert policy.check() is None
-    children.exit("recorder", -9)
-    assert policy.check() == (ExitStatus.FAILED, "recorder died: killed by SIGKILL")
-
-
 class Ending(FakeCoordinator):
     """The plant dies at the first check; a last report arrives after it."""
 

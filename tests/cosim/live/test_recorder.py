@@ -26,7 +26,7 @@ from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import RunProgress, parse_message
-from noack.runtime.spool import NOTICES, SPOOL, batch_of
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
 from noack.scenario.resolution import resolve, run_tables
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load, validate
@@ -152,6 +152,14 @@ def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> Non
     assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 3}) == {}
     assert run.report("sensor", 1, **{NOTICES: 1}) == {}
     assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
+
+
+def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Run) -> None:
+    run.rows(PLANT_STEP, 5)
+    stored = {PLANT_STEP: [[3, 7], [8, 10]]}
+    assert run.report("plant", stored=stored, **{PLANT_STEP: 10}) == {PLANT_STEP: [[7, 8]]}
+    ((_, line),) = read_chunks(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
+    assert "plant: 4 rows were written to disk by itself" in line.decode()
 
 
 def test_a_process_gets_the_acknowledgement_of_its_own_rows_only(run: Run) -> None:

@@ -12,16 +12,33 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+import noack
 from cosim.cli import app
+from cosim.live.run_metrics import RunMetrics
 from cosim.live.run_watcher import Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
-from tests.netem.control.test_emulator_metrics import values_of
+from tests.netem.control.test_emulator_metrics import exposed, values_of
 from tests.noack.runtime.test_json_log import objects
 from tests.noack.runtime.test_metrics_server import read, slow_reader
 
 PROGRESS: dict[str, Any] = {
     "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None, "live": None,
 }  # fmt: skip
+
+
+def test_metrics_follow_the_launchers_reports() -> None:
+    found = RunMetrics(noack.load("lane_following"))
+    assert values_of(exposed(found))["noack_run_loss_burst_limit"] == 4
+    watcher = found.watcher()
+    watcher.waiting(["plant", "sensor"])
+    watcher.failed("plant died", 1.0, None)
+    watcher.restarted("plant", 1.5)
+    watcher.progress(RunProgress(**PROGRESS, warnings=["void"]))
+    values = values_of(exposed(found))
+    assert values["noack_run_missing_processes"] == 2
+    assert values["noack_run_restarts_total,plant"] == values["noack_run_failures_total"] == 1
+    assert (values["noack_run_events_total"], values["noack_run_warnings_total"]) == (7, 1)
+    assert "noack_run_state_norm" not in values
 
 
 def test_a_watcher_whose_output_is_closed_does_not_stop_the_others() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cosim.analysis.loop_statistics import missing_rows
@@ -137,10 +138,20 @@ def other_process(kept: Kept, whole: RunRecord) -> None:
     out.close()
 
 
+def unknown_process(kept: Kept, whole: RunRecord) -> None:
+    kept.keep()
+    kept.path(CONTROLLER_STEP).rename(kept.folder / SPOOL / f"{CONTROLLER_STEP}.stranger")
+
+
 def renumbered(kept: Kept, whole: RunRecord) -> None:
     kept.keep()
     kept.ticks["input"] += 10_000
     kept.add(CONTROLLER_STEP, kept.ticks)
+
+
+def other_generation(kept: Kept, whole: RunRecord) -> None:
+    kept.ticks["input"] += 2**40
+    kept.keep()
 
 
 def changed(kept: Kept, whole: RunRecord) -> None:
@@ -156,6 +167,11 @@ def fewer_reported(kept: Kept, whole: RunRecord) -> None:
     kept.keep()
 
 
+def report_of_another(kept: Kept, whole: RunRecord) -> None:
+    kept.report["instance"] = WRITER["plant"]
+    kept.keep()
+
+
 def link(kept: Kept, whole: RunRecord) -> None:
     kept.keep()
     secret = kept.path(CONTROLLER_STEP).rename(kept.folder / "elsewhere")
@@ -165,6 +181,11 @@ def link(kept: Kept, whole: RunRecord) -> None:
 def fifo(kept: Kept, whole: RunRecord) -> None:
     kept.keep()
     os.mkfifo(kept.path("controller_setting"))
+
+
+def part_of_a_row(kept: Kept, whole: RunRecord) -> None:
+    kept.keep()
+    kept.add(CONTROLLER_STEP, np.zeros(7, np.uint8))
 
 
 def huge_batch(kept: Kept, whole: RunRecord) -> None:
@@ -179,6 +200,10 @@ def huge_batch(kept: Kept, whole: RunRecord) -> None:
     [
         (other_role, "the controller has no table of this name"),
         (other_process, "the plant of this run did not run there"),
+        (unknown_process, "is of no process that joined this run"),
+        (other_generation, "has rows of another process"),
+        (report_of_another, "is the report of another process"),
+        (part_of_a_row, "is damaged"),
         (renumbered, "has 100 more than the controller reported"),
         (changed, "it has other rows of controller_step than were recorded"),
         (fewer_reported, "has 50 more than the controller reported"),

@@ -11,7 +11,7 @@ from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.fidelity import live_run
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
-from cosim.record.align import align_tables, expected_rms, true_states
+from cosim.record.align import align_tables, true_states
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.exact_simulation import setting_of
@@ -186,19 +186,3 @@ def test_a_threshold_within_the_noise_gives_a_warning_before_the_run(
 def verdict_on(content: dict[str, Any], what: str) -> str:
     (found,) = [one for one in assumptions(resolved(content)) if what in one.what]
     return found.verdict
-
-
-def test_an_observer_that_does_not_converge_gives_a_warning_before_the_run(
-    observed: dict[str, Any],
-) -> None:
-    stiff = {
-        "model": {
-            "A": [[0.0, 1.0], [1e9, 0.0]], "B": [[0.0], [1.0]], "gain": [[1.0, 1.0]],
-            "allow_unstable": True,
-        },
-        "plant": observed["plant"] | {"rate_hz": 500.0},
-    }  # fmt: skip
-    assert expected_rms(resolved(observed | stiff)) == np.inf  # no Riccati solution
-    weak = {"observer": {"kind": "luenberger", "gain": [[-0.1], [0.0]]}}
-    for change in (stiff, weak):
-        assert verdict_on(observed | change, "observer's error") == "violated"

@@ -8,15 +8,13 @@ import pytest
 
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.machine_replay import SharedMachines
-from cosim.record.record_source import NetworkRows, RowsInMemory
 from cosim.record.run_record import RecordedRun, RunRecord
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate, simulate_loops
-from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import loop_names, loops_of, phases_ns
+from noack.scenario.scenario import loops_of
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.record.changed_records import changed
 
@@ -56,17 +54,6 @@ def test_each_loop_has_the_bits_of_the_loop_alone(network: str) -> None:
     run = simulate_loops(scenario)
     for own, record in zip(loops_of(scenario), run.loops, strict=True):
         same(simulate(resolve(own)), record)
-
-
-def test_a_change_applies_to_loops_of_all_sizes_at_its_time() -> None:
-    change = 'changes=[{ at_s = 2.0, set = { mansd = 1, "trigger.beta" = 0.001 } }]'
-    entries = 'loops=[{ name = "lane" }, { name = "slow", plant = { rate_hz = 50.0 } }]'
-    run = simulate_loops(load(DIFFERENT, ["horizon_s=4.0", entries, change]))
-    phases = dict(zip(loop_names(run.scenario), phases_ns(run.scenario), strict=True))
-    for record in run.loops:
-        (row,) = record["sensor_setting"]
-        assert row["since_ns"] == max(2_000_000_000 - phases[record.scenario.name], 0)
-        assert replay(record).bit_exact
 
 
 @pytest.fixture
@@ -162,24 +149,3 @@ def test_a_replay_is_exact_and_finds_a_changed_bit(crowded: Content) -> None:
     assert found == replay(other, SharedMachines([*shared.loops[:2], other]))
     assert found.first_difference is not None
     assert found.first_difference.column == "head"
-
-
-def test_a_missing_row_of_the_network_leaves_its_number_free(crowded: Content) -> None:
-    scenario = validate(crowded | {"loops": [{"name": "a", "count": 3}]}, "here")
-    network = simulate_loops(scenario).network
-    rows = {table: network[table].copy() for table in network.tables}
-    # The second half is of a restarted emulator.
-    halves = {one: rows[one]["now_ns"] > 10**9 for one in (NETEM_PACKET, NETEM_RELEASE)}
-    first = min(rows[one]["input"][half].min() for one, half in halves.items())
-    for table, half in halves.items():
-        rows[table]["input"][half] += GENERATION - first
-    for missing in (0, 2):
-        rows[NETEM_PACKET] = np.delete(rows[NETEM_PACKET], np.s_[5 : 5 + missing])
-        found = NetworkRows(RowsInMemory(rows), phases_ns(scenario))
-        for loop in range(len(phases_ns(scenario))):
-            batches = (one["input"] for table in rows for one in found.of_loop(table, loop))
-            inputs = np.sort(np.concatenate([*batches]))
-            for generation in (0, 1):
-                numbers = inputs[inputs // GENERATION == generation] % GENERATION
-                assert numbers[0] == 0
-                assert (np.diff(numbers) - 1).sum() == missing * (generation == 0)

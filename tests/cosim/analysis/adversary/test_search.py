@@ -1,5 +1,6 @@
-"""The search in continuous time against all patterns tried one by one, and certificates."""
+"""The search in continuous time against all patterns tried one by one, and the command."""
 
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -12,22 +13,22 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from typer.testing import CliRunner
 
 from cosim.analysis.adversary import Worst
 from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
-from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
+from cosim.cli import app
+from noack.core.errors import ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 
-LANE = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
-CAP = LossGuarantee((LongestBurst(4),))
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
 find_worst = partial(find_any, continuous=True)
@@ -113,21 +114,6 @@ def test_a_certificate_that_forgets_a_dropout_is_refuted() -> None:
     assert sum(refuted) >= 0.75 * len(refuted)
 
 
-def lane(*settings: str) -> Scenario:
-    return resolve(load(LANE, settings))
-
-
-def test_the_search_stops_at_its_budget_and_reports_it() -> None:
-    resolved = lane("horizon_s=6")
-    search = PatternSearch(flow_of(resolved, Objective.ERROR), CAP)
-    assert not search_tree(search, 10)
-    assert search.nodes <= 10
-    assert not find_worst(resolved, Objective.ERROR, most_nodes=0, beam=4).exact
-    first, second = (find_worst(resolved, Objective.ERROR, most_nodes=10, beam=4) for _ in range(2))
-    assert not first.exact
-    assert first == second
-
-
 def test_a_diverging_loop_has_an_infinite_objective(content: dict[str, Any]) -> None:
     content |= {"model": {"A": [[3.0]], "B": [[1.0]], "gain": [[1.0]]}, "horizon_s": 80.0}
     content["model"]["allow_unstable"] = True
@@ -181,3 +167,60 @@ def test_cost_and_inter_event_time_are_those_of_the_run(resolved: Scenario) -> N
     between_s = [b - a for a, b in pairwise(run.event_s)]
     assert -found.value == min(between_s, default=math.inf)
     assert (found.at_s is None) == (not between_s)
+
+
+# --- noack adversary ------------------------------------------------------------------------------
+
+
+SCENARIO = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, ["adversary", str(SCENARIO), "--horizon", "6", *arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_a_policy_is_searched_in_the_sampled_loop() -> None:
+    """Without losses x_c differs from x by more than δ only where a test comes too late."""
+    trigger = 'trigger={policy="absolute", delta=0.1}'
+    arguments = ("--objective", "error", "--set", trigger, "--set", "network.mansd=0")
+    status, stdout, _ = run(*arguments, "--json")
+    document = json.loads(stdout)
+    worst = document["worst"]["error"]
+    assert status == ExitStatus.OK
+    assert (document["policy"], document["trigger"]) == ("absolute", "sampled")
+    assert document["certificate"]["conditions"]["sampling_s"] == 0.002
+    assert worst["exact"]
+    assert worst["runs"] == 1
+    assert 0.1 < worst["value"] < 0.105
+    assert "‖e_c‖, scaled" in run(*arguments)[1]
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("start", ["[0.0, 0.0]", "[1e-3, 0.0]"])
+def test_a_bound_of_zero_is_searched(start: str) -> None:
+    """Plant and model agree and nothing disturbs them: e_c is 0 after the first update."""
+    settings = [
+        "plant.draw=nominal", "plant.uncertainty_A=", "plant.uncertainty_B=",
+        'trigger={policy="periodic", period_s=0.1}', f"plant.initial_state={start}",
+    ]  # fmt: skip
+    words = [word for one in settings if not one.endswith("=") for word in ("--set", one)]
+    arguments = ["adversary", "double_integrator", "--horizon", "0.5", "--nodes", "100"]
+    done = CliRunner().invoke(app, [*arguments, *words, "--json"])
+    assert done.exit_code == ExitStatus.OK, done.output
+    for worst in json.loads(done.stdout)["worst"].values():
+        assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["lane_following", "--horizon", "-1"], "horizon_s"),
+        (["lane_periodic", "--trigger", "continuous"], "--trigger continuous"),
+        (["lane_crosswind", "--trigger", "continuous"], "--trigger continuous"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused_in_one_line(words: list[str], expected: str) -> None:
+    done = CliRunner().invoke(app, ["adversary", *words])
+    assert (done.exit_code, len(done.stderr.splitlines())) == (ExitStatus.CALLER, 1)
+    assert expected in done.stderr

@@ -17,11 +17,11 @@ from cosim.analysis.claims.condition_reader import ConditionReader, read_conditi
 from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
 from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.record.record_source import rows_by_loop
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import allowed_conditions
 from tests.cosim.analysis.claims.conftest import Make
 from tests.cosim.record.changed_records import changed
 from tests.cosim.simulation.shuttle import shuttled
@@ -90,33 +90,6 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
         seen.add(claims.certified_for is not None)
         assert replay(record).bit_exact
     assert seen == {True, False}
-
-
-@pytest.mark.parametrize("offset_ns", [40 * MS, -40 * MS])
-def test_a_clock_that_is_off_is_a_measured_age_of_the_input(make: Make, offset_ns: int) -> None:
-    scenario = make(certificate={"late_periods": 0})
-    record = simulated(scenario, {"controller": (offset_ns, 0)})
-    found, exact = read_conditions(record), read_conditions(simulate(scenario))
-    hold_s, exact_s = found.hold.largest(), exact.hold.largest()
-    assert hold_s is not None
-    assert exact_s is not None
-    assert hold_s >= 0.04 - exact_s
-    assert hold_s > allowed_conditions(scenario).hold_s
-    assert (covered := ClaimEvaluation(record).certified_for) is not None
-    assert covered.hold_s == hold_s
-    assert {*certified(record).values()} == {ClaimVerdict.HELD}
-
-
-def test_the_networks_and_the_sensors_clocks_enter_no_condition(make: Make) -> None:
-    """Without a delay in the network, only ``now_ns`` of their rows differs."""
-    scenario = make()
-    exact = simulate(scenario)
-    record = simulated(scenario, {"netem": (50 * MS, 100_000), "sensor": (-50 * MS, -100_000)})
-    assert ClaimEvaluation(record).judge() == ClaimEvaluation(exact).judge()
-    for found, expected in zip(
-        read_conditions(record)[:5], read_conditions(exact)[:5], strict=True
-    ):
-        np.testing.assert_array_equal(found, expected)
 
 
 # --- bounds of the clocks' errors that a run has recorded -----------------------------------------
@@ -212,6 +185,14 @@ def test_batches_show_what_the_whole_record_shows(clocked: RunRecord, seed: int)
         parts.append(reader.observed())
     for cause, series in combined(parts).clocks.items():
         np.testing.assert_array_equal(series, whole.clocks[cause])
+
+
+def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
+    table, phases_ns = CLOCK_TABLES[0], (0, 7)
+    rows = np.zeros(2, tables(1, 1, clocks=True)[table])
+    rows["t_ns"] = 10, 20
+    found = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
+    assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
 
 
 def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:

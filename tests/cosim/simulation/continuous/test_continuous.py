@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import block_diag, expm
-from scipy.optimize import brentq
+from scipy.linalg import expm
 
 from cosim.simulation.continuous import (
     POINTS,
@@ -170,40 +169,6 @@ def test_very_short_crossings_are_found(depth: float, omega: float, floored: boo
     tolerance_s = 5e-15 / math.sqrt(depth) / omega + 1e-12 * first_s
     assert run.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     assert turning(-depth, omega, floored).run().event_s.size == 0
-
-
-def test_the_highest_of_many_near_misses_is_found() -> None:
-    """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which exceeds the threshold.
-
-    The weight of the other entries of e_s is almost 0; the reference is the closed form.
-    """
-    omegas, weights = np.array([1.0, 11.3, 17.7]), np.array([0.5, 0.3, 0.2])
-    horizon_s, depth = 60.0, 1e-9
-
-    def error(t: float) -> float:
-        return float(np.sum(weights * (1 - np.cos(omegas * t))))
-
-    t_s = np.linspace(0, horizon_s, 600_001)
-    curve = (weights * (1 - np.cos(np.outer(t_s, omegas)))).sum(axis=1)
-    inner = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
-    assert len(inner) > 100
-    peak = inner[np.argmax(curve[inner])]
-    slope = lambda t: float(np.sum(weights * omegas * np.sin(omegas * t)))  # noqa: E731
-    peak_s = brentq(slope, t_s[peak - 1], t_s[peak + 1], xtol=1e-15)
-    level = error(peak_s) * (1 - depth)
-    first_s = brentq(lambda t: error(t) - level, peak_s - 0.05, peak_s, xtol=1e-14)
-    turns = [np.array([[0.0, w], [-w, 0.0]]) for w in omegas]
-    mix = np.eye(6)
-    mix[0] = [1, 0, 1, 0, 1, 0]  # the first state is the sum of the three cosines
-    A = mix @ block_diag(*turns) @ np.linalg.inv(mix)
-    x0 = mix @ np.array([weights[0], 0, weights[1], 0, weights[2], 0])
-    W = np.diag([1.0, *[1e-12] * 5])
-    loop = loop_with(A, np.zeros((6, 1)), np.zeros((1, 6)), np.zeros((6, 6)), x0, W)
-    trigger = decaying_rule(1e-3, 1.0, level, W)
-    run = Case(loop, trigger, [False], True, horizon_s).run()
-    assert run.event_s[0] == pytest.approx(first_s, abs=1e-13 / math.sqrt(depth))
-    missed = decaying_rule(1e-3, 1.0, error(peak_s) * (1 + depth), W)
-    assert Case(loop, missed, [False], True, horizon_s).run().event_s.size == 0
 
 
 def test_dense_output_is_right_continuous() -> None:

@@ -1,4 +1,4 @@
-"""A damaged run directory: the readable part is read, the rest is reported in one line."""
+"""Damaged run directories, those of other users, and the tables in docs/record.md."""
 
 import json
 import os
@@ -11,11 +11,23 @@ import pyarrow.parquet as pq
 import pytest
 
 from cosim.analysis.run_summary import summarise
-from cosim.record.run_directory import RECORD, REPORTS_FILE
+from cosim.api.runs import open_run
+from cosim.record.run_directory import (
+    LATEST,
+    RECORD,
+    REPORTS_FILE,
+    SCENARIO_FILE,
+    chosen_run,
+    file_of_loop,
+    latest_run,
+    loop_of_file,
+    new_run_dir,
+    point_to_latest,
+)
 from cosim.record.run_record import load_record
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import PLANT_STEP
+from noack.protocol.record_tables import COMMON, PLANT_STEP, TABLES, Column, Table
 from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
 from tests.fuzz.parsers.record import NOTICE, files, spooled
 
@@ -40,7 +52,7 @@ def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None
     path, reports = run_dir / RECORD / f"{PLANT_STEP}.parquet", run_dir / REPORTS_FILE
     whole, given = pq.read_table(path), json.loads(reports.read_text())
     text = {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}}
-    for report in (None, [], {"rows": {}}, text):
+    for report in (None, [], text, text | {"rows": {"plant_step": 1}}):
         reports.write_text(json.dumps(given | {"plant": report}))
         record = load_record(run_dir)
         assert record.reports.keys() == {"sensor", "netem", "controller"}
@@ -50,6 +62,10 @@ def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None
         pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
         with pytest.raises(CallerError, match=expected):
             load_record(run_dir)
+    pq.write_table(whole, path)
+    (run_dir / RECORD / "notices.jsonl").write_bytes(b"\xae\xff")
+    with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
+        load_record(run_dir)
     pq.write_table(whole.append_column("t_ns", whole["t_ns"]), path)
     with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
         load_record(run_dir)
@@ -84,3 +100,68 @@ def test_a_table_is_a_regular_file_in_parts_of_bounded_length(run_dir: Path) -> 
     os.mkfifo(path)
     with pytest.raises(CallerError, match="not a regular file"):
         load_record(run_dir)
+
+
+# --- latest, and names ----------------------------------------------------------------------------
+
+
+ANOTHER_UID = 65_534
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """A folder that everybody may write to, where users remove only their own files, as in /tmp."""
+    folder = tmp_path / "runs"
+    (folder / "first").mkdir(parents=True)
+    (folder / "first" / SCENARIO_FILE).write_text("")
+    folder.chmod(0o1777)
+    return folder
+
+
+@pytest.mark.parametrize("whose", ["link", "run"])
+def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may give a file to another user")
+    point_to_latest(runs / "first")
+    os.chown(
+        runs / (LATEST if whose == "link" else "first"), ANOTHER_UID, -1, follow_symlinks=False
+    )
+    for opened in (
+        lambda: latest_run(runs),
+        lambda: chosen_run(runs / LATEST, Path("elsewhere")),
+        lambda: open_run(runs / LATEST),
+    ):
+        with pytest.raises(CallerError, match=rf"^{runs / LATEST}: .* is another user's; name the"):
+            opened()
+    assert chosen_run(runs / "first", runs) == runs / "first"  # the link's name identifies the run
+
+
+def test_names_of_folders_and_of_files_of_loops(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"r\xff")
+    for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
+        with pytest.raises(CallerError, match="is not UTF-8; rename it"):
+            refused()
+    for name in (None, "a", "b-1"):
+        assert loop_of_file(file_of_loop("report.html", name), "report.html") == name
+
+
+# --- docs/record.md -------------------------------------------------------------------------------
+
+
+DOCS = Path(__file__).parents[3] / "docs" / "record.md"
+TEXT = " ".join(DOCS.read_text(encoding="utf-8").split())
+
+
+def markdown(columns: tuple[Column, ...]) -> str:
+    lines = [f"| `{one.name}` | {one.unit} | {one.meaning} |" for one in columns]
+    return " ".join(" ".join(["| column | unit | meaning |", "|---|---|---|", *lines]).split())
+
+
+def test_the_docs_describe_the_common_columns() -> None:
+    assert markdown(COMMON) in TEXT
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_docs_describe_every_table(table: Table) -> None:
+    described = f"`{table.name}` ({table.owner}): one row per {table.row}. "
+    assert described + markdown(table.columns) in TEXT
