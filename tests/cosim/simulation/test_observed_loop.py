@@ -19,11 +19,10 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
 from noack.protocol.machine_interface import GENERATION, RESTART, Start
-from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve, steady_state
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from noack.theory.certificates.assumptions import assumptions
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with
 from tests.cosim.record.changed_records import changed
 from tests.machine_parts import sensor_of
@@ -162,27 +161,3 @@ def test_exact_simulation_is_refused_in_one_line(
             with pytest.raises(CallerError, match=key) as refusal:
                 take(one)
             assert "\n" not in str(refusal.value)
-
-
-def test_a_threshold_within_the_noise_gives_a_warning_before_the_run(
-    observed: dict[str, Any],
-) -> None:
-    """The warning is justified: the noise alone triggers."""
-    observed["horizon_s"] = 6.0
-    observed["plant"] |= {"disturbances": [], "initial_state": [0.0, 0.0]}
-    observed["plant"]["measurement"] = {"noise_std": [0.02, 0.02]}
-    observed["network"]["loss"] = {"model": "lossless"}
-    del observed["observer"]
-    size = 2 * 0.02  # of the difference of two, with two entries each
-    events = {}
-    for share in (1.0, 3.1):
-        observed["trigger"] |= {"beta": 1e-3, "floor": share * size}
-        rows = run(observed)[SENSOR_MEASUREMENT]
-        events[share] = int((rows["event"] != NO_SEQUENCE).sum())
-        assert verdict_on(observed, "above the noise") == ("holds" if share > 3 else "violated")
-    assert events[1.0] > 20 * max(events[3.1], 1)
-
-
-def verdict_on(content: dict[str, Any], what: str) -> str:
-    (found,) = [one for one in assumptions(resolved(content)) if what in one.what]
-    return found.verdict

@@ -359,12 +359,6 @@ def test_the_worst_case_of_a_schedule_occurs(
         assert seen[name] == pytest.approx(getattr(assumed, name), abs=1e-12), name
 
 
-# --- violations that test_assumption_monitor.py does not make -------------------------------------
-
-
-# --- incomplete records ---------------------------------------------------------------------------
-
-
 def test_every_table_may_be_empty(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
     found = read_conditions(empty)

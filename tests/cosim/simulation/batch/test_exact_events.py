@@ -10,7 +10,6 @@ import pytest
 from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import (
-    DIVERGED,
     TOO_MANY_EVENTS,
     Population,
     Setting,
@@ -123,25 +122,6 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
     assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
     assert run_events(*beyond).event_s.size == 0
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["decaying", "relative", "periodic", "dynamic", "quadratic", "dwell of quadratic"],
-)
-def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> None:
-    quiet = name in ("decaying", "relative", "dynamic", "quadratic")
-    for setting, population in settings(name, range(3)):
-        wild = population._replace(A=population.A + 20 * np.eye(len(setting.H)))
-        forever = replace(setting, horizon_s=60.0, most_events=100_000)
-        if quiet:  # The model equals the plant, so there are no events.
-            forever = replace(forever, H=wild.A[0] + wild.B[0] @ setting.K, known_start=True)
-        draw = one(wild, 0)
-        (row,) = run_batch(forever, draw)
-        run = reference(forever, draw, 100_000)
-        assert row["status"] == DIVERGED
-        assert row["diverged_at_s"] == pytest.approx(run.diverged_at_s, rel=1e-9)
-        assert row["transmissions"] == len(run.event_s)
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
