@@ -1,12 +1,17 @@
-"""Fidelity: the difference to the ideal loop is explained if the record is the scenario's."""
+"""The difference to the ideal loop is explained if the record is the scenario's; the commands."""
 
-import itertools
 import json
 import math
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner, Result
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import (
@@ -14,11 +19,12 @@ from cosim.analysis.fidelity import (
     IncomparableError,
     compute_fidelity,
     fidelity_for_summary,
-    live_run,
 )
 from cosim.analysis.summary_model import NoFidelityPart
+from cosim.cli import app
+from cosim.live.finalize import finalize
+from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord
-from cosim.simulation.continuous import network_fates
 from cosim.simulation.virtual_time import Network, simulate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -65,14 +71,6 @@ def test_the_difference_to_the_ideal_loop_is_explained(fidelity: Fidelity) -> No
     assert fidelity.compared_s == 4.0
 
 
-def test_amplified_rounding_is_reported_and_not_attributed_to_the_run() -> None:
-    """This rule does not tolerate the losses; a deviation grows between equal events."""
-    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
-    record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
-    with pytest.raises(IncomparableError, match="turns rounding into another run"):
-        compute_fidelity(record)
-
-
 def test_delay_is_attributed_to_delay() -> None:
     prompt, late = (compute_fidelity(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
@@ -86,11 +84,24 @@ def test_a_start_without_actuation_is_attributed_to_held_actuation() -> None:
     settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
     fidelity = compute_fidelity(lane(None, *settings))
     sampling, delay, held, _ = fidelity.stages
+    at_rest = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    assert (at_rest.explained, at_rest.explained_relative) == (True, 0.0)
+    assert "rounding" in at_rest.verdict
     assert fidelity.events_live == 0
     assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
     assert delay.difference.max == 0.0
     assert held.share == pytest.approx(1.0)
     assert held.max_event_difference_s is None
+
+
+def test_a_loop_that_amplifies_rounding_or_accumulates_events_is_not_compared() -> None:
+    """This rule does not tolerate the losses; a deviation grows between equal events."""
+    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
+    with pytest.raises(IncomparableError, match="turns rounding into another run"):
+        compute_fidelity(lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100"))
+    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
+    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
+        compute_fidelity(unstable, max_events=200)
 
 
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
@@ -99,44 +110,33 @@ def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) 
     assert not compute_fidelity(changed(record, {PLANT_STEP: steps})).explained
 
 
-def test_at_rest_there_is_nothing_to_explain() -> None:
-    fidelity = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
-    assert fidelity.explained
-    assert fidelity.explained_relative == 0.0
-    assert "rounding" in fidelity.verdict
-
-
-def test_additional_events_get_the_networks_fates_and_median_delays() -> None:
-    waits_ns = itertools.cycle([10_000_000, 10_000_000, 30_000_000])
-    late = lane(lambda data, now_ns: next(waits_ns), "trigger.beta=0.02")
-    schedule = live_run(late).schedule
-    events = int(late[SENSOR_MEASUREMENT]["event"].max()) + 1
-    assert events > 6
-    fates = network_fates(late.scenario)
-    beyond = range(events, events + 50)
-    assert [schedule.delivered(i) for i in beyond] == [fates(i) for i in beyond]
-    assert {schedule.delivered(i) for i in beyond} == {True, False}
-    # 10 ms in flight, then 5 ms to the tick that uses it, or to the next step.
-    assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
-    assert {schedule.delay_steps(i) for i in beyond} == {2}
-
-
 @pytest.mark.parametrize(
-    ("table", "rows", "why"),
+    ("table", "column", "row", "value", "why"),
     [
-        (SENSOR_MEASUREMENT, slice(5), "5 measurements"),
-        (SENSOR_MEASUREMENT, [*range(50), *range(51, 401)], "sensor's record"),
-        (PLANT_STEP, [*range(50), *range(51, 401)], "steps of the plant"),
-        (PLANT_STEP, slice(300), "steps of the plant"),
-        (CONTROLLER_STEP, slice(300), "controller's record"),
-        (CONTROLLER_STEP, [*range(50), *range(51, 400)], "controller's record"),
-        (CONTROLLER_DELIVERY, slice(1, None), "controller's record"),
+        (PLANT_STEP, "x", slice(300, None), math.nan, "diverged"),
+        (SENSOR_MEASUREMENT, "t_ns", None, 2**62, "has times that no run has"),
+        (SENSOR_MEASUREMENT, "t_ns", None, -(2**63), "has times that no run has"),
+        (CONTROLLER_STEP, "model_t_ns", None, 2**63 - 1, "has times that no run has"),
+        (CONTROLLER_DELIVERY, "model_t_ns", None, -1, "has times that no run has"),
+        (PLANT_STEP, None, np.s_[50:51], None, "steps of the plant"),
+        (PLANT_STEP, None, np.s_[300:], None, "steps of the plant"),
+        (SENSOR_MEASUREMENT, None, np.s_[5:], None, "5 measurements"),
+        (SENSOR_MEASUREMENT, None, np.s_[50:51], None, "sensor's record"),
+        (CONTROLLER_STEP, None, np.s_[300:], None, "controller's record"),
+        (CONTROLLER_STEP, None, np.s_[50:51], None, "controller's record"),
+        (CONTROLLER_DELIVERY, None, np.s_[:1], None, "controller's record"),
     ],
 )
-def test_gaps_in_the_record_are_reported(
-    record: RunRecord, table: str, rows: Any, why: str
+def test_a_record_that_is_not_that_of_a_whole_run_is_not_compared(
+    record: RunRecord, table: str, column: str | None, row: Any, value: Any, why: str
 ) -> None:
-    broken = changed(record, {table: record[table][rows]})
+    """Without a column, rows are missing; without a row, the one in the middle is meant."""
+    rows = record[table].copy()
+    if column is None:
+        rows = np.delete(rows, row)
+    else:
+        rows[column][len(rows) // 2 if row is None else row] = value
+    broken = changed(record, {table: rows})
     with pytest.raises(IncomparableError, match=why):
         compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
@@ -150,19 +150,6 @@ def test_an_interrupted_run_is_compared_up_to_its_end(record: RunRecord) -> None
     fidelity = compute_fidelity(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
-
-
-def test_a_diverged_run_is_reported(record: RunRecord) -> None:
-    steps = record[PLANT_STEP].copy()
-    steps["x"][300:] = math.nan
-    with pytest.raises(IncomparableError, match="diverged"):
-        compute_fidelity(changed(record, {PLANT_STEP: steps}))
-
-
-def test_an_accumulation_of_events_is_reported() -> None:
-    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
-    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
-        compute_fidelity(unstable, max_events=200)
 
 
 def test_the_summary_has_the_comparison_or_the_reason(
@@ -186,19 +173,106 @@ def test_the_summary_has_the_comparison_or_the_reason(
     assert "noack fidelity" in str(fidelity_for_summary(record, loops=11).reason)
 
 
-@pytest.mark.parametrize(
-    ("table", "column", "value"),
-    [
-        (SENSOR_MEASUREMENT, "t_ns", 2**62),
-        (SENSOR_MEASUREMENT, "t_ns", -(2**63)),
-        (CONTROLLER_STEP, "model_t_ns", 2**63 - 1),
-        (CONTROLLER_DELIVERY, "model_t_ns", -1),
-    ],
-)
-def test_a_record_with_impossible_times_is_not_compared(
-    record: RunRecord, table: str, column: str, value: int
-) -> None:
-    rows = record[table].copy()
-    rows[column][len(rows) // 2] = value
-    with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
-        compute_fidelity(changed(record, {table: rows}))
+# --- noack replay and noack fidelity --------------------------------------------------------------
+
+
+COMMANDS = ("replay", "fidelity")
+
+
+def noack(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    scenario = load(LANE, ["horizon_s=1", "plant.rate_hz=50", "controller.rate_hz=50"])
+    finalize(simulate_run(scenario, folder), report=False, view=False)
+    return folder
+
+
+@pytest.fixture
+def runs(simulated: Path, tmp_path: Path) -> Path:
+    """An own folder of runs."""
+    return Path(shutil.copytree(simulated, tmp_path / "runs", symlinks=True))
+
+
+def rewrite(runs: Path, table: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    path = runs / "latest" / "record" / f"{table}.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+
+
+def alter(runs: Path, table: str, column: str, by: float) -> None:
+    """Add a ramp to a column."""
+
+    def changed(rows: pa.Table) -> pa.Table:
+        values = rows[column].to_numpy() + np.linspace(0, by, len(rows))
+        return rows.set_column(rows.schema.get_field_index(column), column, pa.array(values))
+
+    rewrite(runs, table, changed)
+
+
+def test_the_last_run_is_replayed_and_compared_with_the_ideal_loop(simulated: Path) -> None:
+    for command, text in (("replay", "bit-exact: "), ("fidelity", "held actuation")):
+        done = noack(command, "--runs", simulated)
+        assert (done.exit_code, done.stderr) == (0, "")
+        assert text in done.stdout
+    document = json.loads(noack("replay", "--runs", simulated, "--json").stdout)
+    assert (document["bit_exact"], document["complete"]) == (True, True)
+    assert document["first_difference"] is None
+    assert document["inputs"] == sum(process["inputs"] for process in document["processes"])
+    assert document["changed_since"] == []
+    document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
+    assert document["explained"] is True
+    names = [stage["name"] for stage in document["stages"]]
+    assert names == ["sampling", "delay", "held actuation", "residual"]
+
+
+def test_a_difference_is_reported_and_fails(runs: Path) -> None:
+    alter(runs, "controller_step", "x_c_3", 1e-9)
+    path = runs / "latest/environment.json"
+    environment = json.loads(path.read_text())
+    environment["packages"]["numpy"] = "1.0"
+    path.write_text(json.dumps(environment))
+    done = noack("replay", "--runs", runs)
+    assert done.exit_code == 1
+    assert "controller_step row 1, x_c_3" in done.stdout
+    assert "0x1." in done.stdout
+    assert "numpy was 1.0, is " in done.stdout
+    done = noack("replay", "--runs", runs, "--json")
+    document = json.loads(done.stdout)
+    assert (done.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
+    assert len(document["changed_since"]) == 1
+
+
+def test_an_empty_record_and_an_unexplained_difference_fail(runs: Path) -> None:
+    alter(runs, "plant_step", "x_4", 1.0)
+    done = noack("fidelity", runs / "latest")
+    assert done.exit_code == noack("fidelity", runs / "latest", "--json").exit_code == 1
+    assert "too large" in done.stdout
+    for path in (runs / "latest/record").glob("*.parquet"):
+        rewrite(runs, path.stem, lambda rows: rows.slice(0, 0))
+    done = noack("replay", "--runs", runs)
+    assert done.exit_code == 1
+    assert "nothing to compare" in done.stdout
+
+
+STEPS = "record/plant_step.parquet"
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "no scenario": lambda runs: (runs / "latest/scenario.toml").unlink(),
+    "no record": lambda runs: shutil.rmtree(runs / "latest/record"),
+    "no table": lambda runs: (runs / "latest" / STEPS).unlink(),
+    "no Parquet": lambda runs: (runs / "latest" / STEPS).write_bytes(b"PAR1 no more"),
+    "no column": lambda runs: rewrite(runs, "plant_step", lambda rows: rows.drop_columns(["x_4"])),
+    "no run": lambda runs: (runs / "latest").unlink(),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_an_invalid_run_directory_gives_one_line(runs: Path, how: str) -> None:
+    DAMAGE[how](runs)
+    for command in COMMANDS:
+        done = noack(command, "--runs", runs)
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert done.stderr.startswith("noack: ")
+        assert done.stderr.count("\n") == 1

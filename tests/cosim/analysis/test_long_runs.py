@@ -1,24 +1,24 @@
 """A run that is read in many parts has the results of one that is read at once."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.value_reduction import EXACT, RESOLUTION, QuantileSketch
+from cosim.analysis.value_reduction import EXACT, RESOLUTION, QuantileSketch, decimate
 from cosim.record import run_record
 from cosim.record.align import align_tables
-from cosim.record.run_directory import write_scenario
-from cosim.record.run_record import RunRecord, load_record, write_run
+from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
-from tests.cosim.summaries import alone
 
 PART_ROWS = 37
 NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
@@ -82,21 +82,6 @@ def test_the_results_do_not_depend_on_the_parts(
     assert without_sums(results(in_parts)) == without_sums(whole)
 
 
-def test_slices_are_the_tables_in_order(
-    record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_scenario(record.scenario, tmp_path)
-    write_run(alone(record), tmp_path)
-    monkeypatch.setattr(run_record, "BATCH_ROWS", PART_ROWS)
-    stored = load_record(tmp_path)
-    parts = list(stored.slices())
-    for table in record.tables:
-        assert np.concatenate([part[table] for part in parts]).tobytes() == record[table].tobytes()
-    ends_ns = [part[PLANT_STEP]["now_ns"][-1] for part in parts[:-1]]
-    begins_ns = [part[SENSOR_MEASUREMENT]["now_ns"][0] for part in parts[1:]]
-    assert all(end < begin for end, begin in zip(ends_ns, begins_ns, strict=True))
-
-
 def test_quantiles_of_many_values_have_the_stated_error() -> None:
     values = np.random.default_rng(1).lognormal(3, 2, EXACT + 5000)
     values[:1000] *= -1
@@ -105,10 +90,42 @@ def test_quantiles_of_many_values_have_the_stated_error() -> None:
         exact = float(np.quantile(values, share, method="lower"))
         assert sketch.quantiles(share)[0] == pytest.approx(exact, rel=RESOLUTION)
     assert sketch.quantiles(1.0)[0] == values.max()
-
-
-def test_quantiles_of_few_values_are_exact() -> None:
-    values = np.random.default_rng(1).lognormal(3, 2, 5000)
-    sketch = QuantileSketch.of(np.array_split(values, 7))
-    assert sketch.quantiles(0.99)[0] == np.quantile(values, 0.99)
+    few = QuantileSketch.of(np.array_split(values[-5000:], 7))
+    assert few.quantiles(0.99)[0] == np.quantile(values[-5000:], 0.99)
     assert QuantileSketch().quantiles(0.5) == [None]
+
+
+# --- curves ---------------------------------------------------------------------------------------
+
+
+VALUES = arrays(
+    np.float64,
+    st.integers(0, 300),
+    elements=st.one_of(st.floats(-5, 5, width=16), st.just(np.nan)),
+)
+
+
+@given(VALUES, st.integers(1, 20), st.integers(0, 5))
+def test_each_column_keeps_its_extremes_and_its_ends(
+    y: np.ndarray, columns: int, step: int
+) -> None:
+    """Compared column by column, as plotted on the screen."""
+    t = np.cumsum(np.arange(len(y)) % (step + 1) + 0.5)
+    keep = decimate(t, y, columns)
+    assert np.array_equal(keep, np.unique(keep))
+    if len(y) <= 4 * columns:
+        assert len(keep) == len(y)
+        return
+    assert len(keep) <= 4 * columns
+    column = np.minimum((t - t[0]) / (t[-1] - t[0]) * columns, columns - 1).astype(int)
+    # Indices that rounding assigns to a neighbouring column are compared in neither.
+    edge = np.abs((t - t[0]) / (t[-1] - t[0]) * columns - column) < 1e-9
+    for c in np.unique(column):
+        inside = (column == c) & ~edge
+        kept = np.isin(np.arange(len(y)), keep) & (column == c)
+        seen = y[inside & np.isfinite(y)]
+        if len(seen):
+            assert np.nanmin(y[kept]) <= seen.min()
+            assert np.nanmax(y[kept]) >= seen.max()
+    assert keep[0] == 0
+    assert keep[-1] == len(y) - 1

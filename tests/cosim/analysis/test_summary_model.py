@@ -7,19 +7,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 import noack
-from cosim.analysis.run_summary import Outcome
+from cosim.analysis.run_summary import Outcome, summarise
 from cosim.analysis.summary_model import LoopSummary, NetworkPart, RunSummary, read_summary
 from cosim.output.report_page import Report, page
+from cosim.output.run_tables import key_numbers
 from cosim.output.run_verdict import print_outcome
-from cosim.record.run_directory import ENVIRONMENT_FILE, changed_since, kind_of
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import ExitStatus
+from noack.protocol.machine_interface import GENERATION, RESTART
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
+from tests.cosim.record.changed_records import changed as altered
 from tests.cosim.summaries import summary_of, with_values
 
 HUGE = 10**400
@@ -98,13 +103,6 @@ def test_a_damaged_summary_is_shown_or_detected(record: RunRecord, summary: dict
     assert shown > 100  # numbers that may be missing, keys that are not shown
 
 
-@pytest.mark.parametrize("content", ["[" * 100_000, "{" * 100_000, "7", '{"kind": []}'])
-def test_a_damaged_environment_is_ignored(content: str, tmp_path: Path) -> None:
-    (tmp_path / ENVIRONMENT_FILE).write_text(content)
-    assert kind_of(tmp_path) == "live"
-    assert any(line.startswith("python was None") for line in changed_since(tmp_path))
-
-
 def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     if at:
         yield at
@@ -149,3 +147,41 @@ def test_the_docs_list_every_key() -> None:
     keys = [key for row in rows if row.startswith("| `") for key in re.findall(r"`(\w+)`", row)]
     expected = [*RunSummary.model_fields, *NetworkPart.model_fields, *LoopSummary.model_fields]
     assert sorted(keys) == sorted(expected)
+
+
+# --- figures of a run -----------------------------------------------------------------------------
+
+
+def simulated(content: dict[str, Any]) -> RunRecord:
+    return simulate(resolve(validate(content, "")))
+
+
+def test_the_expected_loss_rate_is_shown_beside_the_measured_one(content: dict[str, Any]) -> None:
+    """With loss probability p and cap N, Σ_{k=1…N} p^k drops are expected for each delivery."""
+    shown = summary_of(simulated(content))
+    drops = 0.5 + 0.5**2
+    assert shown.loops[0].loss_expected == pytest.approx(drops / (1 + drops))
+    assert ("  expected loss rate with the cap", "42.9 %") in key_numbers(shown)
+    change = {"at_s": 0.5, "set": {"network.loss.probability": 0.2}}
+    shown = summary_of(simulated(content | {"changes": [change]}))
+    assert shown.loops[0].loss_expected is None
+    assert not any("expected loss" in quantity for quantity, _ in key_numbers(shown))
+
+
+def test_restarts_and_their_missing_first_rows_are_listed(content: dict[str, Any]) -> None:
+    """One generation died before a recorder was back to which it could have sent its rows."""
+    record = simulated(content)
+    rows = record[SENSOR_MEASUREMENT].copy()
+    rows["input"][50:80] = GENERATION + 7 + np.arange(30)
+    rows["input"][80:] = 3 * GENERATION + np.arange(len(rows) - 80)
+    notices = [
+        {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
+        for k in (2, 3)
+    ]
+    restarted = altered(record, {SENSOR_MEASUREMENT: rows}, notices=notices, reports={})
+    found = summarise(restarted, 0, "").to_json()
+    assert found["missing_by_table"]["sensor"] == 7
+    first_s = (rows["now_ns"][[50, 80]] * 1e-9).tolist()
+    assert {one["generation"]: (one["first_s"], one["what"]) for one in found["restarts"]} == {
+        1: (first_s[0], None), 2: (None, "after 2"), 3: (first_s[1], "after 3"),
+    }  # fmt: skip

@@ -1,8 +1,14 @@
 """The end of a run: its summary, and how faults of record and analysis change it."""
 
 import json
+import os
 import shutil
+import time
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
+from threading import Event
 from typing import Any, NoReturn
 from unittest.mock import patch
 
@@ -10,8 +16,11 @@ import numpy as np
 import pytest
 
 import cosim.live.finalize
-from cosim.live.finalize import finalize, reopen
-from cosim.record.processes import write_reports
+from cosim.analysis.replay import replay
+from cosim.live import end_helpers
+from cosim.live.end_helpers import EndHelpers, PreparedEnding
+from cosim.live.finalize import ReplayBeside, finalize, reopen
+from cosim.live.simulated_run import simulate_run
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORDING_FILE,
@@ -61,51 +70,9 @@ def run_dir(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded, tmp_path / "run"))
 
 
-@pytest.fixture(scope="module")
-def finalized(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = Path(shutil.copytree(recorded, tmp_path_factory.mktemp("finalized") / "run"))
-    assert finalize(reopened(folder), report=False).status == ExitStatus.FAILED
-    return folder
-
-
-@pytest.fixture
-def whole(finalized: Path, tmp_path: Path) -> Path:
-    """A copy of the run with its summary."""
-    return Path(shutil.copytree(finalized, tmp_path / "whole"))
-
-
-def reopened(run_dir: Path) -> RunEnding:
-    """The ending of a run without a stored one."""
-    return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
-
-
 def summary_of(run_dir: Path) -> dict[str, Any]:
     summary: dict[str, Any] = json.loads((run_dir / SUMMARY_FILE).read_text())
     return summary
-
-
-def test_a_run_directory_that_was_deleted_is_not_created_again(
-    run_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def delete(*_: object) -> NoReturn:
-        shutil.rmtree(run_dir)
-        raise RuntimeError("the results need the directory")
-
-    monkeypatch.setattr(cosim.live.finalize, "replay", delete)
-    with pytest.raises(MachineError, match=r"summary\.json: cannot be written: No such file"):
-        finalize(ended_well(run_dir), report=False)
-    with pytest.raises(MachineError, match=r"reports\.json: cannot be written: No such file"):
-        write_reports(run_dir, [])
-    assert not run_dir.exists()
-
-
-def test_the_reason_is_told_if_the_run_directory_was_replaced(tmp_path: Path) -> None:
-    ending = RunEnding(tmp_path, 1, ExitStatus.FAILED, "the record was moved", None)
-    with pytest.raises(MachineError) as caught:
-        finalize(ending)
-    reason, error = str(caught.value).splitlines()
-    assert reason == "the run failed: the record was moved"
-    assert error == f"{tmp_path / SCENARIO_FILE}: no such file"
 
 
 def test_a_difference_in_the_replay_does_not_fail_the_run(run_dir: Path) -> None:
@@ -123,55 +90,73 @@ def ended_well(run_dir: Path) -> RunEnding:
     return RunEnding(run_dir, 0, ExitStatus.OK, "horizon")
 
 
-def test_a_run_that_cannot_be_replayed_fails(
+def no_rows(run_dir: Path) -> None:
+    record = load_record(run_dir)
+    empty = {table: record[table][:0] for table in record.tables}
+    write_run(alone(changed(record, empty, reports={})), run_dir)
+    (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
+
+
+def missing_rows(run_dir: Path, cut: slice) -> None:
+    record = load_record(run_dir)
+    write_run(alone(changed(record, {PLANT_STEP: np.delete(record[PLANT_STEP], cut)})), run_dir)
+
+
+def more_rows(run_dir: Path) -> None:
+    reports = json.loads((run_dir / REPORTS_FILE).read_text())
+    reports["plant"]["rows_by_loop"][PLANT_STEP][0] -= 7
+    (run_dir / REPORTS_FILE).write_text(json.dumps(reports))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (no_rows, "the run cannot be replayed: the record has no inputs"),
+        (
+            lambda run_dir: missing_rows(run_dir, slice(-40, None)),
+            "rows are missing from the record: 40 of plant_step",
+        ),
+        (
+            lambda run_dir: missing_rows(run_dir, slice(100, 140)),
+            "rows are missing from the record: 40 of plant_step",
+        ),
+        (more_rows, "the record has more rows than the processes reported: 7 of plant_step"),
+    ],
+)
+def test_a_run_whose_record_is_not_complete_fails(
+    run_dir: Path, damage: Callable[[Path], None], reason: str
+) -> None:
+    damage(run_dir)
+    with EndingFile(run_dir) as file:
+        file.store(ExitStatus.OK, "horizon", 1.5)
+    outcome = finalize(ended_well(run_dir), report=False)
+    assert (outcome.status, outcome.reason) == (ExitStatus.FAILED, reason)
+    assert summary_of(run_dir)["exit"] == {"status": 1, "reason": reason}
+    stored = json.loads((run_dir / ENDING_FILE).read_text())
+    assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
+    stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
+    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
+
+
+def test_a_run_that_cannot_be_replayed_or_whose_directory_is_deleted_fails(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def crash(*_: object) -> None:
+    """A directory that is gone is not created again."""
+
+    def crash(*_: object) -> NoReturn:
         raise RuntimeError("a mistake of ours")
 
     monkeypatch.setattr(cosim.live.finalize, "replay", crash)
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
-    assert outcome.reason == ("the run cannot be replayed: RuntimeError('a mistake of ours')")
-    assert summary_of(run_dir)["exit"] == {"status": 1, "reason": outcome.reason}
-
-
-def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
-    record = load_record(run_dir)
-    no_rows = {table: record[table][:0] for table in record.tables}
-    write_run(alone(changed(record, no_rows, reports={})), run_dir)
-    (run_dir / REPORTS_FILE).unlink()  # the total number of rows is unknown
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert outcome.status == ExitStatus.FAILED
-    assert outcome.reason == "the run cannot be replayed: the record has no inputs"
-
-
-@pytest.mark.parametrize("cut", [slice(-40, None), slice(100, 140)])
-def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
-    record = load_record(run_dir)
-    steps = record[PLANT_STEP]
-    lost = len(steps[cut])
-    write_run(alone(changed(record, {PLANT_STEP: np.delete(steps, cut)})), run_dir)
-    with EndingFile(run_dir) as file:
-        file.store(ExitStatus.OK, "horizon", 1.5)
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert outcome.status == ExitStatus.FAILED
-    stored = json.loads((run_dir / ENDING_FILE).read_text())
-    assert stored["exit"] == {"status": 0, "reason": "horizon"}  # the launcher saw no fault
-    assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
-    stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
-    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
-
-
-def test_a_run_with_more_rows_than_were_reported_fails(run_dir: Path) -> None:
-    reports = json.loads((run_dir / REPORTS_FILE).read_text())
-    reports["plant"]["rows_by_loop"][PLANT_STEP][0] -= 7
-    (run_dir / REPORTS_FILE).write_text(json.dumps(reports))
-    outcome = finalize(ended_well(run_dir), report=False)
-    assert (outcome.status, outcome.reason) == (
-        ExitStatus.FAILED,
-        "the record has more rows than the processes reported: 7 of plant_step",
-    )
+    assert outcome.reason == "the run cannot be replayed: RuntimeError('a mistake of ours')"
+    monkeypatch.setattr(cosim.live.finalize, "replay", lambda *_: shutil.rmtree(run_dir))
+    with pytest.raises(MachineError, match=r"summary\.json: cannot be written: No such file"):
+        finalize(ended_well(run_dir), report=False)
+    assert not run_dir.exists()
+    run_dir.mkdir()  # it was replaced
+    with pytest.raises(MachineError, match=r"^the run failed: it was moved\n.*: no such file$"):
+        finalize(RunEnding(run_dir, 1, ExitStatus.FAILED, "it was moved", None))
 
 
 def test_an_interrupted_replay_leaves_a_summary(
@@ -187,13 +172,6 @@ def test_an_interrupted_replay_leaves_a_summary(
     assert reopen(run_dir).summary.loops[0].replay is None
 
 
-@pytest.mark.parametrize("end", [None, {"status": 99, "reason": ""}])
-def test_a_damaged_summary_is_written_again(whole: Path, end: Any) -> None:
-    before = summary_of(whole)
-    (whole / SUMMARY_FILE).write_text(json.dumps(before | {"exit": end}))
-    assert reopen(whole).summary.to_json() == before
-
-
 def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     """An empty file comes from a launcher that ended before the run."""
     with EndingFile(run_dir) as file:
@@ -206,28 +184,21 @@ def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     assert outcome.summary.startup_s == 1.5
     (run_dir / SUMMARY_FILE).write_text("damaged")
     assert reopen(run_dir).reason == "stopped by SIGTERM"
-
-
-def test_an_error_of_the_launcher_is_stored_as_the_end(run_dir: Path) -> None:
     with pytest.raises(CallerError), EndingFile(run_dir):
         raise CallerError("the port is taken")
+    (run_dir / SUMMARY_FILE).unlink()
     outcome = reopen(run_dir)
     assert (outcome.status, outcome.reason) == (2, "the port is taken")
 
 
-def test_a_damaged_log_is_one_clear_line(run_dir: Path) -> None:
-    (run_dir / "record/notices.jsonl").write_bytes(b"\xae\xff")
-    with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
-        reopen(run_dir)
-
-
-def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
+def test_an_interrupted_finalisation_is_completed(run_dir: Path) -> None:
     """It may have ended while the log, the spool or the viewer's recording was written."""
-    notices, write = whole / "record/notices.jsonl", json.dumps
+    finalize(ended_well(run_dir), report=False)
+    notices, write = run_dir / "record/notices.jsonl", json.dumps
     notices.write_text('{"t_ns": 5, "level": "info", "text": "kept", "process": "plant"}\n')
     before = notices.read_text()
     for name in (SPOOL, f"{SPOOL}.done"):
-        writer = SpoolWriter(whole / name, "plant")
+        writer = SpoolWriter(run_dir / name, "plant")
         writer.append(PLANT_STEP, 0, b"")
         writer.close()
 
@@ -237,11 +208,88 @@ def test_an_interrupted_finalisation_is_completed(whole: Path) -> None:
         return write(value, **options)
 
     with patch("json.dumps", full), pytest.raises(MachineError, match="No space"):
-        finish_record(whole)
+        finish_record(run_dir)
     assert notices.read_text() == before
-    assert finish_record(whole).loop().notices
-    assert not [*whole.glob(f"{SPOOL}*")]
-    (whole / SUMMARY_FILE).unlink()
-    (whole / RECORDING_FILE).write_bytes(b"cut")
-    reopen(whole)
-    assert (whole / RECORDING_FILE).stat().st_size > 10_000
+    assert finish_record(run_dir).loop().notices
+    assert not [*run_dir.glob(f"{SPOOL}*")]
+    (run_dir / SUMMARY_FILE).unlink()
+    (run_dir / RECORDING_FILE).write_bytes(b"cut")
+    reopen(run_dir)
+    assert (run_dir / RECORDING_FILE).stat().st_size > 10_000
+
+
+# --- processes that help with the end of a long run -----------------------------------------------
+
+
+@pytest.fixture
+def many_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of more loops than are prepared at once, without a summary."""
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), ["horizon_s=1"])
+    assert scenario.loops is not None
+    loops = (scenario.loops[0].model_copy(update={"count": 17}),)
+    return simulate_run(scenario.model_copy(update={"loops": loops}), tmp_path).run_dir
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_prepared_end_is_that_of_a_run_without_preparation(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch, *, is_killed: bool
+) -> None:
+    given = (many_loops, 0, ExitStatus.OK, "horizon")
+    expected = finalize(RunEnding(*given), report=False, view=False).summary
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    for thread in helpers._threads:
+        thread.join()
+    assert helpers.expectations(range(17)) is not None
+    monkeypatch.setattr(cosim.live.finalize, "_expectations", _killed)
+    if is_killed:
+        assert helpers.submit(os.getpid).result() != os.getpid()
+        with pytest.raises(BrokenProcessPool):
+            helpers.submit(os._exit, 1).result()
+    ending = PreparedEnding(*given, helpers=helpers)
+    assert finalize(ending, report=False, view=not is_killed).summary == expected
+
+
+def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = Event()
+
+    def endless(helpers: EndHelpers, *_: object) -> None:
+        waiting = helpers.submit(time.sleep, 1e6)
+        begun.set()
+        waiting.result()
+
+    monkeypatch.setattr(EndHelpers, "_prepare_loops", endless)
+    monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
+    helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
+    helpers.prepare(many_loops)
+    begun.wait()
+    ending = PreparedEnding(many_loops, 0, ExitStatus.OK, "horizon", helpers=helpers)
+    assert len(finalize(ending, report=False, view=False).summary.loops) == 17
+
+
+def _killed(*_: object) -> None:
+    raise MemoryError
+
+
+@pytest.mark.parametrize("part", [ReplayBeside.part, _killed])
+def test_the_replay_beside_is_that_of_this_process_and_is_not_lost(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, part: Callable[..., Any]
+) -> None:
+    monkeypatch.setattr(end_helpers, "_MANY_STEPS", 10)
+    monkeypatch.setattr(end_helpers, "cores", lambda: 2)
+    asked = []
+
+    def told(self: ReplayBeside) -> Any:
+        asked.append(self)
+        with suppress(MemoryError):
+            return part(self)
+
+    monkeypatch.setattr(ReplayBeside, "part", told)
+    finalize(ended_well(run_dir), report=False)
+    stored = summary_of(run_dir)["loops"][0]["replay"]
+    assert stored == replay(load_record(run_dir)).verdict().model_dump()
+    assert len(asked) == 1

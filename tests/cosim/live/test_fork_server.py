@@ -35,26 +35,6 @@ def started(server: ForkServer, folder: Path, *arguments: str) -> Iterator[Forke
     process.wait()
 
 
-@pytest.mark.parametrize(
-    ("argument", "status", "text"),
-    [("--help", ExitStatus.OK, "usage: noack plant"), ("--no", ExitStatus.CALLER, "--no")],
-)
-def test_status_and_output_are_those_of_the_module(
-    server: ForkServer, tmp_path: Path, argument: str, status: int, text: str
-) -> None:
-    with started(server, tmp_path, argument) as process:
-        assert process.wait() == status
-    assert text in (tmp_path / "log").read_text()
-
-
-def test_a_process_reads_its_standard_input(server: ForkServer, tmp_path: Path) -> None:
-    with started(server, tmp_path) as process:
-        process.stdin.write("no ticket\n")
-        process.stdin.close()
-        assert process.wait() == ExitStatus.CALLER
-    assert "not a valid ticket" in (tmp_path / "log").read_text()
-
-
 def test_its_standard_input_ends_with_the_launchers_end(server: ForkServer, tmp_path: Path) -> None:
     """No other process, and not the server, may hold a lifeline open."""
     with ExitStack() as stack:
@@ -72,12 +52,6 @@ def test_a_process_is_a_child_in_a_session_of_its_own(server: ForkServer, tmp_pa
         process.kill()
         assert process.wait() == -signal.SIGKILL
         process.kill()  # it has ended: another process may have its pid
-
-
-def test_the_server_has_one_thread_when_it_forks(server: ForkServer, tmp_path: Path) -> None:
-    with started(server, tmp_path, "--help") as process:
-        process.wait()
-    assert psutil.Process(server._process.pid).num_threads() == 1
 
 
 _OF_ITSELF = """
@@ -119,7 +93,23 @@ def test_a_command_with_threads_or_another_encoding_starts_the_server_as_a_progr
     assert f"{ExitStatus.CALLER} Popen" in done.stdout
 
 
-def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:
+def test_an_ignored_sigchld_hides_the_exit_status_only(tmp_path: Path) -> None:
+    """The parent of a program may have ignored it, which is inherited."""
+    usual = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        with closing(ForkServer()) as server, started(server, tmp_path, "--no") as process:
+            assert process.wait() == ExitStatus.OK
+    finally:
+        signal.signal(signal.SIGCHLD, usual)
+    assert "--no" in (tmp_path / "log").read_text()
+
+
+def test_a_server_that_ends_or_cannot_be_started_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(ForkServer()) as server:
+        server._socket.close()  # as if the launcher had ended
+        assert server._process.wait() == ExitStatus.OK
     with closing(ForkServer()) as server:
         server._process.kill()
         server._process.wait()
@@ -128,29 +118,6 @@ def test_a_server_that_has_died_is_an_error(tmp_path: Path) -> None:
             started(server, tmp_path),
         ):
             pass
-
-
-def test_a_server_ends_with_its_launcher() -> None:
-    with closing(ForkServer()) as server:
-        server._socket.close()
-        assert server._process.wait() == ExitStatus.OK
-
-
-def test_an_ignored_sigchld_hides_the_exit_status_only(tmp_path: Path) -> None:
-    """The parent of a program may have ignored it, which is inherited."""
-    usual = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    try:
-        with closing(ForkServer()) as server, started(server, tmp_path) as process:
-            assert process.poll() is None
-            process.stdin.write("no ticket\n")
-            process.stdin.close()
-            assert process.wait() == ExitStatus.OK
-    finally:
-        signal.signal(signal.SIGCHLD, usual)
-    assert "not a valid ticket" in (tmp_path / "log").read_text()
-
-
-def test_a_server_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/nowhere/python")
     with pytest.raises(MachineError, match="fork server cannot be started"), fork_server():
         pass

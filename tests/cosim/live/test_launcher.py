@@ -1,23 +1,27 @@
 """Which processes the launcher restarts, when it ends the run, and the reason it reports."""
 
+import shutil
 import time
 from pathlib import Path
 from queue import SimpleQueue
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.launcher import _Run, launch, overtime_s
+from cosim.live.launcher import WaitLimit, _Run, launch, require_disk_space, spool_bytes
 from cosim.live.run_watcher import Watcher
+from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.protocol.topology import RECORDER, ROLES
+from noack.protocol.topology import ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.join_ticket import new_ticket, published
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import validate
 
 KILLED = "sensor died: killed by SIGKILL"
+LOG = "noack sensor: no room\n"
 
 
 class Child:
@@ -96,7 +100,7 @@ class Case:
         self.run_dir = run_dir
         (run_dir / "logs").mkdir()
         self.log = run_dir / "logs" / "sensor.log"
-        self.log.write_text("noack sensor: no room\n")
+        self.log.write_text(LOG)
 
     def children(self, code: int | None) -> FakeChildren:
         return FakeChildren(self.ticket, self.run_dir, code)
@@ -107,181 +111,77 @@ class Case:
             self.ticket, self.run_dir, cast(Any, coordinator), children, watcher, SimpleQueue()
         )
 
-    def result(self, code: int | None, now_s: float = 0.5, **failures: str) -> Failure | None:
-        coordinator = FakeCoordinator(now_s, **failures)
-        found = self.run(self.children(code), coordinator)._policy.check()
-        assert found is not None or coordinator.restarts == ["sensor"] * bool(code)
-        return found
-
 
 @pytest.fixture
 def case(content: dict[str, Any], tmp_path: Path) -> Case:
     return Case(content, tmp_path)
 
 
-@pytest.mark.parametrize("code", [-9, 143])
-def test_a_killed_process_is_restarted(case: Case, code: int) -> None:
-    assert case.result(code) is None
-
-
-@pytest.mark.parametrize("code", [1, 2])
-def test_a_process_that_reported_an_error_is_not_restarted(case: Case, code: int) -> None:
-    assert case.result(code) == (code, "sensor: no room")
-
-
 @pytest.mark.parametrize(
-    ("log", "why"),
+    ("code", "now_s", "log", "expected"),
     [
-        ("noack sensor: no room\nERROR of a library\n", "no room"),
-        ("ERROR of a library\n", "the disk is full"),
-        (None, "the disk is full"),
+        (-9, 0.5, LOG, None),
+        (143, 0.5, LOG, None),
+        (-9, 1.0, LOG, (ExitStatus.FAILED, KILLED)),  # after the horizon
+        (1, 0.5, LOG, (ExitStatus.FAILED, "sensor: no room")),
+        (2, 0.5, f"{LOG}ERROR of a library\n", (ExitStatus.CALLER, "sensor: no room")),
+        (1, 0.5, "ERROR of a library\n", (ExitStatus.FAILED, "sensor: the disk is full")),
+        (1, 0.5, None, (ExitStatus.FAILED, "sensor: the disk is full")),
     ],
 )
-def test_the_reason_is_taken_from_the_log_or_else_from_the_report(
-    case: Case, log: str | None, why: str
+def test_only_a_killed_process_is_restarted(
+    case: Case, code: int, now_s: float, log: str | None, expected: Failure | None
 ) -> None:
+    """The reason is taken from the log, or else from the report."""
     case.log.unlink()
     if log is not None:
         case.log.write_text(log)
-    assert case.result(1) == (ExitStatus.FAILED, f"sensor: {why}")
+    coordinator = FakeCoordinator(now_s)
+    assert case.run(case.children(code), coordinator)._policy.check() == expected
+    assert coordinator.restarts == ["sensor"] * (expected is None)
 
 
-def test_the_exit_status_of_a_process_takes_precedence_over_its_report(case: Case) -> None:
-    children = case.children(None)
-    coordinator = FakeCoordinator(0.5, "sensor", sensor="sensor ended early: no room")
-    policy = case.run(children, coordinator)._policy
-    assert policy.check() is None
-    children.exit("sensor", 2)
-    assert policy.check() == (ExitStatus.CALLER, "sensor: no room")
-
-
-def test_after_the_horizon_nothing_is_restarted_and_the_plant_never_is(case: Case) -> None:
-    assert case.result(-9, now_s=1.0) == (ExitStatus.FAILED, KILLED)
-    children = case.children(None)
-    children.exit("plant", -9)
-    reason = "plant died: killed by SIGKILL"
-    assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
-
-
-def test_a_restart_that_fails_ends_the_run(case: Case) -> None:
+def test_a_restart_that_fails_ends_the_run_with_both_reasons(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
     children = case.children(-9)
     children.can_start = False
     reason = f"{KILLED}; sensor cannot be started: no more processes"
     assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
-
-
-def test_a_process_that_is_not_restarted_ends_the_run(
-    case: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy = case.run(case.children(-9), FakeCoordinator(0.5))._policy
-    assert policy.check() is None
-    now_s = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now_s + 61.0)
-    assert policy.check() == (ExitStatus.FAILED, f"{KILLED}; not restarted within 60 s")
-
-
-def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Case) -> None:
     children = case.children(-9)
     policy = case.run(children, FakeCoordinator(0.5))._policy
     assert policy.check() is None
     assert policy.unfinished() == (ExitStatus.FAILED, f"{KILLED}; not restarted before the end")
+    with monkeypatch.context() as patch:
+        now_s = time.monotonic()
+        patch.setattr(time, "monotonic", lambda: now_s + 61.0)
+        late = (ExitStatus.FAILED, f"{KILLED}; not restarted within 60 s")
+        assert policy.check() == late
+    policy = case.run(children := case.children(-9), FakeCoordinator(0.5))._policy
+    assert policy.check() is None
     children.exit("sensor", 2)
     assert policy.check() == (ExitStatus.CALLER, f"{KILLED}; restarted, sensor: no room")
 
 
-@pytest.mark.parametrize(
-    ("running", "lost", "late"),
-    [
-        (("plant", RECORDER), (), "no report from plant"),
-        ((RECORDER,), (), "no report from recorder"),
-        ((), (RECORDER,), "no report from recorder"),  # it sorts a long record
-        ((), (), f"{', '.join(ROLES)} reported the end, but did not exit"),
-    ],
-)
-def test_a_run_that_does_not_end_names_the_late_process(
-    case: Case, running: tuple[str, ...], lost: tuple[str, ...], late: str
-) -> None:
-    coordinator = FakeCoordinator(2.0, **dict.fromkeys(lost, "stopped responding"))
-    coordinator._running = running
-    reason = case.run(case.children(None), coordinator)._overdue()
-    assert reason == (
-        f"the run did not end at its horizon: {late}, too slow or stopped; reduce the speed or the "
-        "rates"
-    )
+class Ending(FakeCoordinator):
+    """The plant dies at the first check; a last report arrives after it."""
 
+    children: FakeChildren
+    reports = 0
 
-@pytest.mark.parametrize(("load", "counts"), [(0.0, 1), (8.0, 4)])
-def test_the_wait_for_the_end_grows_with_the_load(
-    case: Case, monkeypatch: pytest.MonkeyPatch, load: float, counts: int
-) -> None:
-    """All processes go on after the horizon; time passes by a second at each look."""
-    elapsed_s = [0.0]
+    def poll(self) -> None:
+        self.children.exit("plant", -9)
 
-    def sleep(_: float) -> None:
-        elapsed_s[0] += 1.0
+    def progress(self) -> Any:
+        self.reports += 1
+        return {"warnings": ["late"]} if self.reports == 2 else None
 
-    class GoingOn(FakeCoordinator):
-        def poll(self) -> None: ...
-
-        def progress(self) -> None: ...
-
-        def stop(self, reason: str) -> None: ...
-
-    monkeypatch.setattr("cosim.live.launcher.time.monotonic", lambda: elapsed_s[0])
-    monkeypatch.setattr("cosim.live.launcher.time.sleep", sleep)
-    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
-    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
-    stopped_s: list[float] = []
-    run = case.run(case.children(None), GoingOn(1.0))
-    status, reason = run.watch(Signals(), lambda *_: stopped_s.append(elapsed_s[0]))
-    assert status is ExitStatus.FAILED
-    assert stopped_s == pytest.approx([counts * overtime_s(1.0)], abs=2 * counts)
-    assert ("start fewer runs at once" in reason) == (counts > 1)
-    assert elapsed_s[0] - stopped_s[0] > 10.0 * counts  # and for the processes to stop
-
-
-def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
-    children = case.children(None)
-    coordinator = FakeCoordinator(1.0, recorder="recorder stopped responding")
-    policy = case.run(children, coordinator)._policy
-    assert policy.check() is None
-    children.exit("recorder", -9)
-    assert policy.check() == (ExitStatus.FAILED, "recorder died: killed by SIGKILL")
-
-
-def test_a_progress_report_that_arrives_at_the_end_is_shown(case: Case) -> None:
-    class Ending(FakeCoordinator):
-        """All processes exit after the first check; the last report arrives after it."""
-
-        looks = 0
-
-        def poll(self) -> None:
-            for role in ROLES:
-                children.exit(role, 0)
-
-        def progress(self) -> Any:
-            self.looks += 1
-            return {"warnings": ["late"]} if self.looks == 2 else None
-
-    shown: list[Any] = []
-    children = case.children(None)
-    run = case.run(children, Ending(1.0), progress=shown.append)
-    assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
-    assert shown == [{"warnings": ["late"]}]
+    def stop(self, reason: str) -> None: ...
 
 
 def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> None:
     """The completion of the record of many loops takes minutes."""
-    children = case.children(None)
-    shown: list[str] = []
-
-    class Ending(FakeCoordinator):
-        def poll(self) -> None:
-            children.exit("plant", -9)  # never restarted
-
-        def progress(self) -> None: ...
-
-        def stop(self, reason: str) -> None: ...
+    shown: list[Any] = []
 
     def stopping(why: str) -> None:
         assert children.running()
@@ -289,11 +189,33 @@ def test_why_a_run_ends_early_is_shown_before_its_processes_end(case: Case) -> N
         for role in ROLES:
             children.exit(role, 0)
 
-    status, reason = case.run(children, Ending(0.5), stopping=stopping).watch(
-        Signals(), lambda *_: None
-    )
-    assert shown == [reason] == ["plant died: killed by SIGKILL"]
-    assert status is ExitStatus.FAILED
+    children, coordinator = case.children(None), Ending(0.5)
+    coordinator.children = children
+    run = case.run(children, coordinator, stopping=stopping, progress=shown.append)
+    status, reason = run.watch(Signals(), lambda *_: None)
+    assert shown == [reason, {"warnings": ["late"]}]
+    assert (status, reason) == (ExitStatus.FAILED, "plant died: killed by SIGKILL")
+
+
+def reached_after_s(limit: WaitLimit, load: float) -> float:
+    while not limit.is_reached:
+        limit.wait(0.125, load)
+    return limit.waited_s
+
+
+@pytest.mark.parametrize(
+    ("load", "times", "why"),
+    [
+        (0.4, 1, "waited 30 s (start_within_s); a load of 0.4 on 2 cores is not the likely cause"),
+        (2.0, 1, "a load of 2.0 on 2 cores is not the likely cause"),
+        (4.0, 2, "likely cause: a load of 4.0 on 2 cores; start fewer runs at once"),
+        (1e6, 20, "waited 600 s; likely cause: a load of 1000000.0 on 2 cores; start fewer runs"),
+    ],
+)
+def test_the_time_to_start_grows_with_the_load(load: float, times: int, why: str) -> None:
+    limit = WaitLimit(30.0, 2)
+    assert reached_after_s(limit, load) == pytest.approx(30.0 * times, abs=0.25)
+    assert why in limit.explain_start()
 
 
 def test_a_refused_session_leaves_no_run_directory(
@@ -305,3 +227,36 @@ def test_a_refused_session_leaves_no_run_directory(
     with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
         launch(scenario, tmp_path / "runs", spawn=(), session="lab")
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+# --- disk space -----------------------------------------------------------------------------------
+
+
+def with_free(monkeypatch: pytest.MonkeyPatch, free: float) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=int(free)))
+
+
+def test_the_estimated_size_is_that_of_all_rows_except_events(content: dict[str, Any]) -> None:
+    resolved = resolve(validate(content, ""))
+    record = simulate(resolved)
+    events = ("controller_delivery", "netem_packet", "netem_release")
+    rows = [record[table].nbytes for table in record.tables if table not in events]
+    assert spool_bytes(resolved) == pytest.approx(sum(rows), rel=0.002)
+
+
+def test_a_run_that_cannot_fit_is_refused_and_one_that_may_not_fit_begins_with_a_warning(
+    content: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scenario = validate(content | {"horizon_s": 1e7}, "")
+    with_free(monkeypatch, spool_bytes(resolve(scenario)) - 1)
+    with pytest.raises(MachineError, match=r"this run records .* are free on the disk"):
+        launch(scenario, tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+    resolved = resolve(validate(content | {"horizon_s": 1000.0}, ""))
+    for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
+        with_free(monkeypatch, share * 2 * spool_bytes(resolved))
+        require_disk_space([resolved] * 2, tmp_path / "not" / "yet")
+        assert ("warning: " in capsys.readouterr().err) == warned

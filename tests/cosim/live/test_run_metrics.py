@@ -28,23 +28,16 @@ PROGRESS: dict[str, Any] = {
 
 def test_metrics_follow_the_launchers_reports() -> None:
     found = RunMetrics(noack.load("lane_following"))
+    assert values_of(exposed(found))["noack_run_loss_burst_limit"] == 4
     watcher = found.watcher()
-    values = values_of(exposed(found))
-    assert "noack_run_events_total" not in values
-    assert values["noack_run_loss_burst_limit"] == 4
     watcher.waiting(["plant", "sensor"])
-    watcher.started(Path("runs/a"))
     watcher.failed("plant died", 1.0, None)
     watcher.restarted("plant", 1.5)
     watcher.progress(RunProgress(**PROGRESS, warnings=["void"]))
     values = values_of(exposed(found))
-    assert values["noack_run_info,lane_following,runs/a"] == 1
     assert values["noack_run_missing_processes"] == 2
-    assert values["noack_run_restarts_total,plant"] == 1
-    assert values["noack_run_failures_total"] == 1
-    assert values["noack_run_events_total"] == 7
-    assert values["noack_run_simulated_seconds"] == 2.5
-    assert values["noack_run_warnings_total"] == 1
+    assert values["noack_run_restarts_total,plant"] == values["noack_run_failures_total"] == 1
+    assert (values["noack_run_events_total"], values["noack_run_warnings_total"]) == (7, 1)
     assert "noack_run_state_norm" not in values
 
 

@@ -1,42 +1,168 @@
-"""A simulated run gives a run directory that all readers of run directories accept."""
+"""Simulated runs of one loop and of several: their directories, summaries, and commands."""
 
 import json
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import CliRunner, Result
 
-import cosim.live.finalize
-from cosim.analysis.summary_model import RunSummary
+from cosim.analysis.network_summary import in_flight
+from cosim.analysis.summary_model import read_summary
 from cosim.cli import app
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
-from cosim.record.run_directory import write_environment
 from cosim.record.run_record import RecordedRun, load_record
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.core.errors import CallerError, MachineError
-from noack.protocol.record_tables import tables
-from noack.scenario.resolution import resolve
+from noack.core.number_format import number as written
+from noack.protocol.record_tables import NETEM_PACKET, tables
+from noack.scenario.resolution import network_tables, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 
-ROOT = Path(__file__).parents[3]
-SHORT = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
-PATH = ROOT / "scenarios" / "double_integrator.toml"
+PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
+LOOPS = 11
 
 
-def noack(*arguments: str) -> Result:
-    return CliRunner().invoke(app, arguments)
+def noack(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Result:
+    words = [word for one in settings for word in ("--set", one)]
+    return noack("simulate", PATH, "--runs", folder, "--json", *options, *words)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    done = simulated(folder, "horizon_s=3")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    return (folder / "latest").resolve()
+
+
+def test_the_summary_adds_up(run_dir: Path) -> None:
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert read_summary(summary) is not None
+    assert read_summary(summary | {"loops": summary["loops"][::-1]}) is None
+    network, loops = summary["network"], summary["loops"]
+    assert [one["number"] for one in loops] == [*range(LOOPS)]
+    assert sum(one["link_share"] for one in loops) == pytest.approx(1)
+    for one in loops:
+        record = load_record(run_dir, one["name"])
+        assert one["events"] == len(record.events()) == one["deliveries"] + one["drops"]
+    assert sum(one["events"] for one in loops) == network["datagrams"]
+    assert sum(network["drops_by_cause"].values()) == sum(one["drops"] for one in loops)
+    # Little's law: the mean number in the network is the rate times the mean time in it.
+    times_s = sum(one["deliveries"] * (one["delay_mean_s"] or 0.0) for one in loops)
+    assert network["in_flight"]["mean"] == pytest.approx(times_s / 3, rel=0.02)
+
+
+def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
+    loop = (run_dir, "--loop", "periodic")
+    for words in ((run_dir,), loop):
+        shown = noack("summary", *words)
+        assert shown.exit_code == 0, shown.output
+        assert shown.stdout.count("--loop periodic --verbose") == (words == loop)
+        replayed = noack("replay", *words, "--json")
+        assert replayed.exit_code == 0, replayed.output
+        assert json.loads(replayed.stdout)["gaps"] == []
+    refused = noack("summary", run_dir, "--loop", "x")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
+    shown = noack("summary", run_dir).stdout
+    assert "bottleneck" in shown
+    assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
+    assert noack("report", *loop).exit_code == 0
+    page = run_dir / "report.html"
+    before = page.read_text()
+    assert noack("report", run_dir, "--again").exit_code == 0
+    link = '<a href="report-periodic.html">periodic</a>'
+    assert link not in before
+    assert link in page.read_text()
+
+
+def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
+    late = simulated(tmp_path, "horizon_s=2", "certificate.network_delay_s=0.001")
+    claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
+    reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
+    shown = noack("summary", tmp_path / "latest").stdout
+    assert len(re.findall("^void: ", shown, re.MULTILINE)) == min(len(reasons), 3) > 0
+
+
+@pytest.mark.parametrize("loop", [None, "periodic"])
+def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
+    path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
+    path.unlink(missing_ok=True)
+    done = noack("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
+    assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
+    assert path.read_bytes().startswith(b"RRF")
+
+
+def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    own = "A = [[0.0, 1.0], [50.0, 0.0]], B = [[0.0], [1.0]]"
+    wild = f'{{ name = "wild", phase = 0.75, plant = {{ draw = "given", {own} }} }}'
+    loops = f'loops=[{{ name = "calm", count = 2 }}, {wild}]'
+    change = 'changes=[{ at_s = 1.5, set = { "network.mansd" = 1 } }]'
+    settings = ("horizon_s=3", "network.actuation={}", loops, change)
+    done = simulated(tmp_path, *settings, options=["--no-report"])
+    assert done.exit_code == 1
+    summary = json.loads(done.stdout)
+    diverged_at_s = summary["loops"][2]["diverged_at_s"] + summary["loops"][2]["phase_s"]
+    reason = f"1 of 3 loops failed (wild diverged at {diverged_at_s:.2f} s)"
+    assert summary["exit"]["reason"] == reason
+    assert [(one["t_s"], one["what"]) for one in summary["changes"]] == [(1.5, "network.mansd = 1")]
+    assert [one["exit"]["status"] for one in summary["loops"]] == [0, 0, 1]
+    assert summary["reached_s"] == 3
+    # Finalised again, it is the same.
+    path = tmp_path / "latest/summary.json"
+    path.unlink()
+    shown = noack("summary", path.parent).stdout.splitlines()
+    assert json.loads(path.read_text()) == summary
+    (row,) = [line for line in shown if line.startswith(" wild")]
+    assert written(summary["loops"][2]["sup_e_c_norm"]) in row
+    assert re.match(r"guarantee not checkable in \d of 3 loops: ", shown[1])
+    sent = sum(one["actuations"]["sent"] for one in summary["loops"])
+    assert any(f" {sent} (" in line for line in shown)
+
+
+def test_the_number_in_flight_over_time() -> None:
+    """Two datagrams overlap from 10 to 20 s; a third did not wait, a fourth was lost."""
+    packets = np.zeros(4, network_tables()[NETEM_PACKET])
+    packets["copy_ns"] = -1
+    packets["now_ns"] = np.array([0, 10, 50, 60]) * 10**9
+    packets["release_ns"] = np.array([20 * 10**9, 30 * 10**9, 50 * 10**9, -1])
+    found = in_flight(packets, 100 * 10**9, 100 * 10**9)
+    assert (found.mean, found.max, found.width_s) == (pytest.approx(0.4), 2, 0.5)
+    assert found.max_by_interval[:60] == [1] * 20 + [2] * 20 + [1] * 20
+    assert not any(found.max_by_interval[61:])
+    assert found.mean_by_interval[20:40] == [2.0] * 20
+    assert in_flight(packets, 100 * 10**9, 40 * 10**9).mean == pytest.approx(1.0)  # stopped
+
+
+# --- one loop -------------------------------------------------------------------------------------
+
+
+ONE_LOOP = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
+SETTINGS = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run without a report, of which one was written later."""
     folder = tmp_path_factory.mktemp("runs")
-    settings = [word for setting in SHORT for word in ("--set", setting)]
-    done = noack("simulate", str(PATH), "--runs", str(folder), "--json", *settings)
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    words = ("simulate", str(ONE_LOOP), "--runs", str(folder), "--json", "--no-report")
+    done = noack(*words, *settings)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    assert not (folder / "latest/report.html").exists()
+    assert noack("report", "--runs", str(folder)).exit_code == 0
     return folder
 
 
@@ -46,52 +172,24 @@ def test_a_simulated_run_has_the_files_of_a_live_run(runs: Path) -> None:
         "scenario.toml", "environment.json", "record", "recording.rrd", "reports.json",
         "summary.json", "report.html", "ending.json", "logs", ".lock",
     }  # fmt: skip
-    assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
     assert {path.name for path in (run_dir / "record").iterdir()} == {
         *(f"{table}.parquet" for table in tables(2, 1)),
         "notices.jsonl",
     }
-
-
-@pytest.fixture
-def reported(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Run directories for which a report would be written."""
-    written: list[Path] = []
-
-    def report(run: RecordedRun, summary: RunSummary, run_dir: Path, loop: str | None) -> Path:
-        written.append(run_dir)
-        return run_dir / "report.html"
-
-    monkeypatch.setattr(cosim.live.finalize, "_write_report", report)
-    return written
-
-
-def test_a_report_can_be_omitted_and_written_later(tmp_path: Path, reported: list[Path]) -> None:
-    settings = [word for setting in SHORT for word in ("--set", setting)]
-    done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
-    assert done.exit_code == 0, done.output
-    assert "report.html" not in done.stdout
-    assert reported == []
-    assert noack("report", "--runs", str(tmp_path)).exit_code == 0
-    assert reported == [(tmp_path / "latest").resolve()]
+    reader = rerun.chunk.RrdReader(run_dir / "recording.rrd")
+    (store,) = reader.recordings()
+    paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
+    assert {blueprint.EVENT, blueprint.INPUT} <= paths
+    assert not [path for path in paths if path.startswith("lateness")]
 
 
 def test_the_record_on_disk_equals_the_simulators(runs: Path) -> None:
-    again, loaded = simulate(resolve(load(PATH, SHORT))), load_record(runs / "latest")
+    again, loaded = simulate(resolve(load(ONE_LOOP, SETTINGS))), load_record(runs / "latest")
     assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
     assert loaded.scenario == again.scenario
     assert loaded.kind == again.kind == "simulated"
     assert loaded.reports == again.reports
     assert loaded.notices == again.notices
-
-
-def test_the_recording_of_a_simulated_run_has_no_lateness(runs: Path) -> None:
-    reader = rerun.chunk.RrdReader(runs / "latest" / "recording.rrd")
-    (store,) = reader.recordings()
-    paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
-    assert blueprint.EVENT in paths
-    assert blueprint.INPUT in paths
-    assert not [path for path in paths if path.startswith("lateness")]
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
@@ -104,25 +202,14 @@ def test_an_interrupted_simulation_leaves_no_run_directory(
     monkeypatch.setattr("cosim.live.simulated_run.simulate_loops", broken)
     expected = MachineError if isinstance(error, OSError) else type(error)
     with pytest.raises(expected):
-        simulate_run(load(PATH, SHORT), tmp_path)
+        simulate_run(load(ONE_LOOP, SETTINGS), tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_run_directory_without_a_kind_is_a_live_run(runs: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "old"
-    folder.mkdir()
-    for path in (runs / "latest").iterdir():
-        (folder / path.name).symlink_to(path)
-    (folder / "environment.json").unlink()
-    assert load_record(folder).kind == "live"
-    write_environment(folder, "simulated")
-    assert load_record(folder).kind == "simulated"
 
 
 def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:
     (tmp_path / "long.txt").write_text("10" * 200_000)
     trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
-    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path)
+    ending = simulate_run(load(ONE_LOOP, (*SETTINGS, trace)), tmp_path)
     assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
     with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
         load(ending.run_dir / "scenario.toml")

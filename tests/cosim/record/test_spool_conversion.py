@@ -4,13 +4,16 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
-from cosim.record.run_record import RecordedRun, Rows, RunRecord, load_run
-from cosim.record.spool_conversion import finish_record
+from cosim.record.run_record import RecordedRun, Rows, load_run
+from cosim.record.spool_conversion import Segment, finish_record, merged
 from cosim.record.table_files import StoredTables, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
@@ -67,21 +70,20 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     out.close()
 
 
+def same_rows(run_dir: Path, shared: RecordedRun) -> None:
+    found = finish_record(run_dir)
+    for record, expected in zip(
+        (found.network, *load_run(run_dir).loops), (shared.network, *shared.loops), strict=True
+    ):
+        for table in expected.tables:
+            assert record[table].tobytes() == expected[table].tobytes(), table
+
+
 def opened(shared: RecordedRun, run_dir: Path) -> Path:
     run_dir.mkdir()
     write_scenario(shared.network.scenario, run_dir)
     write_environment(run_dir, "live")
     return run_dir
-
-
-def same_rows(one: RunRecord, other: RunRecord, *but: str) -> None:
-    for table in one.tables:
-        if table not in but:
-            assert one[table].tobytes() == other[table].tobytes(), table
-
-
-def records(run_dir: Path) -> list[RunRecord]:
-    return list(load_run(run_dir).loops)
 
 
 def test_every_row_and_line_reaches_the_record_of_its_loop(
@@ -93,35 +95,21 @@ def test_every_row_and_line_reaches_the_record_of_its_loop(
     out = SpoolWriter(run_dir / SPOOL, "recorder")
     for number, notice in enumerate((Notice(5, "info", "mine", 1), Notice(7, "info", "all"))):
         out.append(notices_of("sensor"), number, json.dumps(notice.line()).encode())
-    out.append(notices_of("plant"), 0, b"damaged")
-    out.append(PLANT_STEP, 10**6, b"damaged")
-    out.close()
-    network = finish_record(run_dir).network
-    same_rows(network, shared.network)
-    for record, expected in zip(records(run_dir), shared.loops, strict=True):
-        same_rows(record, expected)
-        assert (record.kind, record.number, record.scenario) == (
-            "live", expected.number, expected.scenario,
-        )  # fmt: skip
-    lines = [[line["text"] for line in one.notices] for one in records(run_dir)]
-    assert lines == [["all"], ["mine", "all"], ["all"]]
-    assert [line["text"] for line in network.notices] == ["all"]
-    assert not (run_dir / SPOOL).exists()
-
-
-def test_a_line_of_no_loop_of_the_run_is_left_out(shared: RecordedRun, tmp_path: Path) -> None:
-    run_dir = opened(shared, tmp_path / "run")
-    out = SpoolWriter(run_dir / SPOOL, "recorder")
-    for number, loop in enumerate((-1, LOOPS, True, 1.0, "1", 2**70, [1])):
+    for number, loop in enumerate((-1, LOOPS, True, 1.0, "1", 2**70, [1])):  # loops of no run
         line = {"t_ns": number, "level": "info", "text": "damaged", "loop": loop}
         out.append(notices_of("plant"), number, json.dumps(line).encode())
     out.append(notices_of("plant"), 10, b"[" * 100_000)
-    out.append(notices_of("plant"), 11, json.dumps(Notice(5, "info", "own", 2).line()).encode())
+    out.append(PLANT_STEP, 10**6, b"damaged")
     out.close()
-    network = finish_record(run_dir).network
-    lines = [[line["text"] for line in one.notices] for one in records(run_dir)]
-    assert lines == [[], [], ["own"]]
-    assert not network.notices
+    same_rows(run_dir, shared)
+    run = load_run(run_dir)
+    for record, expected in zip(run.loops, shared.loops, strict=True):
+        assert (record.kind, record.number) == ("live", expected.number)
+        assert record.scenario == expected.scenario
+    lines = [[line["text"] for line in one.notices] for one in run.loops]
+    assert lines == [["all"], ["mine", "all"], ["all"]]
+    assert [line["text"] for line in run.network.notices] == ["all"]
+    assert not (run_dir / SPOOL).exists()
 
 
 def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
@@ -137,13 +125,11 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
         with pytest.raises(MachineError, match="is kept in"):
             finish_record(run_dir)
     finish_record(run_dir)
-    counts = [one.count(PLANT_STEP) for one in records(run_dir)]
+    counts = [one.count(PLANT_STEP) for one in load_run(run_dir).loops]
     assert sum(counts) == len(rows[PLANT_STEP]) // 2
     for table, found in later.items():  # a process that was frozen spools its rows after the end
         spool(run_dir, table, found, writer="frozen")
-    same_rows(finish_record(run_dir).network, shared.network)
-    for record, expected in zip(records(run_dir), shared.loops, strict=True):
-        same_rows(record, expected)
+    same_rows(run_dir, shared)
 
 
 def _fail(*_: object) -> None:
@@ -175,7 +161,7 @@ def test_a_loops_reports_count_its_own_rows_and_datagrams(
     content = {"plant": plant, "netem": netem, "earlier": [plant | {"process": "plant"}]}
     (run_dir / REPORTS_FILE).write_text(json.dumps(content))
     finish_record(run_dir)
-    for number, record in enumerate(records(run_dir)):
+    for number, record in enumerate(load_run(run_dir).loops):
         report = record.reports["plant"]
         assert report["rows"] == {PLANT_STEP: steps[number], "plant_actuation": 0}
         assert report["channel"] == own[number]
@@ -194,3 +180,18 @@ def test_a_loop_without_rows_between_long_ones_is_empty(tmp_path: Path) -> None:
     stored = StoredTables(tmp_path, {PLANT_STEP: dtype}, 10**6)
     assert stored.whole(PLANT_STEP).tobytes() == np.concatenate(batches).tobytes()
     assert [stored.count_of_loop(PLANT_STEP, k) for k in range(len(counts))] == list(counts)
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 12)), max_size=12), st.integers(1, 30))
+def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]], at_once: int) -> None:
+    """Batches in any order, overlapping, repeated, empty; gaps stay gaps."""
+    dtype, segments = np.dtype([("input", "<i8"), ("value", "<f8")]), []
+    for first, count in ranges:
+        rows = np.zeros(count, dtype)
+        rows["input"] = rows["value"] = np.arange(first, first + count)
+        if count:
+            segments.append(Segment(first, first + count - 1, lambda rows=rows: rows))
+    with patch("cosim.record.spool_conversion.BATCH_ROWS", at_once):
+        rows = np.concatenate([np.zeros(0, dtype), *merged(segments, dtype)])
+    present = sorted({k for first, n in ranges for k in range(first, first + n)})
+    assert rows["input"].tolist() == rows["value"].tolist() == present

@@ -1,7 +1,6 @@
 """The core drives the machines of a run as the plain driver in Python does, bit for bit."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import loops_of
 from noack.scenario.scenario_file import load, validate
 from tests.cosim.simulation.shuttle import Shuttle, shuttled
+from tests.oracles.random_scenarios import POLICIES, random_scenario
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 IMPAIRMENTS = [
@@ -21,11 +21,6 @@ IMPAIRMENTS = [
     {"kind": "corrupt", "probability": 0.3},
     {"kind": "delay", "delay_s": 0.01, "jitter_s": 0.01},
 ]
-FLOWS: dict[str, dict[str, Any]] = {
-    "updates": {},
-    "acknowledgements": {"protocol": "ack", "acknowledgements": {"impairments": IMPAIRMENTS}},
-    "actuations": {"actuation": {"impairments": IMPAIRMENTS, "mansd": 2}},
-}
 LOOPS = [
     {"name": "pendulum", "count": 3},
     {"name": "periodic", "trigger": {"policy": "periodic", "period_s": 0.1}},
@@ -49,30 +44,11 @@ def require_equal(found: RunRecord, expected: RunRecord) -> None:
     assert found.notices == expected.notices
 
 
-@pytest.mark.parametrize("flows", FLOWS)
-def test_one_loop(flows: str) -> None:
-    network = {"impairments": IMPAIRMENTS} | FLOWS[flows]
-    base = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"])
-    given = base.model_dump(mode="json", exclude_none=True)
-    resolved = resolve(validate(given | {"network": given["network"] | network}, ""))
-    found = simulate(resolved)
-    require_equal(found, shuttled(resolved))
-    rejected = {
-        reason for report in found.reports.values() for reason in report["channel"]["rejected"]
-    }
-    assert {"stale", "tag"} <= rejected
-
-
-def test_changes_during_the_run() -> None:
-    changes = [
-        {"at_s": 0.5, "set": {"network.loss.good_to_bad": 0.9, "network.mansd": 1}},
-        {"at_s": 1.0, "set": {"trigger.beta": 0.1, "controller.setpoint": [0.0, 0.0]}},
-    ]
-    given = load(SCENARIOS / "unstable_pendulum.toml", ["horizon_s=3.0"]).model_dump(
-        mode="json", exclude_none=True
-    )
-    resolved = resolve(validate(given | {"changes": changes}, ""))
-    require_equal(simulate(resolved), shuttled(resolved))
+@pytest.mark.parametrize("first", range(len(POLICIES)))
+def test_random_loops(first: int) -> None:
+    for number in range(first, 3 * len(POLICIES), len(POLICIES)):
+        resolved = resolve(validate(random_scenario(number), "random"))
+        require_equal(simulate(resolved), shuttled(resolved))
 
 
 def test_a_scripted_network() -> None:

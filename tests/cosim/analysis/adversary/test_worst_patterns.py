@@ -174,16 +174,6 @@ def test_a_pattern_makes_the_run_of_the_machines(sections: dict[str, Any]) -> No
     assert len(x) == loop.last + 1
 
 
-def test_losses_of_a_script_play_the_worst_pattern() -> None:
-    resolved = scenario_of(EXAMPLES["mixed"])
-    worst = find_worst(resolved, Objective.ERROR)
-    lost = [event for event, arrives in enumerate(worst.pattern) if not arrives]
-    script = {"mansd": 1, "loss": {"model": "scripted", "lost": lost}}
-    record = simulate(scenario_of(EXAMPLES["mixed"], network=script))
-    assert lost
-    assert event_steps(record) == [round(t_s / STEP_S) for t_s in worst.event_s]
-
-
 @pytest.mark.parametrize(
     ("scenario", "message"),
     [

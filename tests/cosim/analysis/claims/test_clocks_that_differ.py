@@ -12,15 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.analysis.claims.condition_reader import read_conditions
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, RunClaims
+from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.observed_conditions import ObservedConditions, combined
 from cosim.analysis.replay import replay
-from cosim.analysis.summary_model import ClaimVerdict
-from cosim.record.run_record import RunRecord
+from cosim.analysis.summary_model import Claim, ClaimVerdict
+from cosim.record.record_source import rows_by_loop
+from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER, tables
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import allowed_conditions
 from tests.cosim.analysis.claims.conftest import Make
+from tests.cosim.record.changed_records import changed
 from tests.cosim.simulation.shuttle import shuttled
 from tests.machine_interface import Machine
 
@@ -89,28 +92,117 @@ def test_every_claim_holds_whatever_the_clocks(make: Make, delay_s: float) -> No
     assert seen == {True, False}
 
 
-@pytest.mark.parametrize("offset_ns", [40 * MS, -40 * MS])
-def test_a_clock_that_is_off_is_a_measured_age_of_the_input(make: Make, offset_ns: int) -> None:
-    scenario = make(certificate={"late_periods": 0})
-    record = simulated(scenario, {"controller": (offset_ns, 0)})
-    found, exact = read_conditions(record), read_conditions(simulate(scenario))
-    hold_s, exact_s = found.hold.largest(), exact.hold.largest()
-    assert hold_s is not None
-    assert exact_s is not None
-    assert hold_s >= 0.04 - exact_s
-    assert hold_s > allowed_conditions(scenario).hold_s
-    assert (covered := ClaimEvaluation(record).certified_for) is not None
-    assert covered.hold_s == hold_s
-    assert {*certified(record).values()} == {ClaimVerdict.HELD}
+# --- bounds of the clocks' errors that a run has recorded -----------------------------------------
 
 
-def test_the_networks_and_the_sensors_clocks_enter_no_condition(make: Make) -> None:
-    """Without a delay in the network, only ``now_ns`` of their rows differs."""
-    scenario = make()
-    exact = simulate(scenario)
-    record = simulated(scenario, {"netem": (50 * MS, 100_000), "sensor": (-50 * MS, -100_000)})
-    assert ClaimEvaluation(record).judge() == ClaimEvaluation(exact).judge()
-    for found, expected in zip(
-        read_conditions(record)[:5], read_conditions(exact)[:5], strict=True
-    ):
-        np.testing.assert_array_equal(found, expected)
+GOOD_NS, WIDE_NS = 20_000, 3 * MS
+Errors = dict[tuple[str, int], int]
+"""The bounds that differ, by table and number of the row."""
+
+
+@pytest.fixture(scope="module")
+def clocked(make: Make) -> RunRecord:
+    """A run whose processes recorded the bounds of their clocks' errors every 50 ms."""
+    record = simulate(make(clocks={"largest_error_us": 1000.0}))
+    return changed(record, {table: clock_rows(record, table) for table in CLOCK_TABLES})
+
+
+def clock_rows(record: RunRecord, table: str) -> Rows:
+    ends_ns = np.arange(0, 6001, 50) * MS
+    rows = np.zeros(len(ends_ns), record.tables[table])
+    rows["input"] = np.arange(len(ends_ns))
+    rows["now_ns"], rows["t_ns"] = ends_ns, ends_ns - 50 * MS
+    rows["error_ns"] = 0 if OWNER[table] == "plant" else GOOD_NS
+    return rows
+
+
+def with_errors(record: RunRecord, errors: Errors, **t_ns: int) -> RunRecord:
+    rows = {table: record[table].copy() for table in CLOCK_TABLES}
+    for (table, number), error_ns in errors.items():
+        rows[table]["error_ns"][number] = error_ns
+        rows[table]["t_ns"][number] = t_ns.get(table, rows[table]["t_ns"][number])
+    return changed(record, rows)
+
+
+def judged(record: RunRecord) -> list[Claim]:
+    return ClaimEvaluation(record).judge()
+
+
+def test_small_bounds_change_no_verdict(make: Make, clocked: RunRecord) -> None:
+    without = judged(simulate(make()))
+    assert judged(clocked) == without
+    assert {claim.source for claim in without} >= {"certificate", "(I1)"}
+    assert ClaimVerdict.HELD in {claim.verdict for claim in without}
+    assert read_conditions(clocked).summary()["clock_error_s"] == pytest.approx(GOOD_NS * 1e-9)
+
+
+LOST = "the bound of the error of sensor's clock was lost"
+
+
+@pytest.mark.parametrize(
+    ("errors", "t_ns", "since_s", "why"),
+    [
+        (
+            {("netem_clock", 40): WIDE_NS}, {}, 1.95,
+            "the clock of netem may have been off by 0.003 s, 0.001 s allowed",
+        ),
+        ({("sensor_clock", 40): LOST_NS}, {}, 1.95, LOST),
+        ({("sensor_clock", 60): LOST_NS}, {"sensor_clock": 777 * MS}, 0.777, LOST),
+        ({("sensor_clock", 0): LOST_NS}, {"sensor_clock": -5 * MS}, 0.0, LOST),
+        ({("sensor_clock", 40): LOST_NS, ("sensor_clock", 60): LOST_NS},
+         {"sensor_clock": 777 * MS}, 0.777, LOST),
+    ],
+)  # fmt: skip
+def test_all_claims_are_void_from_then_on_for_that_reason(
+    clocked: RunRecord, errors: Errors, t_ns: dict[str, int], since_s: float, why: str
+) -> None:
+    record = with_errors(clocked, errors, **t_ns)
+    for claim in judged(record):
+        assert claim.verdict is not ClaimVerdict.HELD
+        if claim.verdict is ClaimVerdict.VOID and claim.since_s != 0:
+            assert claim.since_s == pytest.approx(since_s)
+            assert why in claim.why
+    assert ClaimVerdict.VOID in {claim.verdict for claim in judged(record)}
+    first = min(RunClaims(record).violations())
+    assert (first.t_s, first.text) == (pytest.approx(since_s), why)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_batches_show_what_the_whole_record_shows(clocked: RunRecord, seed: int) -> None:
+    rng, errors, since_ns = np.random.default_rng(seed), {}, {}
+    for table in CLOCK_TABLES:
+        for number in rng.integers(1, 120, int(rng.integers(0, 4))).tolist():
+            errors[table, number] = int(rng.choice([LOST_NS, WIDE_NS, 2 * WIDE_NS]))
+        if rng.uniform() < 0.5:
+            since_ns[table] = int(rng.integers(0, 6000)) * MS
+    record = with_errors(clocked, errors, **since_ns)
+    reader, whole = ConditionReader(record.scenario), read_conditions(record)
+    parts: list[ObservedConditions] = []
+    cuts = np.sort(rng.integers(0, 121, 5))
+    for piece in zip(*(np.split(record[table], cuts) for table in CLOCK_TABLES), strict=True):
+        for table, rows in zip(CLOCK_TABLES, piece, strict=True):
+            reader.take(table, rows)
+        parts.append(reader.observed())
+    for cause, series in combined(parts).clocks.items():
+        np.testing.assert_array_equal(series, whole.clocks[cause])
+
+
+def test_each_of_several_loops_has_the_rows_in_its_own_time() -> None:
+    table, phases_ns = CLOCK_TABLES[0], (0, 7)
+    rows = np.zeros(2, tables(1, 1, clocks=True)[table])
+    rows["t_ns"] = 10, 20
+    found = dict(rows_by_loop(table, rows, phases_ns, [{table: rows.dtype}] * 2))
+    assert [one["t_ns"].tolist() for one in found.values()] == [[10, 20], [3, 13]]
+
+
+def test_the_claims_of_a_stopped_run_end_with_it(clocked: RunRecord) -> None:
+    """What a clock does after the common end is not part of the claims."""
+    reports = {
+        role: {"ended": "stopped", "reached_ns": 3000 * MS, "rows": {}}
+        for role in ("plant", "sensor", "netem", "controller")
+    }
+    late = changed(with_errors(clocked, {("sensor_clock", 100): LOST_NS}), reports=reports)
+    assert RunClaims(late).violations() == []
+    early = changed(with_errors(clocked, {("sensor_clock", 50): LOST_NS}), reports=reports)
+    (one,) = RunClaims(early).violations()
+    assert one.cause == "sensor clock lost"

@@ -9,13 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cosim.simulation.continuous import ContinuousLoop, ContinuousRun, simulate_continuous
-from cosim.simulation.exact_simulation import (
-    OK,
-    Events,
-    Population,
-    Setting,
-    run_batch,
-)
+from cosim.simulation.exact_simulation import OK, Events, Population, Setting, run_batch
 from noack.core.linear_systems import Vector
 from noack.impairments.constraints.at_most import AtMost
 from noack.impairments.kinds.corrupt import Corrupt

@@ -10,10 +10,7 @@ import pytest
 from cosim.shipped_files import find_shipped
 from cosim.simulation.continuous import TooManyEventsError, run_continuous
 from cosim.simulation.exact_simulation import (
-    DIVERGED,
-    OK,
     TOO_MANY_EVENTS,
-    UNDECIDED,
     Population,
     Setting,
     run_batch,
@@ -36,15 +33,7 @@ from tests.cosim.simulation.batch.exact import (
     random_setting,
     reference,
 )
-from tests.trigger_rules import (
-    TABLES,
-    absolute_rule,
-    decaying_rule,
-    mixed_rule,
-    periodic_rule,
-    quadratic_rule,
-    random_rule,
-)
+from tests.trigger_rules import TABLES, decaying_rule, mixed_rule, quadratic_rule, random_rule
 
 MS = 10**6
 SIZES = ((4, 2), (2, 1))
@@ -119,12 +108,6 @@ def draw_of(A: Matrix) -> Population:
     return Population(A[None], np.ones((1, n, n // 2)), start, np.zeros(1, np.uint64))
 
 
-def rotation(omega: float) -> Matrix:
-    turn = np.zeros((4, 4))
-    turn[0, 1], turn[1, 0] = omega, -omega
-    return turn
-
-
 @pytest.mark.parametrize("alpha_omega", [0.1, 70.0])
 @pytest.mark.parametrize("omega", [0.3, 200.0])
 @pytest.mark.parametrize("depth", [1e-2, 1e-11])
@@ -139,54 +122,6 @@ def test_very_short_crossings_are_found(depth: float, omega: float, alpha_omega:
     assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
     assert run_events(*beyond).event_s.size == 0
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["decaying", "relative", "periodic", "dynamic", "quadratic", "dwell of quadratic"],
-)
-def test_runs_diverge_at_the_same_time_as_in_the_exact_simulator(name: str) -> None:
-    quiet = name in ("decaying", "relative", "dynamic", "quadratic")
-    for setting, population in settings(name, range(3)):
-        wild = population._replace(A=population.A + 20 * np.eye(len(setting.H)))
-        forever = replace(setting, horizon_s=60.0, most_events=100_000)
-        if quiet:  # The model equals the plant, so there are no events.
-            forever = replace(forever, H=wild.A[0] + wild.B[0] @ setting.K, known_start=True)
-        draw = one(wild, 0)
-        (row,) = run_batch(forever, draw)
-        run = reference(forever, draw, 100_000)
-        assert row["status"] == DIVERGED
-        assert row["diverged_at_s"] == pytest.approx(run.diverged_at_s, rel=1e-9)
-        assert row["transmissions"] == len(run.event_s)
-
-
-@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
-def test_the_supremum_between_events_is_certified(omega: float) -> None:
-    """e_c = e_s turns with x, and nothing is sent: sup ‖e_c‖ is 2‖x(0)‖, at π/ω."""
-    setting = known_loop(np.zeros((4, 4)), absolute_rule(2.001, n=4), 1.5 * math.pi / omega)
-    (row,) = run_batch(setting, draw_of(rotation(omega)))
-    assert row["transmissions"] == 0
-    assert 1 - 1e-10 <= row["sup_e_c_scaled"] / 2.0 <= 1 + 1e-12
-
-
-def test_a_norm_that_stays_within_rounding_of_a_level_is_undecided() -> None:
-    """x rotates with ‖x‖ = 1; the comparison with 1 + 1e-13 takes a million evaluations."""
-    turn = rotation(3.0)
-    setting = known_loop(turn, absolute_rule(1.0, n=4), 4.0, settle=1 + 1e-13)
-    (row,) = run_batch(setting, draw_of(turn))
-    assert row["status"] == UNDECIDED
-    assert math.isnan(row["cost"])
-    (row,) = run_batch(replace(setting, settle=1 + 1e-6), draw_of(turn))
-    assert row["status"] == OK
-    assert row["settling_s"] == 0.0
-
-
-@pytest.mark.parametrize("rate_per_s", [1e11, 1e17])
-def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
-    """Polynomials of 1e-10 s take too many steps; a float cannot represent steps of 1e-16 s."""
-    fast = -rate_per_s * np.eye(4)
-    (row,) = run_batch(known_loop(fast, periodic_rule(1000 * MS, n=4), 4.0), draw_of(fast))
-    assert row["status"] == UNDECIDED
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])

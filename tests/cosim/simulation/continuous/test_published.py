@@ -22,11 +22,9 @@ from cosim.simulation.continuous import (
 from noack.scenario.resolution import LoopMatrices, resolve
 from noack.scenario.scenario_file import load
 from noack.trigger.trigger_rule import TriggerRule
-from tests.trigger_rules import absolute_rule, lyapunov_rule, mixed_rule, quadratic_rule
+from tests.trigger_rules import absolute_rule, lyapunov_rule, mixed_rule
 
 Matrix = NDArray[np.float64]
-MS = 1_000_000
-
 System = tuple[Matrix, Matrix, Matrix]
 """A, B, K."""
 
@@ -42,8 +40,6 @@ def system_of(loop: ContinuousLoop) -> System:
 
 TABUADA = system_of(shipped("tabuada_dynamic"))
 REACTOR = system_of(shipped("reactor_petc"))
-P = np.array([[1.0, 0.25], [0.25, 1.0]])
-"""Of V = xᵀPx in Tabuada, IEEE TAC 52(9), 2007, Section V."""
 
 
 def held(system: System, policy: TriggerRule) -> ContinuousLoop:
@@ -82,19 +78,6 @@ def step(system: System, t_s: float) -> Matrix:
 def directions(count: int) -> Matrix:
     angles = np.linspace(0.0, math.pi, count, endpoint=False)
     return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def test_the_reactors_inter_event_times_are_those_printed_by_etcetera() -> None:
-    """Printed: regions {1}, {2}, {3}, {4}, {5}, in periods, with a heartbeat of 20.
-
-    ETCetera (Delimpaltadakis, de A. Gleizer, van Straalen, Mazo Jr., HSCC 2022), documentation,
-    Examples, Linear PETC; the rule is of Heemels, Donkers, Teel, IEEE TAC 58(4), 2013.
-    """
-    loop = shipped("reactor_petc")
-    seen: set[int] = set()
-    for x0 in np.random.default_rng(0).normal(size=(40, 4)):
-        seen |= set(np.rint(between(run_from(x0, loop, 2.0)) / 0.01).astype(int).tolist())
-    assert seen == {1, 2, 3, 4, 5}
 
 
 def test_the_reactor_transmits_after_two_periods_in_etceteras_region() -> None:
@@ -147,23 +130,6 @@ def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma:
     assert tau_s <= shortest_s < 1.2 * tau_s
 
 
-def dynamic(theta_s: float) -> ContinuousLoop:
-    """Girard's rule; for θ → ∞ it becomes the static rule w < 0."""
-    return shipped("tabuada_dynamic", f"trigger.theta_s={theta_s}")
-
-
-def test_dynamic_inter_execution_times_are_larger_and_vary_less() -> None:
-    """Printed, in the abstract: "significantly larger in average and ... their variability is
-    smaller" (Girard, arXiv:1301.2182v1, 2013); here on Tabuada's example.
-    """
-    static, saving = (
-        np.concatenate([between(run_from(x0, loop, 8.0)) for x0 in directions(8)])
-        for loop in (dynamic(1e6), dynamic(1.0))
-    )
-    assert saving.mean() > 2 * static.mean()
-    assert saving.std() / saving.mean() < 0.5 * static.std() / static.mean()
-
-
 def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:
     """Theorem: with S = V(x_k) e^{−ρt}, no event before the first t at which some state meets S.
 
@@ -206,24 +172,6 @@ def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float
     np.testing.assert_allclose(run.event_s, -tau_s * np.log1p(-k * delta), rtol=1e-9)
 
 
-def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes() -> None:
-    """Theorem: at most mean|ẋ|/δ reports a second, where a clock of equal resolution needs
-    max|ẋ|/δ; the ratio depends on the signal only and is π/2 for a sine, for any δ.
-
-    Miskowicz, Sensors 6(1), 2006. The rule measures the first state of an oscillator; the
-    weight of the second is almost 0.
-    """
-    system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
-    amplitude, delta, periods = 3.7, 0.05, 4
-    rule = absolute_rule(delta, np.diag([1.0, 1e-9]))
-    x0 = amplitude * np.array([math.cos(0.4), math.sin(0.4)])
-    events = len(run_from(x0, held(system, rule), 2 * math.pi * periods).event_s)
-    by_clock = amplitude / delta * 2 * math.pi * periods  # max|ẋ| = amplitude
-    assert by_clock / events >= math.pi / 2
-    # At each of two turning points a period, less than one δ is not reported, in either direction.
-    assert events >= by_clock / (math.pi / 2) - 4 * periods - 1
-
-
 def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound() -> None:
     """Theorem: ‖x − x_CT‖ ≤ ē ∫₀^∞ ‖e^{(A+BK)s} BK‖ ds for a generator with ‖e‖ ≤ ē.
 
@@ -249,25 +197,3 @@ def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound(
     continuous = np.stack([expm((other + B @ K) * t) @ x0 for t in t_s])
     apart = np.linalg.norm(run.at(t_s).x - continuous, axis=1).max()
     assert 0.1 * level * gain < apart <= level * gain
-
-
-@pytest.mark.parametrize(
-    "rule",
-    [
-        mixed_rule(0.3),
-        lyapunov_rule(np.linalg.cholesky(P).T, 0.2),
-        dynamic(1.0).trigger,
-        quadratic_rule(np.kron(np.diag([-0.1, 1.0]), np.eye(2)), 10 * MS),
-    ],
-    ids=["relative", "lyapunov", "dynamic", "quadratic"],
-)
-def test_inter_event_times_depend_only_on_the_direction_of_the_state(rule: TriggerRule) -> None:
-    """Theorem: τ(λx) = τ(x) for homogeneous rules and linear plants.
-
-    Anta, Tabuada, IEEE TAC 55(9), 2010, of the degree 0.
-    """
-    loop = held(TABUADA, rule)
-    for x0 in directions(5):
-        one, other = (between(run_from(scale * x0, loop, 3.0)) for scale in (1.0, -2e4))
-        assert len(one) > 2
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)

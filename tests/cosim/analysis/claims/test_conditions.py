@@ -1,6 +1,7 @@
-"""The live assumption monitor reports the same violations as the evaluation after the run."""
+"""The conditions of a run, read in any batches: by the monitor during it, and after it."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,20 +25,25 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary_model import ClaimVerdict
+from cosim.output.certificate_report import Certificates
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
+from noack.core.errors import CallerError
 from noack.protocol.machine_interface import Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
+    NO_SEQUENCE,
     OWNER,
     PLANT_ACTUATION,
+    PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
+from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.certificates.conditions import allowed_conditions
-from noack.trigger.absolute import AbsoluteSettings
-from tests.cosim.analysis.claims.conftest import Make, event_s, network_of
+from noack.scenario.scenario_file import load
+from noack.theory.certificates.conditions import allowed_conditions, nominal_conditions
+from tests.cosim.analysis.claims.conftest import Make, event_s, network_of, without
 from tests.cosim.live.outage import Deaf, Reborn, simulate_with, with_outage
 from tests.cosim.record.changed_records import changed
 from tests.machine_parts import controller_of, sensor_of
@@ -194,11 +200,7 @@ def restarted_controller(make: Make) -> RunRecord:
     """A controller that is restarted at once without a known state, in steps of 10 ms."""
     resolved, at_ns = make(network={"initial_sync": "known_state"}), 2_000_000_000
     successor = controller_of(resolved, Start(1, at_ns))
-    record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
-    knows_ns = record[CONTROLLER_DELIVERY]["model_t_ns"]
-    assert (knows_ns >= at_ns + 10_000_000).any()
-    assert not ((knows_ns >= at_ns) & (knows_ns < at_ns + 10_000_000)).any()
-    return record
+    return simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
 
 
 def restarted_sensor(make: Make) -> RunRecord:
@@ -293,60 +295,19 @@ def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
     assert {one.constants for one in beyond} == {None}
 
 
-def test_a_non_finite_value_is_not_a_measurement(make: Make) -> None:
-    """At 2000 /s the state is finite for 0.36 s; its norm and that of an error overflow earlier."""
-    record = simulate(
-        make(
-            horizon_s=1.0, model={"A": [[-1.0]], "B": [[1.0]], "gain": [[0.0]]},
-            plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
-        )
-    )  # fmt: skip
-    last_s = float(record[SENSOR_MEASUREMENT]["t_ns"][-1] * 1e-9)
-    assert last_s == pytest.approx(0.35)
-    assert ("sampling", pytest.approx(last_s)) in [(one.cause, one.t_s) for one in reported(record)]
-    with np.errstate(all="ignore"):
-        judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
-    for claim in judged:
-        assert claim.verdict is ClaimVerdict.VOID
-        assert claim.since_s is not None
-        assert claim.since_s <= last_s
-
-
-def test_no_violation_is_reported_in_a_run_that_meets_its_conditions(run: RunRecord) -> None:
-    assert reported(run) == []
-
-
-def test_only_assumptions_of_existing_claims_are_reported(make: Make) -> None:
-    """With acknowledgements nothing is claimed; with another trigger as with the paper's."""
-    network = network_of(lambda n: None if 10 <= n < 20 else 33)
-    trigger = AbsoluteSettings(policy="absolute", delta=0.02)
-    absolute = make().model_copy(update={"trigger": trigger})
-    assert reported(simulate(make(network={"protocol": "ack"}), network)) == []
-    assert "dropouts" in [one.cause for one in reported(simulate(absolute, network))]
-
-
 # --- reports are timely and cost little memory ----------------------------------------------------
 
 
-def reported_until(record: RunRecord, until_s: float, **other: float) -> list[AssumptionViolation]:
-    """Report the violations of the rows up to a time, or to another time for some processes."""
-    monitor = AssumptionMonitor(record.scenario)
-    for table in record.tables:
-        end_ns = other.get(OWNER[table], until_s) * 1e9
-        monitor.take(table, record[table][record[table]["now_ns"] < end_ns])
-    return monitor.advance()
-
-
 def test_an_input_that_is_too_old_is_reported_during_the_outage(make: Make) -> None:
-    """The report does not need the controller's own rows."""
-    (one,) = reported_until(with_outage(make(), 2.0, 3.0), 2.1, controller=2.0)
-    assert (one.t_s, one.cause) == (pytest.approx(2.01), "hold")
-
-
-def test_losses_are_reported_once_the_networks_rows_arrive(make: Make) -> None:
-    record = simulate(make(), network_of(lambda n: None if n >= 10 else 0))
-    (one,) = reported_until(record, event_s(record, 13))
-    assert (one.cause, one.t_s) == ("dropouts", pytest.approx(event_s(record, 12)))
+    """The report does not need the controller's own rows, and nothing follows the end."""
+    record = with_outage(make(), 2.0, 3.0)
+    for end_s, expected in ((9.0, [(pytest.approx(2.01), "hold")]), (1.0, [])):
+        monitor = AssumptionMonitor(record.scenario)
+        monitor.end_at(end_s)
+        for table in record.tables:
+            until_ns = 2.0e9 if OWNER[table] == "controller" else 2.1e9
+            monitor.take(table, record[table][record[table]["now_ns"] < until_ns])
+        assert [(one.t_s, one.cause) for one in monitor.advance()] == expected
 
 
 def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
@@ -360,27 +321,128 @@ def test_only_rows_that_are_still_needed_are_stored(make: Make) -> None:
         monitor.advance()
         waiting.append(monitor.waiting)
     assert max(waiting) < 150
-
-
-def test_the_monitor_stops_instead_of_storing_everything(make: Make) -> None:
-    """No rows of the controller arrive for a quarter of an hour."""
-    record = simulate(make(trigger={"beta": 1e-9}, network={"initial_sync": "known_state"}))
-    monitor, rows = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
+    # It stops instead of storing everything, if no rows of the controller arrive.
+    silent, rows = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
     rows["event"] = np.arange(len(rows))
     for _ in range(200):
-        monitor.take(SENSOR_MEASUREMENT, rows)
-        monitor.advance()
-        rows["t_ns"] += 6_010_000_000
+        silent.take(SENSOR_MEASUREMENT, rows)
+        silent.advance()
+        rows["t_ns"] += 10_010_000_000
         rows["event"] += len(rows)
-    assert monitor.stopped == "a process has sent no rows for too long"
-    assert monitor.end() == []
+    assert silent.stopped == "a process has sent no rows for too long"
+    assert silent.end() == []
 
 
-def test_the_monitor_reports_nothing_after_its_end_time(make: Make) -> None:
-    record = simulate(make(network={"enforce_mansd": False, "mansd": 0}))
-    monitor = AssumptionMonitor(record.scenario)
-    monitor.end_at(0.0)
-    for table in record.tables:
-        monitor.take(table, record[table])
-    assert reported(record)
-    assert monitor.end() == []
+# --- the conditions that a run has met ------------------------------------------------------------
+
+
+PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]
+
+
+def busy(make: Make, step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> Scenario:
+    """Almost every measurement is an event."""
+    return make(
+        horizon_s=0.6,
+        plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
+        controller={"rate_hz": 1e9 / tick_ns, "phase": phase},
+        trigger={"beta": 1e-12},
+        network={"initial_sync": sync},
+    )
+
+
+def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make) -> None:
+    @settings(max_examples=20)
+    @given(
+        st.sampled_from(PERIODS_NS), st.sampled_from(PERIODS_NS), st.integers(1, 4),
+        st.sampled_from([0.0, 0.1, 0.5, 0.99]) | st.floats(0, 0.999),
+        st.sampled_from(["first_packet", "known_state"]),
+    )  # fmt: skip
+    def check(step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> None:
+        resolved = busy(make, step_ns, tick_ns, every, phase, sync)
+        record = simulate(resolved)
+        assert read_conditions(record).first_violation(nominal_conditions(resolved, 0)) is None
+
+    check()
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "tick_ns", "every", "phase"),
+    [
+        (2_000_000, 2_000_000, 1, 0.5),  # the demo's rates
+        (2_000_000, 3_000_000, 1, 0.0),
+        (5_000_000, 7_000_000, 3, 0.5),
+        (4_000_000, 5_000_000, 2, 0.0168),
+        (7_000_000, 2_000_000, 1, 0.9),
+        (2_000_000, 2_020_000, 1, 0.3),
+    ],
+)
+def test_the_worst_case_of_a_schedule_occurs(
+    step_ns: int, tick_ns: int, every: int, phase: float, make: Make
+) -> None:
+    """The assumed delays and ages occur exactly, to the nanosecond."""
+    resolved = busy(make, step_ns, tick_ns, every, phase, "first_packet")
+    seen, assumed = read_conditions(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
+    for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
+        assert seen[name] == pytest.approx(getattr(assumed, name), abs=1e-12), name
+
+
+def test_every_table_may_be_empty(run: RunRecord) -> None:
+    empty = without(run, "plant", "sensor", "netem", "controller")
+    found = read_conditions(empty)
+    assert set(found.summary().values()) == {None}
+    assert found.first_violation(nominal_conditions(run.scenario, 0)) is not None
+    step = np.zeros(1, run[PLANT_STEP].dtype)
+    step["actuation"] = NO_SEQUENCE
+    assert read_conditions(changed(empty, {PLANT_STEP: step})).start_s == np.inf
+
+
+# --- actuations that cross the network ------------------------------------------------------------
+
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+WORST = 'loss={model="worst_case"}'
+RANDOM = 'loss={model="bernoulli", probability=0.4}'
+DELAY = 'impairments=[{kind="delay", delay_s=0.013}]'
+JITTER = 'impairments=[{kind="delay", delay_s=0.02, jitter_s=0.02}]'
+
+
+def actuated(actuation: str, *more: str) -> Scenario:
+    path = SCENARIOS / "lane_following.toml"
+    base = ["horizon_s=3", "trigger.beta=0.05", f"network.actuation={{{actuation}}}"]
+    return resolve(load(path, [*base, *more]))
+
+
+@pytest.mark.parametrize("predictions", [1, 4])
+@pytest.mark.parametrize(
+    ("actuation", "reached"),
+    [
+        (f"mansd=0, {RANDOM}", True), (f"mansd=1, {WORST}", True), (f"mansd=3, {WORST}", True),
+        (f"mansd=3, {RANDOM}, {DELAY}", False), (f"mansd=2, {RANDOM}, {JITTER}", False),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("rates", [(100, 100, 0.5), (100, 50, 0.0), (500, 100, 0.3)])
+def test_no_run_leaves_the_conditions_of_its_schedule_and_some_reach_them(
+    actuation: str, reached: bool, predictions: int, rates: tuple[float, float, float]
+) -> None:
+    plant_hz, controller_hz, phase = rates
+    run = actuated(
+        actuation, f"controller.predictions={predictions}", f"plant.rate_hz={plant_hz}",
+        f"controller.rate_hz={controller_hz}", f"controller.phase={phase}",
+    )  # fmt: skip
+    allowed, found = nominal_conditions(run, 0), read_conditions(simulate(run)).summary()
+    for name in ("delay_s", "hold_s", "start_s"):
+        assert found[name] is not None
+        assert found[name] <= getattr(allowed, name) + 1e-9, name  # type: ignore[operator]
+    if reached and predictions == 1:
+        assert found["hold_s"] == pytest.approx(allowed.hold_s, abs=1e-9)
+
+
+def test_what_is_not_covered_is_refused_with_the_reason() -> None:
+    for run, says in (
+        (actuated(RANDOM), "the age of the applied input has no bound"),
+        (actuated("mansd=1", 'plant.watchdog.policy="model"'), "use more controller.predictions"),
+    ):
+        with pytest.raises(CallerError, match=says):
+            Certificates(run, 2)
+    with pytest.raises(CallerError, match=r"network\.actuation"):
+        actuated("mansd=1").coverage.require_exact()

@@ -1,0 +1,203 @@
+"""The coordinator: admission, lost connections, invalid requests, and changes of a run."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import zenoh
+
+from cosim.live import coordinator
+from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
+from noack.core.errors import CallerError
+from noack.protocol.topology import LOOP_ROLES, RECORDER, ROLES
+from noack.scenario.scenario_file import load
+from tests.fuzz.parsers.ticket import _TICKET
+from tests.fuzz.plane import FakePlane, Query, Sample
+
+JUNK: list[bytes | None] = [
+    None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
+    b'{"pid": 1, "address": ["127.0.0.1", 0]}', b'{"pid": 1, "address": null}',
+]  # fmt: skip
+SHARED = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
+
+
+@pytest.fixture
+def plane() -> FakePlane:
+    return FakePlane()
+
+
+@pytest.fixture
+def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
+    monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
+    monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
+    return Coordinator(_TICKET)
+
+
+def ask(
+    plane: FakePlane,
+    barrier: Coordinator,
+    what: str,
+    instance: str = "one",
+    role: str = "sensor",
+    shown: str = _TICKET.admission_pass,
+) -> Query:
+    address = None if role == RECORDER else ["127.0.0.1", 5 + ROLES.index(role)]
+    hello: dict[str, Any] = {"instance": instance, "address": address, "admission_pass": shown}
+    plane.put(what, query := Query(f"noack/0/{what}/{role}", json.dumps(hello).encode()))
+    barrier.poll()
+    return query
+
+
+def token(plane: FakePlane, barrier: Coordinator, kind: zenoh.SampleKind | None) -> None:
+    change = Sample("noack/0/alive/sensor/one")
+    change.kind = kind  # type: ignore[assignment]
+    plane.put("alive", change)
+    barrier.poll()
+
+
+def lose(plane: FakePlane, barrier: Coordinator) -> None:
+    token(plane, barrier, zenoh.SampleKind.DELETE)
+
+
+def test_an_invalid_request_is_refused_and_the_others_join(
+    plane: FakePlane, barrier: Coordinator
+) -> None:
+    for junk in JUNK:
+        plane.put("progress", Sample("progress", junk))
+        assert barrier.progress() is None
+        for question in ("admit", "join"):
+            plane.put(question, bad := Query(f"noack/0/{question}/plant", junk))
+            barrier.poll()
+            assert bad.error is not None
+            assert bad.error.startswith("cannot join: ")
+    for role in ROLES:
+        for question in ("admit", "join"):
+            assert ask(plane, barrier, question, role=role).error is None
+    assert barrier.epoch_ns is not None
+    assert plane.answers[-1].addresses.keys() == set(LOOP_ROLES)
+
+
+def test_a_process_may_join_again_after_a_lost_connection_unless_another_has_its_role(
+    plane: FakePlane, barrier: Coordinator
+) -> None:
+    ask(plane, barrier, "admit")
+    first = ask(plane, barrier, "join")
+    assert "sensor" not in barrier.missing()
+    lose(plane, barrier)
+    assert "sensor" in barrier.missing()
+    assert first.dismissed  # the process sends it again
+    assert not first.answered
+    assert ask(plane, barrier, "join").error is None
+    assert barrier.missing() == tuple(role for role in ROLES if role != "sensor")
+    lose(plane, barrier)
+    ask(plane, barrier, "admit", "two")
+    assert ask(plane, barrier, "join", "two").error is None
+    assert ask(plane, barrier, "join").error == (
+        "cannot join: another sensor is in this run already"
+    )
+
+
+def test_the_reason_for_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
+    for role, text, sent_as, reason in (
+        ("sensor", b"rows", "noack/0/progress", None),
+        ("sensor", b"the disk is full", "", "the disk is full"),
+        ("netem", b"horizon", "", None),
+    ):
+        plane.put("ended", Sample(f"noack/0/ended/{role}/one", text, sent_as=sent_as))
+        barrier.poll()
+        assert barrier.reported_failure(role) == reason
+
+
+def test_a_running_process_is_lost_only_if_its_connection_does_not_come_back(
+    plane: FakePlane, barrier: Coordinator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for role in ROLES:
+        ask(plane, barrier, "admit", role=role)
+        ask(plane, barrier, "join", role=role)
+    assert barrier.epoch_ns is not None
+    lose(plane, barrier)
+    assert barrier.failures() == {}
+    barrier.allow_restart("sensor", "stopped responding", dead=False)
+    assert ask(plane, barrier, "admit", "two").error == (
+        "cannot join: the sensor before it may still come back; try again in 8 s"
+    )
+    token(plane, barrier, None)
+    monkeypatch.setattr(coordinator, "AWAY_S", -1.0)
+    barrier.poll()
+    assert barrier.failures() == {}
+    lose(plane, barrier)
+    assert barrier.failures() == {"sensor": "sensor stopped responding"}
+    assert ask(plane, barrier, "admit", "two").error is None
+
+
+@pytest.mark.parametrize(
+    ("known", "shown", "role", "reason"),
+    [
+        (AdmissionPass(), "ab" * 16, "sensor", None),
+        (AdmissionPass(), "", "sensor", "its ticket or invitation is not of this run"),
+        (AdmissionPass(), "cd" * 16, "sensor", "its ticket or invitation is not of this run"),
+        (AdmissionPass(["plant"]), "ab" * 16, "plant", None),
+        (AdmissionPass(["plant"]), "ab" * 16, "sensor", "its invitation is for the plant only"),
+        (AdmissionPass(until_s=-1.0), "ab" * 16, "sensor", "its invitation has expired"),
+    ],
+)
+def test_a_pass_admits_its_roles_until_it_expires(
+    plane: FakePlane, barrier: Coordinator, known: AdmissionPass, shown: str, role: str,
+    reason: str | None,
+) -> None:  # fmt: skip
+    barrier.passes["ab" * 16] = known
+    asked = ask(plane, barrier, "admit", role=role, shown=shown)
+    assert asked.error == (None if reason is None else f"cannot join: {reason}")
+    joined = ask(plane, barrier, "join", role=role)
+    assert joined.error == (None if reason is None else "cannot join: it was not admitted")
+
+
+# --- requests to change a run ---------------------------------------------------------------------
+
+
+def requests_of(loops: str, *settings: str) -> ChangeRequests:
+    ticket = SimpleNamespace(scenario=load(SHARED, [f"loops=[{loops}]", *settings]), run_dir="here")
+    plane = SimpleNamespace(announce_change=lambda announcement: None)
+    return ChangeRequests(cast("Any", ticket), cast("Any", plane))
+
+
+def requested(requests: ChangeRequests, settings: dict[str, Any]) -> dict[str, Any]:
+    return requests.answer(json.dumps({"settings": settings}).encode(), lambda: 0, None).fields()
+
+
+@pytest.mark.parametrize("loops", [1, 4])
+def test_every_listed_parameter_can_be_changed(loops: int) -> None:
+    entry = f'{{ name = "p", count = {loops} }}'
+    listed = requested(requests_of(entry), {})["runtime_parameters"]
+    assert {"trigger.beta", "network.mansd", "controller.setpoint"} <= listed.keys()
+    for key, value in listed.items():
+        assert requested(requests_of(entry), {key: value})["from_s"] > 0
+    with pytest.raises(CallerError, match=r"plant\.rate_hz"):
+        requested(requests_of(entry), {"plant.rate_hz": 100.0})
+
+
+def test_each_entry_of_the_loops_has_its_own_values() -> None:
+    requests = requests_of('{ name = "p", count = 3 }, { name = "q", trigger = { beta = 0.07 } }')
+    before = requested(requests, {})
+    assert before["loops"]["q"]["trigger.beta"] == 0.07
+    assert before["loops"]["p"] == before["runtime_parameters"]
+    assert before["changed_loops"] == ()
+    after = requested(requests, {"trigger.beta": 0.07})
+    assert after["changed_loops"] == ("p",)
+    assert after["loops"]["p"] == after["loops"]["q"]
+
+
+def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
+    """It is valid now and with the last settings, but not with the first of those scheduled."""
+    change = 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]'
+    requests = requests_of('{ name = "p", count = 2 }', change)
+    kept = {"model": "bernoulli", "probability": 0.8, "keep": True}
+    with pytest.raises(CallerError, match=r"network\.loss: loss 80% keep: impossible"):
+        requested(requests, {"network.mansd": 10, "network.loss": kept})
+    loss = kept | {"probability": 0.2}
+    assert requested(requests, {"network.loss": loss})["from_s"] > 0
+    found = requested(requests, {})["runtime_parameters"]
+    assert (found["network.mansd"], found["network.loss"]["probability"]) == (2, 0.2)
+    assert [one.number for one in requests.announced] == [0, 1]

@@ -1,0 +1,291 @@
+"""The recorder: invalid telemetry, restarts, full disks, and claims that become void in the run."""
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from rich.console import Console
+
+from cosim.analysis.claims.claim_evaluation import RunClaims
+from cosim.analysis.loop_statistics import list_violations
+from cosim.analysis.run_summary import summarise
+from cosim.live import recorder
+from cosim.live.progress import progress_line
+from cosim.live.recorder import Recorder
+from cosim.record.record_source import with_loop
+from cosim.record.run_directory import SCENARIO_FILE
+from cosim.record.run_record import RunRecord, load_record
+from cosim.record.spool_conversion import finish_record
+from noack.core.errors import MachineError
+from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
+from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.control_messages import RunProgress, parse_message
+from noack.runtime.spool import NOTICES, SPOOL, batch_of, read_chunks
+from noack.scenario.resolution import resolve, run_tables
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import dumps, load, validate
+from tests.cosim.live.outage import SCENARIOS, with_outage
+from tests.cosim.live.test_coordinator import JUNK
+from tests.fuzz.plane import FakePlane, Query, Sample
+
+
+class RecordingPlane(FakePlane):
+    """A control plane that stores the recorder's reports."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reports: list[RunProgress] = []
+
+    def publish(self, *parts: str, content: Any) -> None:
+        assert parts == ("progress",)
+        self.reports.append(parse_message(RunProgress, content))
+
+
+class Run:
+    """A run directory and its successive recorders."""
+
+    def __init__(self, scenario: Scenario, run_dir: Path) -> None:
+        self.scenario, self.run_dir = scenario, run_dir
+        (run_dir / SCENARIO_FILE).write_text(dumps(scenario))
+        self.sent: dict[str, int] = {}
+        self.begin(BEGINNING, "f")
+
+    def begin(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
+        self.plane = plane = RecordingPlane()
+        plane.instance = instance
+        self.recorder = Recorder(self.scenario, self.run_dir, plane, start=start)  # type: ignore[arg-type]
+        for role in present:
+            plane.put("alive", Sample(f"noack/0/alive/{role}/{role}"))
+        self.recorder.poll()
+
+    def follow(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
+        self.recorder.store.writer.close()
+        self.begin(start, instance, present)
+
+    def send(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
+        header = json.dumps({"first": first, "generation": generation}).encode()
+        self.plane.put("telemetry", Sample(f"t/{role}/{table}", payload, header))
+        self.recorder.poll()
+
+    def send_until(self, record: RunRecord, until_ns: int) -> None:
+        """Send what the processes have recorded since the last call, up to a time."""
+        for table in record.tables:
+            first = self.sent.get(table, 0)
+            self.sent[table] = int(np.searchsorted(record[table]["now_ns"], until_ns))
+            if len(rows := record[table][first : self.sent[table]]):
+                sent = with_loop(rows, 0, run_tables(record.scenario)[table])
+                self.send(table, first, sent.tobytes(), OWNER[table])
+
+    def rows(self, table: str, count: int, generation: int = 0) -> None:
+        rows = np.zeros(count, self.recorder.store.types[table])
+        rows["input"] = generation * GENERATION + np.arange(count)
+        self.send(table, 0, rows.tobytes(), OWNER[table], generation)
+
+    def notices(self, role: str, count: int, generation: int = 0) -> None:
+        line = json.dumps({"t_ns": 0, "level": "info", "text": role}).encode()
+        self.send(NOTICES, 0, batch_of([line] * count), role, generation)
+
+    def report(
+        self, role: str, generation: int = 0, stored: Any = None, instance: str = "", **rows: int
+    ) -> Any:
+        tables = {table: 0 for table in OWNER if OWNER[table] == role}
+        report = {
+            "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
+            "generation": generation, "instance": instance or role, "stored": stored or {},
+        }  # fmt: skip
+        query = Query(f"report/{role}", json.dumps(report).encode())
+        self.plane.put("report", query)
+        self.recorder.poll()
+        return json.loads(query.replies[0])["rows"]
+
+    def finished(self) -> RunRecord:
+        """The record after the end of the recorder."""
+        self.recorder.finish()
+        self.recorder.report()
+        return finish_record(self.run_dir).loop()
+
+    @property
+    def warnings(self) -> list[list[str]]:
+        return [report.warnings for report in self.plane.reports]
+
+
+@pytest.fixture
+def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
+    found = Run(resolve(validate(content, "")), tmp_path)
+    yield found
+    found.recorder.store.writer.close()
+
+
+def test_invalid_telemetry_is_ignored_and_the_rest_is_stored(
+    run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = np.zeros(1, run.recorder.store.types[PLANT_STEP]).tobytes()
+    header = b'{"first": 0, "rows": 1}'
+    for junk in JUNK:
+        run.plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
+        run.plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
+        run.plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
+        run.plane.put("telemetry", Sample("t/plant/notices", junk, header))
+        run.plane.put("telemetry", Sample("t/plant/plant_step", row, header, "t/plant/plant_x"))
+        run.plane.put("report", bad := Query("report/plant", junk))
+        run.recorder.poll()
+        assert bad.error is not None
+    run.rows(PLANT_STEP, 1)
+    assert len(run.finished()[PLANT_STEP]) == 1
+    assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1
+
+
+# --- restarts -------------------------------------------------------------------------------------
+
+
+def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> None:
+    run.rows(PLANT_STEP, 5)
+    run.notices("plant", 3)
+    run.notices("sensor", 1, generation=1)
+    run.follow(Start(1, 0), "a")
+    assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 3}) == {}
+    assert run.report("sensor", 1, **{NOTICES: 1}) == {}
+    assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
+
+
+def test_rows_that_a_process_has_stored_are_not_requested_and_are_logged(run: Run) -> None:
+    run.rows(PLANT_STEP, 5)
+    stored = {PLANT_STEP: [[3, 7], [8, 10]]}
+    assert run.report("plant", stored=stored, **{PLANT_STEP: 10}) == {PLANT_STEP: [[7, 8]]}
+    ((_, line),) = read_chunks(run.run_dir / SPOOL, f"{NOTICES}_{RECORDER}")
+    assert "plant: 4 rows were written to disk by itself" in line.decode()
+
+
+def test_a_process_gets_the_acknowledgement_of_its_own_rows_only(run: Run) -> None:
+    run.rows(SENSOR_MEASUREMENT, 7)
+    run.follow(Start(1, 0), "b")
+    run.rows(SENSOR_MEASUREMENT, 3, generation=1)
+    run.follow(Start(2, 0), "a")
+    run.rows(PLANT_STEP, 2)
+    run.recorder.acknowledge()
+    assert run.plane.acknowledged["sensor"] == {
+        "generation": 1,
+        "rows": {SENSOR_MEASUREMENT: [[0, 3]]},
+    }
+    assert run.plane.acknowledged["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
+
+
+def test_a_restarted_recorder_does_not_wait_for_ended_processes(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.follow(Start(1, 0), "a")
+    assert not run.recorder.finished
+    for role in LOOP_ROLES:
+        assert run.report(role) == {}
+    assert run.recorder.finished
+    run.follow(Start(2, 0), "b", present=["plant"])
+    assert not run.recorder.finished
+    monkeypatch.setattr(recorder, "_DISCOVERY_S", -1.0)
+    assert not run.recorder.finished
+    assert run.report("plant") == {}
+    assert run.recorder.finished
+
+
+def test_a_process_is_gone_once_the_one_that_replaced_it_has_reported(run: Run) -> None:
+    gone = Sample("noack/0/alive/plant/plant")
+    gone.kind = zenoh.SampleKind.DELETE  # type: ignore[assignment]
+    run.plane.put("alive", gone)
+    for role in set(LOOP_ROLES) - {"plant"}:
+        assert run.report(role) == {}
+    assert not run.recorder.finished  # it may come back
+    run.plane.put("alive", Sample("noack/0/alive/plant/plant2"))
+    run.recorder.poll()
+    assert not run.recorder.finished
+    assert run.report("plant", generation=1, instance="plant2") == {}
+    assert run.recorder.finished
+
+
+def test_a_deleted_spool_file_is_reported(run: Run) -> None:
+    run.rows(PLANT_STEP, 2)
+    file = run.run_dir / SPOOL / f"{PLANT_STEP}.{RECORDER}"
+    file.unlink()
+    with pytest.raises(MachineError, match=f"^{file}: was deleted or moved during the run$"):
+        run.recorder.acknowledge()
+    run.recorder.finish()
+    assert "was deleted or moved" in str(run.recorder.lost)
+
+
+# --- claims ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def outage() -> RunRecord:
+    """The controller stands still from 0.5 s to 0.7 s."""
+    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=1"])), 0.5, 0.7)
+
+
+@pytest.fixture
+def late(outage: RunRecord, tmp_path: Path) -> Run:
+    return Run(outage.scenario, tmp_path)
+
+
+def test_a_violation_is_reported_once_and_recorded(outage: RunRecord, late: Run) -> None:
+    for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
+        late.send_until(outage, until_ns)
+        late.recorder.show()
+    cause = "an input was 0.101 s old, 0.007 s allowed"
+    line = (
+        f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.05502 s"
+    )
+    assert late.warnings == [[]] * 5 + [[line]] * 6
+    notices = late.finished().notices
+    assert notices == [{"t_ns": 506_000_000, "level": "late", "text": line, "process": "recorder"}]
+    assert load_record(late.run_dir).notices == notices
+
+
+@pytest.mark.parametrize("is_stopping", [False, True])
+def test_a_violation_found_at_the_end_is_reported_unless_the_run_was_stopped(
+    outage: RunRecord, late: Run, is_stopping: bool
+) -> None:
+    late.recorder.is_stopping = is_stopping
+    late.send_until(outage, 1_200_000_000)
+    notices = late.finished().notices
+    assert len(notices) == (not is_stopping)
+    assert [one for one in late.warnings if one] == [[one["text"]] for one in notices]
+
+
+def test_the_summary_lists_every_violated_assumption(outage: RunRecord) -> None:
+    reported = summarise(outage, 0, "horizon").assumption_violations
+    assert reported == []  # no process detects that an input is old
+    (found,) = list_violations(reported, RunClaims(outage).violations())
+    assert (found.cause, found.t_s, found.process) == ("hold", pytest.approx(0.506), "recorder")
+    assert found.what == "an input was 0.203 s old, 0.007 s allowed"
+
+
+def test_missing_rows_are_reported_as_an_unknown_result(outage: RunRecord, late: Run) -> None:
+    late.send_until(outage, 300_000_000)
+    late.sent["sensor_measurement"] += 10  # a batch is lost and sent again at the end
+    late.send_until(outage, 1_200_000_000)
+    late.recorder.show()
+    late.recorder.show()
+    assert late.warnings[-1] == [
+        "claims are checked after the run only: telemetry is missing or arrived out of order"
+    ]
+    assert late.finished().notices == []
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_terminal_reports_each_cause_once(outage: RunRecord, terminal: bool) -> None:
+    shown = io.StringIO()
+    report: dict[str, Any] = {
+        "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
+        "live": None,
+    }  # fmt: skip
+    console = Console(file=shown, force_terminal=terminal, width=200)
+    with progress_line(console, outage.scenario) as watcher:
+        watcher.started(Path())
+        for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
+            watcher.progress(RunProgress(**report, warnings=void))
+    assert shown.getvalue().count("one [cause]") == 1
+    assert shown.getvalue().count("another") == 1

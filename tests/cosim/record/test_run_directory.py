@@ -1,0 +1,167 @@
+"""Damaged run directories, those of other users, and the tables in docs/record.md."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from cosim.analysis.run_summary import summarise
+from cosim.api.runs import open_run
+from cosim.record.run_directory import (
+    LATEST,
+    RECORD,
+    REPORTS_FILE,
+    SCENARIO_FILE,
+    chosen_run,
+    file_of_loop,
+    latest_run,
+    loop_of_file,
+    new_run_dir,
+    point_to_latest,
+)
+from cosim.record.run_record import load_record
+from cosim.record.spool_conversion import finish_record
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import COMMON, PLANT_STEP, TABLES, Column, Table
+from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from tests.fuzz.parsers.record import NOTICE, files, spooled
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    for name, data in files(acknowledged=False, live=True).items():
+        if not name.startswith(SPOOL):
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+COLUMNS: list[tuple[Callable[[int], Any], str]] = [
+    (lambda n: pa.array(["0"] * n), "column t_ns is not one of int64"),
+    (lambda n: pa.array([0.5] * n), "column t_ns is not one of int64"),
+    (lambda n: pa.array([None] + [0] * (n - 1), pa.int64()), "column t_ns has holes"),
+]
+
+
+def test_a_damaged_column_or_report_is_refused_or_ignored(run_dir: Path) -> None:
+    path, reports = run_dir / RECORD / f"{PLANT_STEP}.parquet", run_dir / REPORTS_FILE
+    whole, given = pq.read_table(path), json.loads(reports.read_text())
+    text = {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}}
+    for report in (None, [], text, text | {"rows": {"plant_step": 1}}):
+        reports.write_text(json.dumps(given | {"plant": report}))
+        record = load_record(run_dir)
+        assert record.reports.keys() == {"sensor", "netem", "controller"}
+        assert summarise(record, 0, "").to_json()["missing_samples"] == 0
+    number = whole.column_names.index("t_ns")
+    for values, expected in COLUMNS:
+        pq.write_table(whole.set_column(number, "t_ns", values(len(whole))), path)
+        with pytest.raises(CallerError, match=expected):
+            load_record(run_dir)
+    pq.write_table(whole, path)
+    (run_dir / RECORD / "notices.jsonl").write_bytes(b"\xae\xff")
+    with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
+        load_record(run_dir)
+    pq.write_table(whole.append_column("t_ns", whole["t_ns"]), path)
+    with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
+        load_record(run_dir)
+
+
+def test_the_readable_part_of_a_damaged_spool_is_read(run_dir: Path) -> None:
+    record = load_record(run_dir)
+    rows, steps = spooled(record, PLANT_STEP), len(record[PLANT_STEP])
+    (run_dir / RECORD / f"{PLANT_STEP}.parquet").unlink()
+    writer = SpoolWriter(run_dir / SPOOL, "recorder")
+    writer.append(PLANT_STEP, 0, rows[:2].tobytes())
+    writer.append(PLANT_STEP, 2, rows[2:4].tobytes()[:-1])
+    writer.append(PLANT_STEP, 4, rows[4:].tobytes())
+    for number, line in enumerate(["[]", "{", json.dumps(NOTICE | {"text": "last"})]):
+        writer.append(notices_of("netem"), number, line.encode())
+    writer.close()
+    finished = finish_record(run_dir).loop()
+    kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
+    assert finished[PLANT_STEP]["input"].tolist() == kept
+    assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
+    assert summarise(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
+    assert steps == len(finished[PLANT_STEP]) + 2
+
+
+def test_a_table_is_a_regular_file_in_parts_of_bounded_length(run_dir: Path) -> None:
+    path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * (40_000 // len(table))), path, row_group_size=10**6)
+    with pytest.raises(CallerError, match=r"rows in one part; at most 32,768 are read"):
+        load_record(run_dir)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(CallerError, match="not a regular file"):
+        load_record(run_dir)
+
+
+# --- latest, and names ----------------------------------------------------------------------------
+
+
+ANOTHER_UID = 65_534
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """A folder that everybody may write to, where users remove only their own files, as in /tmp."""
+    folder = tmp_path / "runs"
+    (folder / "first").mkdir(parents=True)
+    (folder / "first" / SCENARIO_FILE).write_text("")
+    folder.chmod(0o1777)
+    return folder
+
+
+@pytest.mark.parametrize("whose", ["link", "run"])
+def test_a_run_of_another_user_is_not_opened(runs: Path, whose: str) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may give a file to another user")
+    point_to_latest(runs / "first")
+    os.chown(
+        runs / (LATEST if whose == "link" else "first"), ANOTHER_UID, -1, follow_symlinks=False
+    )
+    for opened in (
+        lambda: latest_run(runs),
+        lambda: chosen_run(runs / LATEST, Path("elsewhere")),
+        lambda: open_run(runs / LATEST),
+    ):
+        with pytest.raises(CallerError, match=rf"^{runs / LATEST}: .* is another user's; name the"):
+            opened()
+    assert chosen_run(runs / "first", runs) == runs / "first"  # the link's name identifies the run
+
+
+def test_names_of_folders_and_of_files_of_loops(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"r\xff")
+    for refused in (lambda: new_run_dir(folder, "x"), lambda: chosen_run(folder, tmp_path)):
+        with pytest.raises(CallerError, match="is not UTF-8; rename it"):
+            refused()
+    for name in (None, "a", "b-1"):
+        assert loop_of_file(file_of_loop("report.html", name), "report.html") == name
+
+
+# --- docs/record.md -------------------------------------------------------------------------------
+
+
+DOCS = Path(__file__).parents[3] / "docs" / "record.md"
+TEXT = " ".join(DOCS.read_text(encoding="utf-8").split())
+
+
+def markdown(columns: tuple[Column, ...]) -> str:
+    lines = [f"| `{one.name}` | {one.unit} | {one.meaning} |" for one in columns]
+    return " ".join(" ".join(["| column | unit | meaning |", "|---|---|---|", *lines]).split())
+
+
+def test_the_docs_describe_the_common_columns() -> None:
+    assert markdown(COMMON) in TEXT
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_docs_describe_every_table(table: Table) -> None:
+    described = f"`{table.name}` ({table.owner}): one row per {table.row}. "
+    assert described + markdown(table.columns) in TEXT
