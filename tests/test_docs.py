@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -44,37 +44,33 @@ def choices(union: Any) -> tuple[type[BaseModel], ...]:
 
 
 def test_every_scenario_key_is_documented_and_no_other() -> None:
+    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
     text = (ROOT / "docs/scenarios.md").read_text()
     keys = text.partition("## Plants")[0]
     assert documented_keys(keys) == set(keys_of(Scenario))
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-def test_every_key_of_a_policy_is_documented(policy: str) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text()
-    policies = text.partition("## Trigger policies")[2].partition("## Loss models")[0]
-    (row,) = [line for line in policies.splitlines() if line.startswith(f"| `{policy}`")]
-    named = re.findall("`([^`]+)`", row.split("|")[-2])
-    documented = {name.partition(" ")[0] for name in named}
-    assert documented == POLICIES[policy].model_fields.keys() - {"policy", "weight"}
-
-
-@pytest.mark.parametrize("table", [*choices(AnyDisturbance), *choices(AnyObserver)])
-def test_every_key_of_disturbances_and_observers_is_documented(table: type[BaseModel]) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text().partition("## Disturbances")[2]
-    (kind,) = get_args(table.model_fields["kind"].annotation)
-    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{kind}`")][:1]
-    named = re.findall("`([A-Za-z_]+)", row.split("|")[-2])
-    assert set(named) - {"disturbances", "measurement"} == table.model_fields.keys() - {"kind"}
-
-
-@pytest.mark.parametrize("table", [*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS])
-def test_every_key_of_losses_and_impairments_is_documented(table: type[BaseModel]) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text().partition("## Loss models")[2]
-    (chosen,) = get_args(next(iter(table.model_fields.values())).annotation)
-    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{chosen}`")]
-    documented = set(re.findall("([a-z_0-9]+) = ", row.partition("|")[2])) - {"model", "kind"}
-    assert documented == table.model_fields.keys() - {"model", "kind"}
+@pytest.mark.parametrize(
+    ("heading", "tables"),
+    [
+        ("Trigger policies", POLICIES.values()),
+        ("Disturbances", (*choices(AnyDisturbance), *choices(AnyObserver))),
+        ("Loss models", (*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS)),
+    ],
+)
+def test_every_key_of_a_kind_is_documented(heading: str, tables: Iterable[type[BaseModel]]) -> None:
+    text = (ROOT / "docs/scenarios.md").read_text().partition(f"## {heading}")[2]
+    for table in tables:
+        first, *_ = table.model_fields.values()
+        name = get_args(first.annotation)[0]
+        row, *_ = (line for line in text.splitlines() if line.startswith(f"| `{name}`"))
+        _, _, cells = row.partition("|")
+        if heading == "Loss models":
+            named = re.findall("([a-z_0-9]+) = ", cells)
+        else:
+            named = re.findall(r"`([A-Za-z_]\w*)", cells.split("|")[-2])
+        no_keys = {"model", "kind", "policy", "weight", "disturbances", "measurement"}
+        assert set(named) - no_keys == table.model_fields.keys() - no_keys, name
 
 
 def test_every_word_of_the_emulator_is_documented_and_understood() -> None:
@@ -97,8 +93,11 @@ def documented_keys(text: str) -> set[str]:
 
 
 def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
-    text = (ROOT / "docs/campaigns.md").read_text()
-    text = text.partition("## The file")[2].partition("## Draws")[0]
+    page = (ROOT / "docs/campaigns.md").read_text()
+    shipped = {path.stem for path in (ROOT / "campaigns").glob("*.toml")}
+    assert documented_keys(page.partition("## The file")[0]) == shipped
+    assert documented_keys(page.partition("## Metrics")[2].partition("##")[0]) == METRICS.keys()
+    text = page.partition("## The file")[2].partition("## Draws")[0]
     sections = {"axes": Axis, "metrics": Metrics, "compare": PairedComparison}
     keys = set(Campaign.model_fields) - {"metrics", "compare"} | {"figures.kind", "figures.where"}
     keys |= {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}
@@ -107,14 +106,6 @@ def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
     for name, table in figures.items():
         (row,) = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
         assert set(re.findall("([a-z]+) = ", row)) == table.model_fields.keys() - {"kind", "where"}
-
-
-def test_every_campaign_and_every_metric_is_documented() -> None:
-    text = (ROOT / "docs/campaigns.md").read_text()
-    shipped = {path.stem for path in (ROOT / "campaigns").glob("*.toml")}
-    assert documented_keys(text.partition("## The file")[0]) == shipped
-    text = text.partition("## Metrics")[2].partition("##")[0]
-    assert documented_keys(text) == METRICS.keys()
 
 
 def test_the_documented_campaign_is_valid(tmp_path: Path) -> None:
@@ -132,10 +123,6 @@ def test_every_option_is_documented_and_no_other(command: str) -> None:
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
     known = {name for one in parameters for name in one.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
-
-
-def test_the_exported_schema_matches_the_code() -> None:
-    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
 
 
 def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:

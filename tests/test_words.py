@@ -3,8 +3,6 @@
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from cosim.output.page_kit import glossary
 from tests.pages import ROOT
 
@@ -49,8 +47,3 @@ def test_no_phrase_of_the_list_is_left() -> None:
 
 def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
     assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
-def test_pages_link_the_glossary(page: str) -> None:
-    assert "glossary.md" in (ROOT / page).read_text(encoding="utf-8")
