@@ -54,12 +54,6 @@ def test_a_module_is_loaded_when_a_name_of_it_is_used(package: str) -> None:
     assert type(module) is ModuleType
 
 
-def test_an_ordinary_import_loads_it(package: str) -> None:
-    imported(package, "slow")
-    importlib.import_module(f"{package}.slow")
-    assert sys.argv[-1] == f"{package}.slow"
-
-
 def test_a_module_that_is_loaded_within_lazy_imports_has_lazy_imports(package: str) -> None:
     with lazy_modules():
         outer = importlib.import_module(f"{package}.outer")

@@ -12,7 +12,7 @@ from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from plant_server.plant import BLOCK, MeasurementModel, disturbance_of
-from tests.machine_parts import OneLoop, plant_of, state_of
+from tests.machine_parts import OneLoop, plant_of
 
 STEPS = 4000
 
@@ -62,6 +62,10 @@ def test_disturbances_have_their_distributions_and_are_independent(
     assert kstest(normal, "norm").pvalue > 1e-3
     assert kstest(w[:, 0], "uniform", (-0.2, 0.4)).pvalue > 1e-3
     np.testing.assert_allclose(w[:, 1], 1.5 * np.sin(2 * np.pi * 0.7 * t_s + 0.4), atol=1e-12)
+    model = MeasurementModel(np.eye(2), np.array([0.5, 0.0]), np.array([0.0, 0.2]), seed=7)
+    noise = model.noise(0, STEPS)
+    assert kstest(noise[:, 0] / 0.5, "norm").pvalue > 1e-3
+    assert kstest(noise[:, 1], "uniform", (-0.2, 0.4)).pvalue > 1e-3
     # White and mutually independent: correlations of 4,000 samples are within 4/√4000.
     for one, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
@@ -93,31 +97,3 @@ def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> N
         for messages, some in ((sent, rows), (sent_2, rows_2))
     )
     np.testing.assert_allclose(v, v_2, atol=1e-12)
-
-
-def test_an_input_disturbance_acts_on_a_nonlinear_plant(content: dict[str, Any]) -> None:
-    content["model"] = {
-        "A": [[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 30, 0]],
-        "B": [[0.0], [1.0], [0.0], [-4.0]], "gain": [[1.0, 2.0, 60.0, 10.0]],
-    }  # fmt: skip
-    content["plant"] = {"system": {"kind": "cart_pole"}, "initial_state": [0.0, 0.0, 0.1, 0.0]}
-    plain = plant_of(resolved(content))
-    content["plant"]["disturbances"] = [{"kind": "step", "amplitude": [0.5]}]
-    disturbed = plant_of(resolved(content))
-    for k in range(20):
-        disturbed.handle(Message(Flow.ACTUATION, k, 0, np.array([0.1])), 0)
-        plain.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
-        disturbed.on_timer(k * 2_000_000)
-        plain.on_timer(k * 2_000_000)
-    assert state_of(plain, "x")[2] != 0.1
-    np.testing.assert_array_equal(state_of(disturbed, "x"), state_of(plain, "x"))
-
-
-def test_noise_has_its_distribution() -> None:
-    C = np.array([[1.0, 2.0]])
-    measuring = MeasurementModel(C, np.array([0.5]), np.array([0.0]), seed=7)
-    (v,) = measuring.noise(0, STEPS).T
-    assert kstest(v / 0.5, "norm").pvalue > 1e-3
-    measuring = MeasurementModel(C, np.array([0.0]), np.array([0.2]), seed=7)
-    (v,) = measuring.noise(0, STEPS).T
-    assert kstest(v, "uniform", (-0.2, 0.4)).pvalue > 1e-3

@@ -1,20 +1,32 @@
 """Fits of loss models, against brute force, closed forms and simulated networks."""
 
 import math
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood
+from cosim.measurement import chain_fits as rule
+from cosim.measurement.chain_fits import (
+    ChainFits,
+    ChainRates,
+    LossLikelihood,
+    find_outages,
+    fit_outages,
+)
 from cosim.measurement.loss_bursts import (
+    LossBursts,
     binomial_estimate,
     exponential_estimate,
     loss_bursts,
     poisson_estimate,
 )
+from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 
 GILBERT = ChainRates(0.02, 0.2, 0.0, 1.0)
@@ -56,16 +68,6 @@ def test_the_chain_is_the_emulators() -> None:
     np.testing.assert_allclose(loses, chain.moves * chain.acts)
 
 
-def test_lengths_follow_the_survival_function() -> None:
-    lost = chain_losses(100_000, ELLIOTT, seed=1)
-    bursts = loss_bursts(~lost)
-    for observed, which in ((bursts.length, True), (bursts.deliveries()[1:-1], False)):
-        at = np.array([1, 2, 4, 8, 16])
-        expected = ELLIOTT.survival(lost=which)(at.astype(float))
-        found = (observed[:, None] >= at).mean(axis=0)
-        np.testing.assert_allclose(found, expected, atol=4 * 0.5 / math.sqrt(len(observed)))
-
-
 def test_gilberts_chain_in_closed_form() -> None:
     lost = np.array([0, 0, 1, 1, 0, 1, 0, 0, 0, 1], bool)  # by hand: 6 from good, 3 of them to bad
     fit = ChainFits(loss_bursts(~lost)).gilbert.estimates
@@ -96,18 +98,6 @@ def test_intervals_of_the_hidden_chain_cover_its_parameters() -> None:
         biases.append(np.log(np.array(fit.rates) / np.array(ELLIOTT)))
     assert covered >= 13
     assert (abs(np.mean(biases, axis=0)) < 0.2).all()
-
-
-@pytest.mark.parametrize("seed", [105, 112, 119])
-def test_profiles_with_several_valleys_have_ends(seed: int) -> None:
-    """Of 200 random chains, those with which the likelihood's valleys were taken for each other."""
-    rng = np.random.default_rng(seed)
-    p, r = 10 ** rng.uniform(-2.5, -0.3), 10 ** rng.uniform(-1.5, 0)
-    one = ChainRates(p, r, rng.choice([0, rng.uniform(0, 0.2)]), rng.uniform(0.2, 1))
-    fits = ChainFits(loss_bursts(~chain_losses(int(rng.choice([300, 700, 1500])), one, seed)))
-    for estimate in fits.gilbert_elliott.estimates.values():
-        assert estimate is not None
-        assert 0 <= estimate.low <= estimate.value <= estimate.high <= 1
 
 
 def test_the_preferred_model_is_the_true_one() -> None:
@@ -157,3 +147,76 @@ def test_binomial_and_exponential_intervals_at_their_edges() -> None:
         one = exponential_estimate(4, rng.exponential(2.0, 4).sum())
         inside.append(one is not None and one.low <= 2.0 <= one.high)
     assert abs(np.mean(inside) - 0.95) < 0.03
+
+
+TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
+
+
+def test_the_rural_run_has_one_outage_of_ten_seconds_and_an_m_without_it() -> None:
+    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
+    found = Measurement(trace, MeasurementOptions(deadline_s=0.1))
+    (outage,) = found.to_json()["outages"]
+    assert outage["losses"] == 175
+    assert 10 < outage["duration_s"] < 11.5
+    assert found.longest_loss_burst + 1 == found.quantiles[-1].bursts == 49
+    by_hand = Measurement(trace, MeasurementOptions(deadline_s=0.1, outage_s=2.0))
+    durations_s = by_hand.bursts.times_s(trace)[1]
+    assert by_hand.is_outage.tolist() == (durations_s >= 2.0).tolist()
+    assert by_hand.is_outage.sum() == 2
+
+
+@pytest.mark.parametrize(
+    "truth", [ChainRates(0.03, 0.25, 0.0, 1.0), ChainRates(0.01, 0.05, 0.02, 0.7)]
+)
+def test_networks_without_outages_have_none_and_added_ones_are_found(truth: ChainRates) -> None:
+    rng = np.random.default_rng(1)
+    for seed in range(40):
+        lost = chain_losses(3000, truth, seed)
+        assert not find_outages(loss_bursts(~lost)).flags.any()
+    for outages in (1, 2, 4):
+        lost = chain_losses(5000, truth, seed=outages)
+        starts = np.sort(rng.choice(np.arange(2, 48), outages, replace=False)) * 100
+        for start in starts[::-1]:
+            lost = np.insert(lost, start, np.ones(rng.integers(220, 260), bool))
+        bursts = loss_bursts(~lost)
+        found = find_outages(bursts).flags
+        assert found.sum() == outages
+        assert bursts.length[found].min() >= 220
+
+
+def test_few_bursts_are_no_ground_for_an_outage() -> None:
+    """The largest of b values is never surprising beside b − 1 unknown ones, for small b."""
+    for lengths in ([500], [1, 500], [2, 1, 90]):
+        first = np.cumsum([0, *lengths[:-1]]) + 100 * np.arange(1, len(lengths) + 1)
+        found = find_outages(LossBursts(5000, first, np.array(lengths)))
+        assert not found.flags.any()
+        assert "too few" in found.reason
+
+
+def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -> None:
+    lengths = np.array([7, 2, 1, 1])
+    total, parts = lengths.sum(), len(lengths)
+    divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), parts - 1)]
+    exact = np.mean([np.max(one) >= lengths[0] for one in divisions])
+    bound = rule._geometric(lengths)[0]
+    assert exact == pytest.approx(bound)  # two parts of 7 or more do not fit into 11
+
+
+def test_the_outage_fit_covers_rate_and_duration() -> None:
+    rng, covered = np.random.default_rng(4), np.zeros(2)
+    for _ in range(200):
+        starts = np.cumsum(rng.exponential(20.0, 100))
+        count = int((starts < 100).sum())
+        durations_s = rng.exponential(3.0, count)
+        every = np.ones(count, bool)
+        fit = fit_outages(durations_s, every, 100 + durations_s.sum())
+        for place, (one, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
+            covered[place] += one is not None and one.low <= truth <= one.high
+    assert (covered / 200 > 0.92).all()  # exact intervals cover at least 95 %
+    many = np.full(40, 2.0) + 0.01 * np.arange(40)
+    assert "rejected" in fit_outages(many, np.ones(40, bool), 500.0).text
+    assert "not rejected" in fit_outages(rng.exponential(2.0, 40), np.ones(40, bool), 500.0).text
+    none = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
+    assert none.rate_per_s is not None
+    assert none.duration_s is None
+    assert none.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)

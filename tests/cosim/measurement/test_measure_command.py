@@ -2,8 +2,11 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +15,7 @@ from typer.testing import CliRunner, Result
 import noack
 from cosim.cli import app
 from cosim.measurement.chain_fits import ChainRates
+from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
 from cosim.measurement.network_measurement import (
     Measurement,
@@ -19,10 +23,20 @@ from cosim.measurement.network_measurement import (
     autocorrelation,
     normal_scores,
 )
+from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
+from cosim.record.run_events import packet_outcomes
+from cosim.simulation.virtual_time import simulate
+from netem.fates import description
+from noack.core.errors import CallerError
+from noack.impairments.loss_prediction import read_files
 from noack.scenario import toml_file
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
 from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import packet_trace
-from tests.cosim.measurement.chains import chain_losses, trace_of
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
+from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
+from tests.fuzz.parsers.fates import SPECS, TABLE
+from tests.oracles.link import Link
 
 RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
 
@@ -137,17 +151,16 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     [
         (["missing.csv"], "missing.csv: cannot be read: No such file or directory"),
         ([RURAL, "--deadline", "100"], "--deadline 100: expected a time in s, ms, us or ns"),
-        ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
         ([RURAL, "--outage", "-1s"], "--outage -1s: expected a time"),
-        ([RURAL, "--share", "99"], "--share 99: expected a share, e.g. 0.99 or 99%"),
         ([RURAL, "--share", "x%"], "--share x%: expected a share, e.g. 0.99 or 99%"),
         ([RURAL, "--flow", 2], "--flow: has no effect on a packet trace"),
         ([RURAL, "--rate", "20hz"], "--rate: has no effect on a packet trace"),
+        ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
+        ([":1", "--share", "99%"], "the sender of a one-way probe does not know what arrives"),
         ([RURAL, "--silence", "3s"], f"--silence: has no effect on {RURAL}"),
         (["--listen", ":1", "--for", "5s"], "--for: has no effect on a listener"),
         ([":1", "--silence", "5s"], "--silence: has no effect on a sender"),
         ([":1", "--out", "a.html"], "the sender of a one-way probe does not know what arrives"),
-        ([":1", "--share", "99%"], "the sender of a one-way probe does not know what arrives"),
         ([RURAL, "--as", "model"], "--as model: is the form of --write; give its FILE.toml"),
         ([RURAL, "--set", "trigger.beta=0.3"], "--set: replaces a value of the scenario of"),
         ([RURAL, "--out", "page.pdf"], "--out page.pdf: the file's name must end in .html"),
@@ -161,3 +174,122 @@ def test_mistakes_are_one_line(words: list[object], message: str) -> None:
     assert result.exit_code in (1, 2)
     (line,) = result.stderr.strip().splitlines()
     assert message in line
+
+
+def through(path: Path, sent_ns: np.ndarray) -> PacketTrace:
+    """Send packets at some times through a written network."""
+    section = toml_file.validated(NetworkSection, toml_file.read(path)["network"], str(path))
+    link = Link(read_files(section.link, path.parent), 1, "test")
+    releases = np.array([link.decide(0, 100, at_ns).release_ns for at_ns in sent_ns.tolist()])
+    return packet_trace(sent_ns, np.maximum(releases, sent_ns), releases < 0)
+
+
+def measured_again(source: Path | str, path: Path, form: str) -> tuple[noack.Measurement, ...]:
+    first = noack.measure(source)
+    first.write_network(path, form)  # type: ignore[arg-type]
+    sent_ns = first.trace.sent_ns
+    if form == "model":
+        sent_ns = PERIOD_NS * np.arange(40_000)
+    again = through(path, sent_ns)
+    csv = path.with_suffix(".again.csv")
+    csv.write_text(trace_csv(again))
+    return first, noack.measure(csv)
+
+
+@pytest.mark.parametrize("first_lost", [False, True])
+def test_a_written_trace_repeats_each_packet(tmp_path: Path, first_lost: bool) -> None:
+    rng = np.random.default_rng(1)
+    lost = chain_losses(800, ChainRates(0.1, 0.4, 0.02, 0.9), 3)
+    lost[0] = first_lost
+    trace = trace_of(lost)
+    late_ns = np.where(lost, 0, rng.integers(0, 3 * PERIOD_NS, len(lost)))  # overtakes
+    csv = tmp_path / "trace.csv"
+    csv.write_text(trace_csv(packet_trace(trace.sent_ns, trace.sent_ns + late_ns, lost)))
+    first, again = measured_again(csv, tmp_path / "network.toml", "trace")
+    assert (first.trace.received_ns == again.trace.received_ns).all()
+    assert histogram(first.bursts) == histogram(again.bursts)
+    assert bool(first.trace.received_ns[0] == LOST_NS) is first_lost
+
+
+def test_a_written_model_has_the_parameters_and_delays(tmp_path: Path) -> None:
+    """A Gilbert chain with correlated delays below the period, so that nothing is overtaken."""
+    rng, z = np.random.default_rng(2), np.zeros(6000)
+    for k in range(1, len(z)):
+        z[k] = 0.7 * z[k - 1] + np.sqrt(1 - 0.49) * rng.normal()
+    lost = chain_losses(len(z), ChainRates(0.05, 0.4, 0, 1), 3)
+    sent_ns = PERIOD_NS * np.arange(len(z))
+    delay_ns = (PERIOD_NS * (0.3 + 0.2 * np.tanh(z))).astype(np.int64)
+    csv = tmp_path / "trace.csv"
+    csv.write_text(trace_csv(packet_trace(sent_ns, sent_ns + delay_ns, lost)))
+    first, again = measured_again(csv, tmp_path / "network.toml", "model")
+    fits = [one.models["gilbert"].fit.rates for one in (first, again)]
+    assert fits[0] == pytest.approx(fits[1], rel=0.1)
+    for share, delay_s in first.delays.quantiles_s.items():
+        assert again.delays.quantiles_s[share] == pytest.approx(delay_s, abs=2e-4)
+    correlations = [one.delays.correlation[0] for one in (first, again)]
+    assert correlations[0] == pytest.approx(correlations[1], abs=0.03)
+
+
+def test_a_fate_file_gives_the_first_intact_delivery(tmp_path: Path) -> None:
+    path = tmp_path / "fates.parquet"
+    pq.write_table(TABLE.replace_schema_metadata(description(SPECS, 0)), path)
+    trace = read_source([path])
+    assert (
+        trace.notes[0]
+        == "flow 1: up forward, flow 0, 4 packets; --flow chooses another of the 3 flows"
+    )
+    assert trace.sent_ns.tolist() == [0, 10, 20, 30]
+    # Delivered; dropped; corrupted, but its copy is intact and arrives 9 ns later; forced.
+    assert trace.delay_ns.tolist() == [5, -1, 9, 5]
+    assert len(read_source([path], SourceOptions(flow=3))) == 1
+    with pytest.raises(CallerError, match="has no flow 4; its flows are 1 to 3"):
+        read_source([path], SourceOptions(flow=4))
+    incomplete = TABLE.replace_schema_metadata(description(SPECS, 7))
+    pq.write_table(incomplete, path)
+    with pytest.raises(CallerError, match="7 events are missing"):
+        read_source([path])
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(CallerError, match="not a fate trace"):
+        read_source([path])
+
+
+def test_a_run_gives_its_effective_losses(content: dict[str, Any]) -> None:
+    content |= {"horizon_s": 5.0, "trigger": {"policy": "periodic", "period_s": 0.05}}
+    loss = {"model": "bernoulli", "probability": 0.3}
+    delay = {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.1}
+    content["network"] = {"mansd": 4, "loss": loss, "impairments": [delay]}
+    record = simulate(resolve(validate(content, "test")))
+    outcomes = packet_outcomes(record)
+    trace = updates_trace(record)
+    newest = np.minimum.accumulate(np.where(trace.lost, 2**62, trace.received_ns)[::-1])[::-1]
+    effective = ~trace.lost & (trace.received_ns <= newest)
+    assert (~effective).tolist() == outcomes.lost[: len(trace)].tolist()
+    assert outcomes.lost.any()
+
+
+def test_opportunities_delay_a_probe_until_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "link.up"
+    times_ms = [0, 30, 31, 100, 200]
+    path.write_text("".join(f"{t}\n" for t in times_ms))
+    trace = read_source([path], SourceOptions(period_ns=20_000_000))
+    # An opportunity at the very time of an arrival is lost, as in mahimahi.
+    expected = [min(t for t in times_ms if t > at) - at for at in range(0, 200, 20)]
+    assert trace.delay_ns.tolist() == [one * 10**6 for one in expected]
+    assert (
+        "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s"
+        in trace.notes[0]
+    )
+
+
+def test_sources_that_are_none(tmp_path: Path) -> None:
+    csv = tmp_path / "a.csv"
+    csv.write_text("sent_ms,received_ms\n0,1\n")
+    for paths, options, message in (
+        ([tmp_path], SourceOptions(), str(tmp_path)),
+        ([tmp_path / "none"], SourceOptions(), "No such file"),
+        ([csv, csv], SourceOptions(), "expected one file, or two captures"),
+        ([csv], SourceOptions(sequence_at="0:4"), "--sequence-at: has no effect on a packet trace"),
+    ):
+        with pytest.raises(CallerError, match=message) as refused:
+            read_source(paths, options)
+        assert "\n" not in str(refused.value)
