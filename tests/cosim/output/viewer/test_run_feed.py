@@ -1,18 +1,25 @@
 """The recording of several loops that is written while they run, against that of the record."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import cosim.output.viewer.table_feed
 from cosim.analysis.network_summary import (
     INTERVALS,
+    QUANTILES,
     counts_inside,
     loops_over_time,
     quantiles,
+    summarise_run,
     times_inside,
 )
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.output.viewer import blueprint as bp
+from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.run_feed import RunFeed
 from cosim.output.viewer.run_recording import (
     ERROR,
@@ -21,14 +28,18 @@ from cosim.output.viewer.run_recording import (
     SHARE,
     SIZE,
     open_recording,
+    write_view,
 )
+from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.align import align_tables
-from cosim.record.run_directory import RECORDING_FILE
-from cosim.record.run_record import RecordedRun
+from cosim.record.run_directory import RECORDING_FILE, write_environment, write_scenario
+from cosim.record.run_record import RecordedRun, write_run
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.machine_interface import Notice
-from noack.protocol.record_tables import NETEM_PACKET
+from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
+from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
@@ -109,3 +120,119 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     assert len(series(found, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
+
+
+MAX_BYTES = 3_000_000
+
+
+def written_view(folder: Path, count: int) -> tuple[RecordedRun, list[LoopSummary], Chunks]:
+    """Simulate loops, and read their recording; the last loop but one is the worst."""
+    settings = ["horizon_s=0.4", f'loops=[{{ name = "p", count = {count} }}]']
+    scenario = load(find_shipped("shared_bottleneck", "scenarios"), settings)
+    run = simulate_loops(write_scenario(scenario, folder))
+    write_environment(folder, "simulated")
+    write_run(run, folder)
+    loops = [
+        summarise(record, 0, "horizon").model_copy(update={"sup_e_c_norm": float(i == count - 2)})
+        for i, record in enumerate(run.loops)
+    ]
+    end = ExitPart(status=0, reason="horizon")
+    write_view(run, summarise_run(run.network, loops, end), folder, None)
+    return run, loops, read(folder / RECORDING_FILE)
+
+
+def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path) -> None:
+    run, _, found = written_view(tmp_path, 100)
+    over_time = loops_over_time(run)
+    assert {one.split("/")[1] for one in found if one.startswith("loops/")} == {"p-099"}
+    for entity, values in ((ERROR, over_time.errors), (SIZE, over_time.states)):
+        t_ns, drawn = series(found, entity)
+        assert len(t_ns) == INTERVALS
+        last = np.quantile(values[:, -1], QUANTILES)
+        least = np.median(np.nanmax(10**drawn, axis=0)) / 1e5  # curves are cut off below
+        np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, least), rtol=1e-9)
+    _, queue = series(found, QUEUE)
+    assert queue[:, 0].max() > 1
+    assert (queue[:, 1] <= queue[:, 0] + 1e-6).all()
+    assert series(found, SHARE)[1][-1, -1] <= 100
+    assert MAP in found
+    assert (tmp_path / RECORDING_FILE).stat().st_size < MAX_BYTES
+
+
+ROOT = Path(__file__).parents[4]
+SCENARIO = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
+LOOP = loop_of(SCENARIO)
+TYPES = tables(LOOP.n, LOOP.m)
+MS = 1_000_000
+
+
+class Drawn:
+    """A view that stores its input."""
+
+    def __init__(self) -> None:
+        self.forced: list[tuple[int, bool]] = []
+        self.frames: list[tuple[Any, Frames]] = []
+
+    def move(self, t_ns: Any, frames: Frames) -> None:
+        self.frames.append((t_ns, frames))
+
+    def receptions(self, t_ns: Any, interval_s: Any, forced: Any) -> None:
+        self.forced += list(zip(t_ns.tolist(), forced.tolist(), strict=True))
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *arguments, **options: None
+
+
+def ticks(first: int, count: int) -> np.ndarray:
+    rows = np.zeros(count, TYPES["controller_step"])
+    rows["input"] = rows["sequence"] = np.arange(first, first + count)
+    rows["t_ns"] = rows["model_t_ns"] = rows["now_ns"] = rows["input"] * 2 * MS
+    return rows
+
+
+def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
+    view = Drawn()
+    feed = ViewFeed(SCENARIO, view)  # type: ignore[arg-type]
+    delivery = np.zeros(1, TYPES["controller_delivery"])
+    delivery["t_ns"] = delivery["model_t_ns"] = 100 * MS
+    delivery["sequence"] = 5
+    delivery["input"] = 50
+    feed.add("controller_delivery", delivery)
+    feed.add("controller_step", ticks(0, 50))
+    feed.advance()
+    assert view.forced == []
+
+    packet = np.zeros(1, TYPES["netem_packet"])
+    update = Message(Flow.UPDATE, 5, 100 * MS, np.zeros(LOOP.n))
+    packet["head"] = np.void(Encoder(1, bytes(32)).encode(update)[:PACKET_HEAD_BYTES])
+    packet["fate"] = Fate.FORCED
+    feed.add("netem_packet", packet)
+    feed.add("controller_step", ticks(51, 300))
+    feed.advance()
+    assert view.forced == [(100 * MS, True)]
+
+
+def test_the_plants_internal_state_is_shown_at_the_measurement_times(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """For any order of plant and sensor batches; without a row in time the state is unknown."""
+    types = tables(LOOP.n, LOOP.m, internal=3)
+    monkeypatch.setattr(cosim.output.viewer.table_feed, "tables_of", lambda scenario: types)
+    view = Drawn()
+    feed = ViewFeed(SCENARIO, view)  # type: ignore[arg-type]
+    for first, count in ((0, 400), (400, 350)):
+        steps = np.zeros(count, types["plant_step"])
+        steps["t_ns"] = steps["now_ns"] = 2 * MS * (first + np.arange(count))
+        steps["z"] = (first + np.arange(count))[:, None] + [0.0, 0.25, 0.5]
+        feed.add("plant_step", steps)
+        measurements = np.zeros(400, types["sensor_measurement"])
+        measurements["t_ns"] = measurements["now_ns"] = 2 * MS * (first + np.arange(400))
+        measurements["event"] = -1
+        feed.add("sensor_measurement", measurements)
+        feed.add("controller_step", ticks(first, 400))
+        feed.advance(final=first > 0)
+    t_ns = np.concatenate([times for times, _ in view.frames])
+    z = np.concatenate([frames.z for _, frames in view.frames if frames.z is not None])
+    np.testing.assert_array_equal(t_ns, 2 * MS * np.arange(800))
+    np.testing.assert_array_equal(z[:750, 1], np.arange(750) + 0.25)
+    assert np.isnan(z[750:]).all()

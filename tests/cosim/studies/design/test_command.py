@@ -12,8 +12,6 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from cosim.cli import app
-from cosim.studies.design.design_page import page
-from cosim.studies.design.design_search import DesignResult
 from cosim.studies.design.design_space import lqr_gain
 from noack.scenario.scenario_file import load
 
@@ -127,17 +125,9 @@ def test_limits_that_cannot_be_met_give_a_page_and_one_line(
     assert result.stderr.startswith("noack: no design meets the limits; the closest has a settling")
     assert result.stderr.count("\n") == 1
     assert ("trade-off" in result.stdout) == table
-    assert "<svg" in (tmp_path / "p.html").read_text()
-
-
-def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design) -> None:
-    result = run_design(
-        one, "--settling", "4", "--bound", "error=1", "--under", "schedule",
-        "--set", "plant.rate_hz=2", "--set", "controller.rate_hz=2",
-    )  # fmt: skip
-    assert result.exit_code == 1
-    assert "no certified bound of sup‖e_c‖ (1 allowed)" in result.stderr
-    assert "no certified bound of sup‖x‖" in result.stdout
+    html = (tmp_path / "p.html").read_text()
+    assert "<svg" in html
+    assert not re.findall(r"<script|<link|(?:src|href)=\"(?!#|data:)", html)
 
 
 UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"]
@@ -149,7 +139,6 @@ UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"
         ("mass", ["--settling", "30"], "beyond horizon_s = 20"),
         ("mass", ["--settling", "-1"], "--settling: must be positive"),
         ("mass", ["--quantile", "1"], "between 0 and 1"),
-        ("mass", ["--quantile", "nan"], "--quantile: must be between 0 and 1"),
         ("mass", ["--settle", "1"], "--settle: must be between 0 and 1"),
         ("mass", ["--under", "theory"], "--under: paper or schedule"),
         ("mass", ["--bound", "gain=3"], "write it as state=X or error=X"),
@@ -163,6 +152,11 @@ UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"
         ("mass", ["--set", "model.gain=[[1.0, 1.0]]"], "u = -K x does: give -K"),
         ("mass", ["--set", "plant.initial_state=[0.0, 0.0]"], "initial_state: is 0"),
         ("mass", ["--set", 'trigger={policy="absolute", delta=1.0}'], "trigger.policy"),
+        (
+            "mass",
+            ["--set", "plant.initial_state_halfwidth=[0.1, 0.1]", "--bound", "error=1"],
+            "initial_state_halfwidth",
+        ),
         ("mass", ["--out", "no/such/folder/x.toml"], "there is no folder"),
         ("one", ["--set", "trigger.floor=3"], "trigger.floor = 3: must be less than the largest β"),
         ("one", ["--set", 'mode="zoh"', "--weights", "chosen"], "models that hold do not decay"),
@@ -182,9 +176,10 @@ def test_mistakes_are_one_line(
     assert expected in result.stderr
 
 
-def test_the_page_is_self_contained(found: DesignResult) -> None:
-    html = page(found)
-    assert "<svg" in html
-    assert found.verdict() in html
-    assert not re.findall(r"<script|<link|(?:src|href)=\"(?!#|data:)", html)
-    assert html.count("<tr>") == len(found.front) + 1
+def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design) -> None:
+    result = run_design(
+        one, "--settling", "4", "--bound", "error=1", "--under", "schedule",
+        "--set", "plant.rate_hz=2", "--set", "controller.rate_hz=2",
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "no certified bound of sup‖e_c‖ (1 allowed)" in result.stderr

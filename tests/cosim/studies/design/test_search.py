@@ -7,22 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.design_search import (
     DesignLimits,
     DesignResult,
+    design,
     measure,
     require_draws,
 )
-from cosim.studies.design.design_space import LEVELS
+from cosim.studies.design.design_space import families_of, lqr_gain
 from noack.core.errors import CallerError
+from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
-from tests.cosim.studies.design.conftest import LIMITS, designed
+from tests.cosim.studies.design.conftest import LIMITS
+from tests.cosim.studies.design.test_command import ONE
 
 
 def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
@@ -94,36 +98,6 @@ def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignR
             assert better or trial in found.front or settling_s == math.inf
 
 
-def test_the_same_seed_gives_the_same_design_and_another_seed_other_draws(
-    scenario: Scenario,
-) -> None:
-    limits = replace(LIMITS, bounds={})
-    one, again, other = (designed(scenario, limits, draws=40, seed=s) for s in (5, 5, 6))
-    assert again.document() == one.document()
-    assert other.fresh != one.fresh
-
-
-def test_candidates_lie_below_the_decay_rate(found: DesignResult) -> None:
-    # s² + 1.5 s + 1: the real part of both roots is −0.75
-    assert 0.7 < max(trial.candidate.alpha_per_s for trial in found.trials) < 0.75
-    assert min(trial.candidate.beta for trial in found.trials) > LEVELS[0] / 3
-
-
-def test_infeasible_limits_are_reported_with_the_closest_candidate(scenario: Scenario) -> None:
-    found = designed(scenario, DesignLimits(1.0, 0.5, 0.02, {}), draws=20)
-    assert not found.feasible
-    assert not found.confirmed
-    assert f"{found.best.measured.settling_s:.4g} s" in found.verdict()
-    closest = found.best.measured.settling_high_s
-    assert all(t.measured.settling_high_s >= closest for t in found.trials if t.full)
-
-
-def test_no_bound_is_certified_for_a_drawn_initial_state(scenario: Scenario) -> None:
-    plant = scenario.plant.model_copy(update={"initial_state_halfwidth": (0.1, 0.1)})
-    with pytest.raises(CallerError, match="initial_state_halfwidth"):
-        designed(scenario.model_copy(update={"plant": plant}), LIMITS)
-
-
 def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
     with pytest.raises(CallerError, match="--draws: 50 are too few") as caught:
         require_draws(50, 0.95)
@@ -132,9 +106,47 @@ def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> 
     assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
 
 
-def test_the_largest_excess_over_a_limit_counts() -> None:
-    limits = DesignLimits(10.0, 0.95, 0.02, {"state": 4.0, "error": 1.0})
-    assert limits.excess(10.0, {"state": 4.0, "error": 1.0}) == 0
-    assert limits.excess(20.0, {"state": 5.0, "error": 1.0}) == pytest.approx(0.5)
-    assert limits.excess(9.0, {"state": math.inf, "error": 1.0}) == 1
-    assert limits.excess(9.0, {}) == 0  # not yet computed
+def test_without_randomness_every_draw_is_the_exact_run(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text(ONE)
+    families = families_of(load(path), ("identity",), None)
+    found = design(families, DesignLimits(4.0, 0.5, 0.02, {}), draws=20, seed=0)
+    assert found.confirmed
+    assert found.fresh.halfwidth == 0
+    assert found.fresh.settling_high_s == found.fresh.settling_s
+    exact = run_continuous(resolve(found.scenario))
+    assert found.fresh.transmissions == len(exact.event_s)
+    x = exact.at([found.fresh.settling_s]).x
+    assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
+
+
+def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
+    A, B, *_ = lane_following()
+    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    K = lqr_gain(A, B, Q, R)
+    closed = A + B @ K
+    assert spectral_abscissa(closed) < 0
+    # P is the cost of the closed loop by another equation; K must follow from it.
+    cost = Q + K.T @ R @ K
+    n = len(A)
+    lyapunov = np.kron(np.eye(n), closed.T) + np.kron(closed.T, np.eye(n))
+    P = np.linalg.solve(lyapunov, -cost.ravel()).reshape(n, n)
+    np.testing.assert_allclose(R @ K, -B.T @ P, rtol=1e-8, atol=1e-8)
+    residual = A.T @ P + P @ A - P @ B @ np.linalg.solve(R, B.T @ P) + Q
+    np.testing.assert_allclose(residual, 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("A", "Q", "R", "word"),
+    [
+        ([[1, 0], [0, -1]], [[1, 0], [0, 1]], 1, "stabilising"),  # B does not affect state 1
+        ([[0, 1], [0, 0]], [[-1, 0], [0, -1]], 1, "semidefinite"),
+        ([[0, 1], [0, 0]], [[1, 1], [0, 1]], 1, "symmetric"),
+        ([[0, 1], [0, 0]], [[1, 0], [0, 1]], 0, "definite"),
+    ],
+)
+def test_a_system_without_a_regulator_is_refused(
+    A: list[list[float]], Q: list[list[float]], R: float, word: str
+) -> None:
+    with pytest.raises(CallerError, match=word):
+        lqr_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))
