@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import pytest
 from cosim.interactive.draft import open_draft
 from cosim.lab import live_run
 from cosim.lab.live_run import LiveRun
-from noack.core.process_limits import python_command
 
 
 def said(run: LiveRun, what: str, **fields: object) -> None:
@@ -32,7 +30,11 @@ def test_the_states_follow_each_other() -> None:
     assert run.state == "starting"
     said(run, "started", run_dir="/runs/one")
     assert (run.state, run.run_dir) == ("running", Path("/runs/one"))
-    said(run, "progress", **REPORT)
+    live = "live view: http://127.0.0.1:1234/secret/"
+    for changes in ([], ["M 3"]):  # each warning is shown once
+        said(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
+    assert run.lines == ["all processes run", "void", "changed: M 3"]
+    assert run.viewer == "http://127.0.0.1:1234/secret/"
     said(run, "finalising", reason="horizon")
     assert run.state == "finalising"
     assert not run.is_over
@@ -43,16 +45,11 @@ def test_the_states_follow_each_other() -> None:
     assert run.progress is not None
     assert run.progress.events == 3
     assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
-
-
-def test_a_report_gives_each_warning_and_change_once_and_the_viewers_address() -> None:
-    run = LiveRun(20.0)
-    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"]})
-    live = "live view: http://127.0.0.1:1234/secret/"
-    said(run, "progress", **REPORT | {"warnings": ["void from 1 s on"], "changes": ["M 3"],
-                                      "live": live})  # fmt: skip
-    assert run.lines == ["void from 1 s on", "changed: M 3"]
-    assert run.viewer == "http://127.0.0.1:1234/secret/"
+    failed = LiveRun(20.0)
+    said(failed, "error", text="the port is taken")
+    assert failed.is_over
+    assert failed.ok is False
+    assert failed.lines == ["the port is taken"]
 
 
 @pytest.mark.parametrize("line", ["", "compiling ...", "{", "[1]", '{"x": 1}', "7"])
@@ -61,33 +58,6 @@ def test_other_output_is_a_line_of_the_log(line: str) -> None:
     run._take(line)
     assert run.lines == [line] * bool(line)
     assert run.state == "starting"
-
-
-def test_an_error_ends_it() -> None:
-    run = LiveRun(20.0)
-    said(run, "error", text="the port is taken")
-    assert run.is_over
-    assert run.ok is False
-    assert run.lines == ["the port is taken"]
-
-
-def test_a_stop_after_the_loop_ended_keeps_the_summary(tmp_path: Path) -> None:
-    text = open_draft("double_integrator").with_value("horizon_s", 1.0).text
-    command = python_command("-m", "cosim.lab.live_run", tmp_path, tmp_path / "runs")
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                          text=True) as process:  # fmt: skip
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(text)
-        process.stdin.close()
-        told = []
-        for line in process.stdout:
-            told.append(json.loads(line)["what"])
-            if told[-1] == "finalising":
-                process.send_signal(signal.SIGINT)
-    assert told[-2:] == ["finalising", "ended"]
-    (run,) = [path for path in (tmp_path / "runs").iterdir() if not path.is_symlink()]
-    assert (run / "summary.json").exists()
 
 
 def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
