@@ -208,3 +208,4 @@ def test_the_scenarios_of_a_folder_are_offered(tmp_path: Path) -> None:
     known = known_scenarios(tmp_path, "lane_following")
     assert "mine.toml" in known
     assert not {"other.toml", "broken.toml"} & known.keys()
+    assert open_draft(known["mine.toml"]).scenario.name == "lane_following"

@@ -30,11 +30,12 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert found.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
         assert found.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
         assert found.e_s_norm[first + 1] == 0.0
-    figure = exploration_figure(Shown(found, 0))
-    errors = figure.rows[1].panels[0].legend or ()
-    assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
     known = noack.load("lane_following", {"network.initial_sync": "known_state"})
-    assert np.isfinite(exploration.explore(known).e_c_norm).all()
+    shown = Shown(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
+    figure = exploration_figure(shown)
+    errors = figure.rows[1].panels[0].legend or ()
+    assert "certified bound" in errors
+    assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
 
 
 def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> None:
@@ -94,6 +95,7 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     run = exploration.explore(noack.load("lane_weighted"))
     bound = np.interp(run.t_s, certified.t_s, certified.e_c)
     assert (run.e_c_norm <= bound * 1.01).all()
+    assert "loop gain" in guarantee.certify(noack.load("reactor_petc")).reason
     missing = guarantee.certify(noack.load("lane_vehicle"))
     assert missing.verdict == guarantee.NOT_COVERED
     assert "not linear" in missing.reason

@@ -130,6 +130,9 @@ def test_a_probe_without_an_end_and_late_sends_are_named() -> None:
         now_ns = max(now_ns, sender.next_deadline_ns())
         now_ns += 10 * PERIOD_NS if sender.sent == 15 else 0
         receiver.handle(sender.on_timer(now_ns), "sender", now_ns + DELAY_NS)
+    assert not receiver.is_over(now_ns + DELAY_NS)
+    assert receiver.is_over(now_ns + SILENCE_NS + NS_PER_S)
+    assert new_receiver().finish(0) is None
     (line,) = sender.finish(0).notes
     assert line == "datagrams sent: 30; late sends: 10, the longest by 200 ms"
     result = receiver.finish(0)

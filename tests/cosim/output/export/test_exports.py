@@ -135,6 +135,9 @@ def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> Non
     mat = loadmat(loops.export(tmp_path / "a.mat", certificates=False)[0], simplify_cells=True)
     assert mat["loops"][name.replace("-", "_")]["plant_step"]["now_ns"].tolist() == steps
     assert Path(tmp_path / "loops.csv") in loops.save_tables(tmp_path)
+    plain = noack.simulate(noack.load("lane_following", {"horizon_s": 0.1}))
+    found_mat = loadmat(plain.export(tmp_path / "plain.mat")[0], simplify_cells=True)
+    assert found_mat["certificates"]["certificates"][0]["constants"]["state"] > 0
     files = loops.export(tmp_path / "csv")
     assert tmp_path / f"csv/{name}/plant_step.csv" in files
 

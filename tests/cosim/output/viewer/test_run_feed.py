@@ -9,15 +9,11 @@ import pytest
 import cosim.output.viewer.table_feed
 from cosim.analysis.network_summary import (
     INTERVALS,
-    QUANTILES,
     counts_inside,
     loops_over_time,
     quantiles,
-    summarise_run,
     times_inside,
 )
-from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import ExitPart, LoopSummary
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.run_feed import RunFeed
@@ -28,12 +24,11 @@ from cosim.output.viewer.run_recording import (
     SHARE,
     SIZE,
     open_recording,
-    write_view,
 )
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.align import align_tables
-from cosim.record.run_directory import RECORDING_FILE, write_environment, write_scenario
-from cosim.record.run_record import RecordedRun, write_run
+from cosim.record.run_directory import RECORDING_FILE
+from cosim.record.run_record import RecordedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.machine_interface import Notice
@@ -120,43 +115,6 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     assert len(series(found, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
-
-
-MAX_BYTES = 3_000_000
-
-
-def written_view(folder: Path, count: int) -> tuple[RecordedRun, list[LoopSummary], Chunks]:
-    """Simulate loops, and read their recording; the last loop but one is the worst."""
-    settings = ["horizon_s=0.4", f'loops=[{{ name = "p", count = {count} }}]']
-    scenario = load(find_shipped("shared_bottleneck", "scenarios"), settings)
-    run = simulate_loops(write_scenario(scenario, folder))
-    write_environment(folder, "simulated")
-    write_run(run, folder)
-    loops = [
-        summarise(record, 0, "horizon").model_copy(update={"sup_e_c_norm": float(i == count - 2)})
-        for i, record in enumerate(run.loops)
-    ]
-    end = ExitPart(status=0, reason="horizon")
-    write_view(run, summarise_run(run.network, loops, end), folder, None)
-    return run, loops, read(folder / RECORDING_FILE)
-
-
-def test_of_many_loops_quantiles_a_map_and_the_worst_are_recorded(tmp_path: Path) -> None:
-    run, _, found = written_view(tmp_path, 100)
-    over_time = loops_over_time(run)
-    assert {one.split("/")[1] for one in found if one.startswith("loops/")} == {"p-099"}
-    for entity, values in ((ERROR, over_time.errors), (SIZE, over_time.states)):
-        t_ns, drawn = series(found, entity)
-        assert len(t_ns) == INTERVALS
-        last = np.quantile(values[:, -1], QUANTILES)
-        least = np.median(np.nanmax(10**drawn, axis=0)) / 1e5  # curves are cut off below
-        np.testing.assert_allclose(10 ** drawn[-1], np.maximum(last, least), rtol=1e-9)
-    _, queue = series(found, QUEUE)
-    assert queue[:, 0].max() > 1
-    assert (queue[:, 1] <= queue[:, 0] + 1e-6).all()
-    assert series(found, SHARE)[1][-1, -1] <= 100
-    assert MAP in found
-    assert (tmp_path / RECORDING_FILE).stat().st_size < MAX_BYTES
 
 
 ROOT = Path(__file__).parents[4]

@@ -32,7 +32,7 @@ from cosim.output.viewer.live_viewer import (
     script_to_open_at,
     view_recording,
 )
-from cosim.output.viewer.pictures.picture import TIMELINE
+from cosim.output.viewer.pictures.picture import TIMELINE, Frames
 from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFile, ViewError
 from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
@@ -175,7 +175,11 @@ def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float
     with new_view(path, horizon_s=horizon_s) as view:
         add_samples(view, 5)
         view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+        x = np.zeros((3, 4))
+        for _ in range(2):  # the picture has a maximum frame rate
+            view.views[0].move(times(0, 3), Frames(np.zeros(3), x, x, x))
     chunks = read(path)
+    assert sum(c.num_rows for c in chunks["picture/plant"] if not c.is_static) == 1
     for i, name in enumerate(STATES):
         t_ns, values = series(chunks, f"state/{name}")
         np.testing.assert_array_equal(t_ns, times(0, 5 * K))

@@ -252,6 +252,7 @@ def test_medians_and_numbers_can_be_compared(write: Write, plan: dict[str, Any])
         ({"holds": ["events @ ZOH > 1"]}, "events @ ZOH: should be a number or one of"),
         ({"holds": ["transmissions @ PB > 1"]}, "no such value; policy has MB, ZOH"),
         ({"axis": None}, "axis: give an axis, and a value of it after each metric, or neither"),
+        ({"axis": "polic"}, "no such axis"),
         ({"where": {"beta": 0.2}}, "no such value; beta has 0.1, 0.3"),
     ],
 )

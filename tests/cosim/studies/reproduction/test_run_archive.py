@@ -216,6 +216,10 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
         ),
         "has no scenario.toml",
     ),
+    "deep JSON": (
+        lambda files, path: write(path, files | {MANIFEST: b"[" * 100_000}),
+        "archive.json: content: Invalid JSON",
+    ),
     "another kind": (with_claim("kind", "live"), "describes another run than the archive contains"),
     "another name": (with_claim("scenario", "\x1b[31mred"), "describes another run"),
     "rows without end": (with_rows, "plant_step.parquet: has 5,000,000 rows; a run of this"),
