@@ -36,13 +36,6 @@ def test_help_imports_no_large_library(words: list[str]) -> None:
     assert not imported(*words) & {"numpy", "pydantic", "rich", "scipy", "zenoh"}
 
 
-def test_a_command_with_a_module_of_its_own_imports_only_this_one() -> None:
-    modules = imported("scenarios", "--json")
-    assert {one for one in modules if one.startswith("cosim.cli.commands.")} == {
-        "cosim.cli.commands.scenario_commands"
-    }
-
-
 _LARGE = {
     "asyncio", "cryptography", "jinja2", "matplotlib", "prometheus_client", "pyarrow", "rerun",
     "rich", "scipy", "ssl",
@@ -69,9 +62,3 @@ def test_a_run_begins_without_large_libraries(program: str, tmp_path: Path) -> N
     assert [one for one in modules if re.match(r"noack\.theory\.\w+\.", one)] == []
     assert not modules & {"cosim.live.finalize", "cosim.live.progress"}
     assert program is _BEFORE_THE_START or "typer" not in modules
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the fork server is for Linux")
-def test_the_fork_server_starts_before_the_command_line_is_read() -> None:
-    assert "cosim.live.fork_server" in imported("run", "no_such_scenario", "--nonsense")
-    assert "cosim.live.fork_server" not in imported("run", "--help")
