@@ -1,16 +1,20 @@
-"""Compare the documentation's key tables with the code."""
+"""Compare the documentation, its words and CITATION.cff with the code."""
 
 import json
 import re
+import subprocess
+import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import yaml
 from pydantic import BaseModel
 from typer.main import get_command
 
 from cosim.cli import app
+from cosim.output.page_kit import glossary
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
@@ -164,3 +168,63 @@ def test_the_map_of_the_code_names_existing_files() -> None:
     named = set(re.findall(r"`(\w+\.py)`", (ROOT / "ARCHITECTURE.md").read_text()))
     assert len(named) > 20
     assert named <= files
+
+
+REQUIRED = {"authors", "cff-version", "message", "title"}
+"""Of the Citation File Format 1.2.0."""
+
+
+def test_the_citation_agrees_with_the_package() -> None:
+    citation = yaml.load((ROOT / "CITATION.cff").read_text(), yaml.BaseLoader)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert citation.keys() >= REQUIRED
+    assert citation["cff-version"] == "1.2.0"
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    assert citation["title"].startswith(project["name"] + ":")
+    (paper,) = citation["references"]
+    assert paper["title"] in " ".join((ROOT / "README.md").read_text().split())
+    assert [one["family-names"] for one in paper["authors"]] == ["Garcia", "Antsaklis"]
+    assert re.fullmatch(r"\d{4}", paper["year"])
+
+
+PHRASES = (
+    "lost that nobody ordered", "lost outside the emulator", "in the long run, at most",
+    "unexplained, RMS", "what this run says of them", "look at it", "the trigger watches",
+    "decays at any rate below", "some coincide", "stops listening",
+    "makes an ‖e_s‖ of", "presupposed", "reproduce themselves",
+    "the plant feels", "minus the same draw", "nothing is done", "no run goes on",
+    "did not live to see", "did not come to the start", "holds nothing", "takes one away",
+    "nobody's interface", "never parts from", "in your hands", "begins with nothing",
+    "of who runs it", "where nobody looks", "s a leg", "no update missing",
+    "updates outstanding", "× the scenario's", "certified for the missing",
+    "certified from the newest", "largest certified value of each quantity",
+    "that must pass enters", "100 % is normal", "so often\"",
+    "how far the run came", "that confirms itself", "has made of it", "asks for no lines",
+    "has the last word", "says what follows from what",
+)  # fmt: skip
+"""The left columns of the project's list of words, as far as they are unambiguous."""
+PLACES = ("cosim", "noack", "netem", "plant_server", "sensor_node", "controller_node")
+
+
+def texts() -> list[Path]:
+    listed = subprocess.run(
+        ["git", "ls-files", *PLACES, "docs/*.md", "README.md"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    names = listed.stdout.splitlines()
+    return [ROOT / name for name in names if name.endswith((".py", ".jinja", ".md", ".toml"))]
+
+
+def test_no_phrase_of_the_list_is_left() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}: {phrase}"
+        for path in texts()
+        if path.is_file()
+        for phrase in PHRASES
+        if phrase in path.read_text(encoding="utf-8")
+    ]
+    assert found == []
+
+
+def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
+    assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")

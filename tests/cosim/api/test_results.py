@@ -1,4 +1,4 @@
-"""Campaigns of the library give what the command writes."""
+"""Campaigns and certificates of the library give what the commands write."""
 
 import json
 from typing import Any

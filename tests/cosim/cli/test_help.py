@@ -1,4 +1,4 @@
-"""The help: an introduction, examples that work, and one word for each concept."""
+"""The help and the completion: examples that work, and the words that fit."""
 
 import json
 import re

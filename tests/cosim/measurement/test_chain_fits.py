@@ -1,7 +1,7 @@
-"""Fits of loss models, against brute force, closed forms and simulated networks."""
+"""Bursts, outages and fits of loss models: against definitions, closed forms and simulation."""
 
 import math
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +18,18 @@ from cosim.measurement.chain_fits import (
     fit_outages,
 )
 from cosim.measurement.loss_bursts import (
-    LossBursts,
     binomial_estimate,
     exponential_estimate,
+    histogram,
     loss_bursts,
+    most_losses,
+    outcomes,
     poisson_estimate,
+    quantile_m,
 )
 from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.traces.packet_trace import packet_trace
 from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 
@@ -184,15 +188,6 @@ def test_networks_without_outages_have_none_and_added_ones_are_found(truth: Chai
         assert bursts.length[found].min() >= 220
 
 
-def test_few_bursts_are_no_ground_for_an_outage() -> None:
-    """The largest of b values is never surprising beside b − 1 unknown ones, for small b."""
-    for lengths in ([500], [1, 500], [2, 1, 90]):
-        first = np.cumsum([0, *lengths[:-1]]) + 100 * np.arange(1, len(lengths) + 1)
-        found = find_outages(LossBursts(5000, first, np.array(lengths)))
-        assert not found.flags.any()
-        assert "too few" in found.reason
-
-
 def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -> None:
     lengths = np.array([7, 2, 1, 1])
     total, parts = lengths.sum(), len(lengths)
@@ -220,3 +215,107 @@ def test_the_outage_fit_covers_rate_and_duration() -> None:
     assert none.rate_per_s is not None
     assert none.duration_s is None
     assert none.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)
+
+
+flags = st.lists(st.booleans(), min_size=1, max_size=60)
+
+
+@given(
+    st.lists(st.one_of(st.none(), st.integers(0, 9)), min_size=1, max_size=12), st.integers(0, 9)
+)
+def test_a_packet_is_effective_if_it_arrives_in_time_before_every_later_one(
+    delays: list[int | None], deadline: int
+) -> None:
+    """The definition of docs/mansd.md, by a receiver that keeps only what is newer."""
+    sent = 2 * np.arange(len(delays))
+    arrivals = [(2 * k + d, k) for k, d in enumerate(delays) if d is not None]
+    kept, newest = set(), -1
+    for at, k in sorted(arrivals):
+        if at - 2 * k <= deadline and k > newest:
+            kept.add(k)
+            newest = k
+    lost = np.array([d is None for d in delays])
+    received = sent + np.array([d or 0 for d in delays])
+    found = outcomes(packet_trace(sent, received, lost), deadline)
+    assert set(np.flatnonzero(found.effective).tolist()) == kept
+    groups = np.array([found.lost, found.out_of_order, found.late, found.effective])
+    assert (groups.sum(axis=0) == 1).all()
+
+
+@given(flags)
+def test_bursts_are_the_groups_of_consecutive_losses(effective: list[bool]) -> None:
+    bursts = loss_bursts(np.array(effective))
+    lengths = [len(list(group)) for ok, group in groupby(effective) if not ok]
+    assert bursts.length.tolist() == lengths
+    assert histogram(bursts) == {n: lengths.count(n) for n in sorted(set(lengths))}
+    assert bursts.deliveries().sum() == sum(effective)
+    assert bursts.complete.tolist() == [
+        first > 0 and end < len(effective)
+        for first, end in zip(bursts.first, bursts.end, strict=True)
+    ]
+
+
+@given(flags, st.sampled_from([0.1, 0.5, 0.75, 0.9, 1.0]))
+def test_m_of_a_share_is_the_smallest_that_covers_it(effective: list[bool], share: float) -> None:
+    bursts = loss_bursts(np.array(effective))
+    counts, count = [], 0
+    for ok in effective:
+        count = 0 if ok else count + 1
+        counts.append(count)
+    found = quantile_m(bursts, share)
+    of = {found.packets: counts, found.bursts: bursts.length.tolist()}
+    for m, values in of.items():
+        for smaller, covered in ((m, True), (m - 1, False)):
+            within = sum(value <= smaller - 1 for value in values)
+            assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (
+                covered or not values
+            )
+
+
+@given(flags, st.data())
+def test_most_losses_are_those_of_the_worst_window(
+    effective: list[bool], data: st.DataObject
+) -> None:
+    bursts = loss_bursts(np.array(effective))
+    chosen = data.draw(
+        st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length))
+    )
+    left_out = np.array(chosen, bool)
+    skipped = np.zeros(len(effective), bool)
+    for first, end in zip(bursts.first[left_out], bursts.end[left_out], strict=True):
+        skipped[first:end] = True
+    windows = range(1, len(effective) + 3)
+    expected = {}
+    for window in windows:
+        starts = range(len(effective) - window + 1)
+        worst = [
+            window - sum(effective[i : i + window])
+            for i in starts
+            if not skipped[i : i + window].any()
+        ]
+        if worst:
+            expected[window] = max(worst)
+    assert most_losses(bursts, windows, left_out) == expected
+
+
+@pytest.mark.parametrize(("share", "fewest"), [(0.9, 29), (0.99, 299)])
+def test_confidence_needs_as_many_bursts_as_wilks_says(share: float, fewest: int) -> None:
+    """ln 0.05 / ln share, rounded up: then the longest burst is the limit."""
+    assert fewest == math.ceil(math.log(0.05) / math.log(share))
+    for count in (fewest - 1, fewest):
+        effective = np.tile([True, False], count)
+        found = quantile_m(loss_bursts(effective), share).bursts_confident
+        assert (found is None) == (count < fewest)
+    rng = np.random.default_rng(1)
+    covered = [
+        quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident
+        for _ in range(400)
+    ]
+    truth = 1 + math.ceil(math.log(1 - share) / math.log(0.7))
+    assert np.mean([m is not None and m >= truth for m in covered]) >= 0.93
+
+
+def _bursts(lengths: np.ndarray) -> np.ndarray:
+    steps = np.zeros(int(lengths.sum()) + len(lengths), bool)
+    steps[np.cumsum(lengths + 1) - 1] = True
+    return steps

@@ -1,3 +1,5 @@
+"""Figures: every curve is named, the same bytes each time, as wide as a paper wants."""
+
 import re
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The end of a run: three lines, one table that fits, and no warning without a cause."""
+"""The end of a run: what its lines and its table say, and no warning without a cause."""
 
 import io
 import re

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import cosim.output.viewer.table_feed
 from cosim.analysis.network_summary import (
     INTERVALS,
     counts_inside,
@@ -26,7 +25,6 @@ from cosim.output.viewer.run_recording import (
     open_recording,
 )
 from cosim.output.viewer.table_feed import ViewFeed
-from cosim.record.align import align_tables
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.shipped_files import find_shipped
@@ -89,18 +87,6 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     assert (MAP in found) == (count == 30)
     assert not said
     assert bp.LOG in found
-
-
-def test_few_loops_are_shown_in_detail(tmp_path: Path) -> None:
-    run, found, _ = shown(tmp_path, 3)
-    for record in run.loops:
-        folder = bp.loop_folder(record.scenario.name)
-        aligned = align_tables(record)
-        t_ns, states = series(found, f"{folder}{bp.state_path('angle')}")
-        assert np.ptp(t_ns - aligned.t_ns) == 0
-        np.testing.assert_array_equal(states[:, 2], aligned.x_c[:, 0])
-        assert any(one.startswith(f"{folder}picture/") for one in found)
-    assert f"{bp.loop_folder('p-2')}log" in found
 
 
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
@@ -168,29 +154,3 @@ def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
     feed.add("controller_step", ticks(51, 300))
     feed.advance()
     assert view.forced == [(100 * MS, True)]
-
-
-def test_the_plants_internal_state_is_shown_at_the_measurement_times(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """For any order of plant and sensor batches; without a row in time the state is unknown."""
-    types = tables(LOOP.n, LOOP.m, internal=3)
-    monkeypatch.setattr(cosim.output.viewer.table_feed, "tables_of", lambda scenario: types)
-    view = Drawn()
-    feed = ViewFeed(SCENARIO, view)  # type: ignore[arg-type]
-    for first, count in ((0, 400), (400, 350)):
-        steps = np.zeros(count, types["plant_step"])
-        steps["t_ns"] = steps["now_ns"] = 2 * MS * (first + np.arange(count))
-        steps["z"] = (first + np.arange(count))[:, None] + [0.0, 0.25, 0.5]
-        feed.add("plant_step", steps)
-        measurements = np.zeros(400, types["sensor_measurement"])
-        measurements["t_ns"] = measurements["now_ns"] = 2 * MS * (first + np.arange(400))
-        measurements["event"] = -1
-        feed.add("sensor_measurement", measurements)
-        feed.add("controller_step", ticks(first, 400))
-        feed.advance(final=first > 0)
-    t_ns = np.concatenate([times for times, _ in view.frames])
-    z = np.concatenate([frames.z for _, frames in view.frames if frames.z is not None])
-    np.testing.assert_array_equal(t_ns, 2 * MS * np.arange(800))
-    np.testing.assert_array_equal(z[:750, 1], np.arange(750) + 0.25)
-    assert np.isnan(z[750:]).all()

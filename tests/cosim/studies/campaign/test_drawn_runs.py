@@ -1,4 +1,4 @@
-"""The measures of a sampled campaign: runs in virtual time."""
+"""Draws, and the measures of their runs in virtual time, of one loop and of several."""
 
 import math
 from functools import partial

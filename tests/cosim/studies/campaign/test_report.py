@@ -237,14 +237,6 @@ def test_the_least_favourable_grid_point_counts_unless_it_is_left_out(
     assert judged(write, plan, fewer, np.full(4, 9.0)).verdict == "confirmed"
 
 
-def test_medians_and_numbers_can_be_compared(write: Write, plan: dict[str, Any]) -> None:
-    zoh = np.array([1.0, 11.0, 12.0])
-    assert judged(write, plan, MORE | {"medians": True}, zoh).share == 1.0
-    number = {"says": "Few.", "where": {"policy": "ZOH", "beta": 0.1},
-              "holds": ["transmissions < 12", "transmissions > 0.5"]}  # fmt: skip
-    assert judged(write, plan, number, zoh).share == pytest.approx(2 / 3)
-
-
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [
