@@ -158,30 +158,6 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
         assert trace not in content
 
 
-BACKGROUNDS = {"rerun, dark": (13, 16, 17), "report, dark": (20, 24, 29), "light": (255, 255, 255)}
-COLOURS = {
-    palette.PLANT, palette.SENSOR, palette.CONTROLLER, palette.THRESHOLD, palette.CERTIFIED,
-    palette.IDENTITY, palette.PRINTED, palette.LOST, palette.FORCED, palette.NETWORK,
-    *palette.PROCESSES.values(), *palette.SERIES,
-}  # fmt: skip
-
-
-def luminance(colour: palette.Colour) -> float:
-    """Relative luminance by WCAG 2.2."""
-    c = np.array(colour) / 255
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
-@pytest.mark.parametrize("background", BACKGROUNDS)
-def test_every_colour_has_enough_contrast_to_its_background(background: str) -> None:
-    """3 to 1, WCAG's minimum for graphics."""
-    behind = luminance(BACKGROUNDS[background])
-    for colour in COLOURS:
-        low, high = sorted((luminance(colour), behind))
-        assert (high + 0.05) / (low + 0.05) >= 3, colour
-
-
 ALLOWED_US, SENSOR_NS, MS = 1000.0, 63_200, 1_000_000
 FIRST_LOST = 7
 

@@ -1,7 +1,7 @@
 """The recording of several loops that is written while they run, against that of the record."""
 
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from cosim.analysis.network_summary import (
     times_inside,
 )
 from cosim.output.viewer import blueprint as bp
-from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.run_feed import RunFeed
 from cosim.output.viewer.run_recording import (
     ERROR,
@@ -103,28 +102,10 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
 
 
-ROOT = Path(__file__).parents[4]
-SCENARIO = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
+SCENARIO = resolve(load(find_shipped("lane_following", "scenarios")))
 LOOP = loop_of(SCENARIO)
 TYPES = tables(LOOP.n, LOOP.m)
 MS = 1_000_000
-
-
-class Drawn:
-    """A view that stores its input."""
-
-    def __init__(self) -> None:
-        self.forced: list[tuple[int, bool]] = []
-        self.frames: list[tuple[Any, Frames]] = []
-
-    def move(self, t_ns: Any, frames: Frames) -> None:
-        self.frames.append((t_ns, frames))
-
-    def receptions(self, t_ns: Any, interval_s: Any, forced: Any) -> None:
-        self.forced += list(zip(t_ns.tolist(), forced.tolist(), strict=True))
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *arguments, **options: None
 
 
 def ticks(first: int, count: int) -> np.ndarray:
@@ -134,9 +115,14 @@ def ticks(first: int, count: int) -> np.ndarray:
     return rows
 
 
+def received(view: Mock) -> list[tuple[int, bool]]:
+    calls = [call.args for call in view.receptions.call_args_list]
+    return [one for t_ns, _, forced in calls for one in zip(t_ns, forced, strict=True)]
+
+
 def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
-    view = Drawn()
-    feed = ViewFeed(SCENARIO, view)  # type: ignore[arg-type]
+    view = Mock()
+    feed = ViewFeed(SCENARIO, view)
     delivery = np.zeros(1, TYPES["controller_delivery"])
     delivery["t_ns"] = delivery["model_t_ns"] = 100 * MS
     delivery["sequence"] = 5
@@ -144,7 +130,7 @@ def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
     feed.add("controller_delivery", delivery)
     feed.add("controller_step", ticks(0, 50))
     feed.advance()
-    assert view.forced == []
+    assert received(view) == []
 
     packet = np.zeros(1, TYPES["netem_packet"])
     update = Message(Flow.UPDATE, 5, 100 * MS, np.zeros(LOOP.n))
@@ -153,4 +139,4 @@ def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
     feed.add("netem_packet", packet)
     feed.add("controller_step", ticks(51, 300))
     feed.advance()
-    assert view.forced == [(100 * MS, True)]
+    assert received(view) == [(100 * MS, True)]
