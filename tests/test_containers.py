@@ -1,11 +1,7 @@
 """The files for containers: read and compared; built on request where a container tool works."""
 
 import ipaddress
-import os
 import re
-import shutil
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,16 +18,10 @@ COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES: dict[str, Any] = COMPOSE["services"]
 
 
-def test_each_process_has_a_container() -> None:
-    assert SERVICES.keys() == {"recorder", *LOOP_ROLES}
-    for role in LOOP_ROLES:
-        assert SERVICES[role]["command"][0] == role
-    assert SERVICES["recorder"]["command"][0] == "record"
-
-
-@pytest.mark.parametrize("name", SERVICES)
-def test_its_command_is_one_of_noack(name: str) -> None:
+@pytest.mark.parametrize("name", ["recorder", *LOOP_ROLES])
+def test_each_process_has_a_container_with_a_command_of_noack(name: str) -> None:
     command, *arguments = SERVICES[name]["command"]
+    assert command == {"recorder": "record"}.get(name, name)
     if command == "netem":
         add_options(parser := Parser(allow_abbrev=False))
         assert parser.parse_args(arguments).invitation
@@ -61,19 +51,3 @@ def test_volumes_and_folders_are_those_of_the_image() -> None:
     python = re.search(r"^FROM \S+/python:(\d+)\.(\d+)", image, re.MULTILINE)
     assert python is not None
     assert tuple(map(int, python.groups())) >= (3, 11)
-
-
-def test_the_image_is_built_and_has_the_command(tmp_path: Path) -> None:
-    if not os.environ.get("NOACK_TEST_IMAGE"):
-        pytest.skip("it downloads an image and packages; set NOACK_TEST_IMAGE=1 for it")
-    tool = next((one for one in ("podman", "docker") if shutil.which(one)), None)
-    if tool is None:
-        pytest.skip("neither podman nor docker is installed")
-    info = subprocess.run([tool, "info"], capture_output=True, text=True, check=False)
-    if info.returncode:
-        pytest.skip(f"{tool} does not work here: {info.stderr.strip().splitlines()[-1]}")
-    build = [tool, "build", "--file", "Containerfile", "--iidfile", str(tmp_path / "id"), "."]
-    subprocess.run(build, cwd=ROOT, check=True)
-    image = (tmp_path / "id").read_text()
-    run = [tool, "run", "--rm", image, "simulate", "lane_following", "--no-report"]
-    assert "transmissions" in subprocess.run(run, capture_output=True, text=True, check=True).stdout

@@ -1,16 +1,20 @@
-"""Compare the documentation's key tables with the code."""
+"""Compare the documentation, its words and CITATION.cff with the code."""
 
 import json
 import re
-from collections.abc import Iterator
+import subprocess
+import tomllib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import yaml
 from pydantic import BaseModel
 from typer.main import get_command
 
 from cosim.cli import app
+from cosim.output.page_kit import glossary
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
@@ -44,37 +48,33 @@ def choices(union: Any) -> tuple[type[BaseModel], ...]:
 
 
 def test_every_scenario_key_is_documented_and_no_other() -> None:
+    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
     text = (ROOT / "docs/scenarios.md").read_text()
     keys = text.partition("## Plants")[0]
     assert documented_keys(keys) == set(keys_of(Scenario))
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-def test_every_key_of_a_policy_is_documented(policy: str) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text()
-    policies = text.partition("## Trigger policies")[2].partition("## Loss models")[0]
-    (row,) = [line for line in policies.splitlines() if line.startswith(f"| `{policy}`")]
-    named = re.findall("`([^`]+)`", row.split("|")[-2])
-    documented = {name.partition(" ")[0] for name in named}
-    assert documented == POLICIES[policy].model_fields.keys() - {"policy", "weight"}
-
-
-@pytest.mark.parametrize("table", [*choices(AnyDisturbance), *choices(AnyObserver)])
-def test_every_key_of_disturbances_and_observers_is_documented(table: type[BaseModel]) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text().partition("## Disturbances")[2]
-    (kind,) = get_args(table.model_fields["kind"].annotation)
-    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{kind}`")][:1]
-    named = re.findall("`([A-Za-z_]+)", row.split("|")[-2])
-    assert set(named) - {"disturbances", "measurement"} == table.model_fields.keys() - {"kind"}
-
-
-@pytest.mark.parametrize("table", [*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS])
-def test_every_key_of_losses_and_impairments_is_documented(table: type[BaseModel]) -> None:
-    text = (ROOT / "docs/scenarios.md").read_text().partition("## Loss models")[2]
-    (chosen,) = get_args(next(iter(table.model_fields.values())).annotation)
-    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{chosen}`")]
-    documented = set(re.findall("([a-z_0-9]+) = ", row.partition("|")[2])) - {"model", "kind"}
-    assert documented == table.model_fields.keys() - {"model", "kind"}
+@pytest.mark.parametrize(
+    ("heading", "tables"),
+    [
+        ("Trigger policies", POLICIES.values()),
+        ("Disturbances", (*choices(AnyDisturbance), *choices(AnyObserver))),
+        ("Loss models", (*LOSS_MODELS, *IMPAIRMENTS, *DISCIPLINES, *CONSTRAINTS)),
+    ],
+)
+def test_every_key_of_a_kind_is_documented(heading: str, tables: Iterable[type[BaseModel]]) -> None:
+    text = (ROOT / "docs/scenarios.md").read_text().partition(f"## {heading}")[2]
+    for table in tables:
+        first, *_ = table.model_fields.values()
+        name = get_args(first.annotation)[0]
+        row, *_ = (line for line in text.splitlines() if line.startswith(f"| `{name}`"))
+        _, _, cells = row.partition("|")
+        if heading == "Loss models":
+            named = re.findall("([a-z_0-9]+) = ", cells)
+        else:
+            named = re.findall(r"`([A-Za-z_]\w*)", cells.split("|")[-2])
+        no_keys = {"model", "kind", "policy", "weight", "disturbances", "measurement"}
+        assert set(named) - no_keys == table.model_fields.keys() - no_keys, name
 
 
 def test_every_word_of_the_emulator_is_documented_and_understood() -> None:
@@ -97,8 +97,11 @@ def documented_keys(text: str) -> set[str]:
 
 
 def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
-    text = (ROOT / "docs/campaigns.md").read_text()
-    text = text.partition("## The file")[2].partition("## Draws")[0]
+    page = (ROOT / "docs/campaigns.md").read_text()
+    shipped = {path.stem for path in (ROOT / "campaigns").glob("*.toml")}
+    assert documented_keys(page.partition("## The file")[0]) == shipped
+    assert documented_keys(page.partition("## Metrics")[2].partition("##")[0]) == METRICS.keys()
+    text = page.partition("## The file")[2].partition("## Draws")[0]
     sections = {"axes": Axis, "metrics": Metrics, "compare": PairedComparison}
     keys = set(Campaign.model_fields) - {"metrics", "compare"} | {"figures.kind", "figures.where"}
     keys |= {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}
@@ -107,14 +110,6 @@ def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
     for name, table in figures.items():
         (row,) = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
         assert set(re.findall("([a-z]+) = ", row)) == table.model_fields.keys() - {"kind", "where"}
-
-
-def test_every_campaign_and_every_metric_is_documented() -> None:
-    text = (ROOT / "docs/campaigns.md").read_text()
-    shipped = {path.stem for path in (ROOT / "campaigns").glob("*.toml")}
-    assert documented_keys(text.partition("## The file")[0]) == shipped
-    text = text.partition("## Metrics")[2].partition("##")[0]
-    assert documented_keys(text) == METRICS.keys()
 
 
 def test_the_documented_campaign_is_valid(tmp_path: Path) -> None:
@@ -132,10 +127,6 @@ def test_every_option_is_documented_and_no_other(command: str) -> None:
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
     known = {name for one in parameters for name in one.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
-
-
-def test_the_exported_schema_matches_the_code() -> None:
-    assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema(Scenario)
 
 
 def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:
@@ -177,3 +168,63 @@ def test_the_map_of_the_code_names_existing_files() -> None:
     named = set(re.findall(r"`(\w+\.py)`", (ROOT / "ARCHITECTURE.md").read_text()))
     assert len(named) > 20
     assert named <= files
+
+
+REQUIRED = {"authors", "cff-version", "message", "title"}
+"""Of the Citation File Format 1.2.0."""
+
+
+def test_the_citation_agrees_with_the_package() -> None:
+    citation = yaml.load((ROOT / "CITATION.cff").read_text(), yaml.BaseLoader)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert citation.keys() >= REQUIRED
+    assert citation["cff-version"] == "1.2.0"
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    assert citation["title"].startswith(project["name"] + ":")
+    (paper,) = citation["references"]
+    assert paper["title"] in " ".join((ROOT / "README.md").read_text().split())
+    assert [one["family-names"] for one in paper["authors"]] == ["Garcia", "Antsaklis"]
+    assert re.fullmatch(r"\d{4}", paper["year"])
+
+
+PHRASES = (
+    "lost that nobody ordered", "lost outside the emulator", "in the long run, at most",
+    "unexplained, RMS", "what this run says of them", "look at it", "the trigger watches",
+    "decays at any rate below", "some coincide", "stops listening",
+    "makes an ‖e_s‖ of", "presupposed", "reproduce themselves",
+    "the plant feels", "minus the same draw", "nothing is done", "no run goes on",
+    "did not live to see", "did not come to the start", "holds nothing", "takes one away",
+    "nobody's interface", "never parts from", "in your hands", "begins with nothing",
+    "of who runs it", "where nobody looks", "s a leg", "no update missing",
+    "updates outstanding", "× the scenario's", "certified for the missing",
+    "certified from the newest", "largest certified value of each quantity",
+    "that must pass enters", "100 % is normal", "so often\"",
+    "how far the run came", "that confirms itself", "has made of it", "asks for no lines",
+    "has the last word", "says what follows from what",
+)  # fmt: skip
+"""The left columns of the project's list of words, as far as they are unambiguous."""
+PLACES = ("cosim", "noack", "netem", "plant_server", "sensor_node", "controller_node")
+
+
+def texts() -> list[Path]:
+    listed = subprocess.run(
+        ["git", "ls-files", *PLACES, "docs/*.md", "README.md"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    names = listed.stdout.splitlines()
+    return [ROOT / name for name in names if name.endswith((".py", ".jinja", ".md", ".toml"))]
+
+
+def test_no_phrase_of_the_list_is_left() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}: {phrase}"
+        for path in texts()
+        if path.is_file()
+        for phrase in PHRASES
+        if phrase in path.read_text(encoding="utf-8")
+    ]
+    assert found == []
+
+
+def test_the_glossary_of_the_documentation_is_that_of_the_program() -> None:
+    assert glossary() in (ROOT / "docs/glossary.md").read_text(encoding="utf-8")

@@ -70,18 +70,6 @@ def notices(outputs: Sequence[Output]) -> list[Notice]:
     return [output for output in outputs if isinstance(output, Notice)]
 
 
-def test_late_ticks_carry_their_nominal_time() -> None:
-    late, in_time = new_controller(x0=np.ones(2)), new_controller(x0=np.ones(2))
-    for k in range(5):
-        message, record = late.on_timer(50 * MS)
-        expected, _ = tick(in_time)
-        assert isinstance(message, Message)
-        assert message.t_ns == expected.t_ns == (2 * k + 1) * MS
-        assert message.vector.tobytes() == expected.vector.tobytes()
-        (row,) = rows([record], CONTROLLER_STEP)
-        assert row["now_ns"] == 50 * MS
-
-
 @given(st.lists(st.booleans(), max_size=25))
 def test_further_constraints_are_checked_over_all_updates_so_far(delivered: list[bool]) -> None:
     """At most 2 losses in 5, and 2 deliveries between bursts; each against its definition."""

@@ -1,6 +1,5 @@
 """Records and summaries of runs of one loop for tests."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from cosim.analysis.network_summary import summarise_run
@@ -34,9 +33,3 @@ def with_values(run: RunSummary, **more: Any) -> RunSummary:
     for part, model in ((loop, LoopSummary), (document, RunSummary)):
         part |= {key: value for key, value in more.items() if key in model.model_fields}
     return RunSummary.model_validate(document)
-
-
-def loop_of(summary: Mapping[str, Any], name: str | None = None) -> dict[str, Any]:
-    """The entry of a loop in ``summary.json``; of the only one without a name."""
-    (found,) = [one for one in summary["loops"] if name in (None, one["name"])]
-    return dict(found)

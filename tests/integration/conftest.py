@@ -14,7 +14,7 @@ from typing import Any
 import psutil
 import pytest
 
-from benchmarks.programs import is_of, udp_port
+from benchmarks.programs import is_of
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
@@ -192,10 +192,6 @@ class Running:
             if is_of(role, child):
                 return child
         raise AssertionError(f"no process of {role}")
-
-    def udp_port(self, role: str) -> int:
-        """Return the receiving port of a process of the loop."""
-        return udp_port(self.child(role))
 
     def finish(self) -> Finished:
         stdout, stderr = self.process.communicate(timeout=PATIENCE_S)

@@ -1,18 +1,29 @@
-"""Faults of processes and ports: the run names them, ends cleanly and loses no rows."""
+"""Faults and disturbances of processes, disks and streams: they are named, and no row is lost."""
 
+import contextlib
+import fcntl
+import json
+import os
 import re
+import shutil
 import signal
-import socket
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import psutil
+import pytest
 from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.live.finalize import reopen
-from cosim.record.run_record import load_record
+from cosim.record.run_record import RunRecord, load_record
+from noack.core.errors import MachineError
+from noack.protocol.topology import ROLES
+from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration import conftest as live
 
 Start = Callable[..., live.Running]
@@ -68,62 +79,6 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
     assert len(load_record(run_dir)["plant_step"]) > 10
 
 
-def test_what_a_late_plant_sends_after_the_horizon_is_received(tmp_path: Path) -> None:
-    """It is stopped before the horizon and goes on half a second after it."""
-    for attempt in range(10):  # a machine that stalls may stop it after its end, or go on too late
-        (folder := tmp_path / str(attempt)).mkdir()
-        with live.begun(folder) as start:
-            running = start(*live.AT_RATE, *live.settings(horizon_s=3.0))
-            running.wait_recording()
-            plant = running.child("plant")
-            plant.send_signal(signal.SIGSTOP)
-            time.sleep(2.8)
-            plant.send_signal(signal.SIGCONT)
-            finished = running.finish()
-        lost = finished.loop["unintended_losses"] + finished.loop["missing_samples"]
-        steps = load_record(finished.run_dir)["plant_step"]
-        was_late = (steps["now_ns"] - steps["t_ns"]).max() > 1e9
-        if was_late and not lost and finished.status == 0:
-            break
-    assert was_late
-    assert lost == 0
-    assert finished.status == 0
-
-
-def test_a_taken_port_gives_one_clear_line(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
-        squatter.bind(("127.0.0.1", 0))
-        port = squatter.getsockname()[1]
-        given = (*live.EPHEMERAL, *live.settings(ports__plant=port))
-        done = CliRunner().invoke(app, ["run", "lane_following", "--runs", str(tmp_path), *given])
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    (line,) = done.stderr.strip().splitlines()
-    assert f"127.0.0.1:{port} " in line
-    assert "set ports.plant to another port, or to 0 for any" in line
-
-
-def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
-    """The plant needs five times the time that it has."""
-    code = tmp_path / "slow.py"
-    code.write_text(
-        "import time\n"
-        "class Slow:\n"
-        "    def start(self, x0): self.x = x0\n"
-        "    def advance(self, u, t_s, dt_s): time.sleep(5 * dt_s)\n"
-    )
-    finished = live.run_scenario(
-        tmp_path,
-        "--set", f'plant.system={{kind="python", file="{code}", name="Slow"}}',
-        *live.settings(horizon_s=2.0, plant__draw="nominal"),
-    )  # fmt: skip
-    assert finished.status == 1
-    # Its other threads may starve, too; the process then seems to be lost.
-    reason = finished.summary["exit"]["reason"]
-    assert "overrun" in reason or "stopped responding" in reason
-    assert finished.summary["reached_s"] < 2.0
-
-
 def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     """It is frozen before the start barrier, so that it has no liveliness token."""
     running = start(*LONG, *live.settings(start_within_s=2.0), impatient=True)
@@ -140,3 +95,288 @@ def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
     outcome = reopen(run_dir)
     assert outcome.status == 1
     assert error.startswith(f"{outcome.reason} (logs in ")
+
+
+HORIZON_S = 8.0
+SHORT = [*live.AT_RATE, *live.settings(speed=4.0, horizon_s=HORIZON_S)]
+F_SETPIPE_SZ = 1031
+AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
+"""A terminal that cannot redraw a line: progress is printed line by line, also to a pipe."""
+
+
+def run(runs: Path) -> list[str]:
+    return live.noack_command("run", "lane_following", "--runs", str(runs), *live.BARE, *SHORT)
+
+
+def is_whole(run_dir: Path) -> bool:
+    steps = load_record(run_dir)["plant_step"]
+    return np.array_equal(steps["sequence"], np.arange(HORIZON_S * live.RATE_HZ + 1))
+
+
+def test_a_run_with_closed_streams_is_complete(tmp_path: Path) -> None:
+    """Closed by a shell's ``<&- >&- 2>&-``: files opened next get the descriptors 0 to 2."""
+    shell = ["/bin/sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *run(tmp_path)]
+    assert subprocess.run(shell, timeout=live.PATIENCE_S, check=False).returncode == 0
+    run_dir = (tmp_path / "latest").resolve()
+    assert is_whole(run_dir)
+    assert {log.read_text() for log in (run_dir / "logs").iterdir()} == {""}
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="sets the size of a pipe")
+def test_a_full_and_then_closed_pipe_does_not_disturb_the_run(tmp_path: Path) -> None:
+    """The launcher is blocked until the reader of its progress closes the pipe."""
+    reading, writing = os.pipe()
+    fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
+    process = subprocess.Popen(
+        run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing, env=AS_A_TERMINAL
+    )
+    os.close(writing)
+    try:
+        rows = tmp_path / "latest" / "spool" / "plant_step.recorder"  # from the start on
+        live.wait_for(lambda: rows.exists() or process.poll() is not None)
+        filling = os.open(f"/proc/self/fd/{reading}", os.O_WRONLY | os.O_NONBLOCK)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(filling, b"x")
+        os.close(filling)
+
+        def has_ended() -> bool:
+            """Whether the loop and the recorder have: none runs, reaped by the launcher or not."""
+            return all(live.child_of(process, role) is None for role in ROLES)
+
+        live.wait_for(has_ended)  # although the pipe is not read
+    finally:
+        os.close(reading)
+        status = process.wait(live.PATIENCE_S)
+    assert status == 0
+    assert is_whole((tmp_path / "latest").resolve())
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 64 MiB that contains the runs of ``start``."""
+    path = tmp_path / "runs"
+    path.mkdir()
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount a disk")
+    command = ["mount", "-t", "tmpfs", "-o", "size=64m", "noack-test", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
+    try:
+        yield path
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+def fill(disk: Path) -> None:
+    room = shutil.disk_usage(disk).free
+    with (disk / "filler").open("wb", buffering=0) as file:
+        while room > 0:  # other processes may write at the same time
+            try:
+                room -= file.write(bytes(min(room, 1 << 16)))
+            except OSError:
+                break
+
+
+def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, small: Path) -> None:
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=240.0))
+    running.wait_recording()
+    run_dir = (running.runs / "latest").resolve()
+    fill(small)
+    stdout, stderr = running.process.communicate(timeout=live.PATIENCE_S)
+    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
+    assert running.process.returncode == 1
+    # Whoever writes first on the full disk: the recorder, or a process for which it is too slow.
+    # "ended early": a recorder that needs more than 5 s to exit is not waited for.
+    reason = f": {run_dir / 'spool'}: the record cannot be written: No space left on device"
+    assert lines[0].startswith("noack: the run failed: ")
+    assert lines[0].replace(" ended early", "").endswith(reason)
+    assert lines[1].startswith(f"noack: {run_dir / 'record'}: the record cannot be written: No spa")
+    assert f"kept in {run_dir / 'spool'}" in lines[1]
+    assert len(lines) == 2, stderr
+    assert "No space left on device" in stdout  # as JSON
+    assert running.left_behind() == []
+    spooled = {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()}
+
+    with pytest.raises(MachineError) as refused:
+        reopen(run_dir)
+    assert str(refused.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
+    assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
+
+    (small / "filler").unlink()
+    assert CliRunner().invoke(app, ["summary", str(run_dir)]).exit_code == 0
+    record = load_record(run_dir)
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        rows = record[table]
+        bytes_on_disk = sum(size for name, size in spooled.items() if name.startswith(table))
+        batches_at_most, row_bytes = len(rows) / 4 + 2, rows.itemsize + 2  # and the loop
+        assert len(rows) * row_bytes >= bytes_on_disk - 16 * batches_at_most - row_bytes
+        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
+    assert not (run_dir / "spool").exists()
+    assert (run_dir / "report.html").stat().st_size > 100_000
+
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["exit"]["status"] == 1
+    failed = summary["exit"]["reason"]
+    assert lines[0] == f"noack: the run failed: {failed}"
+    assert failed in (run_dir / "report.html").read_text()
+    assert not list(run_dir.rglob("*.partial"))
+
+
+def test_a_removed_run_directory_ends_the_run_with_clear_lines(start: Start) -> None:
+    running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=400.0))
+    running.wait_recording()
+    run_dir = (running.runs / "latest").resolve()
+    run_dir.rename(running.runs.parent / "removed")  # at once; rmtree would race with new files
+    _, stderr = running.process.communicate(timeout=live.PATIENCE_S)
+    assert running.process.returncode == 1
+    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
+    assert len(lines) == 2, stderr
+    assert lines[0].startswith(f"noack: the run failed: recorder: {run_dir}")
+    assert lines[0].endswith(": was deleted or moved during the run")
+    assert lines[1].startswith(f"noack: {run_dir}: the run cannot be written: No such file")
+    assert "Traceback" not in stderr
+    assert running.left_behind() == []
+    assert not run_dir.exists()
+
+
+DISTURBED_S = 36.0
+PAUSE_S = 0.7
+"""Well below zenoh's lease, and far above every delay that a certificate allows."""
+SILENT_S = 3.0
+"""Above the lease: all connections break, come back, and rows are sent again."""
+
+
+class Disturbed(NamedTuple):
+    """A finished run, its record, and its live viewer's processes."""
+
+    finished: live.Finished
+    record: RunRecord
+    left_behind: list[psutil.Process]
+    viewers: list[psutil.Process]
+    viewer_group: int
+
+
+def pause(process: psutil.Process, pause_s: float) -> None:
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(pause_s)
+    process.send_signal(signal.SIGCONT)
+
+
+def viewers_of(running: live.Running) -> list[psutil.Process]:
+    """Return the server of the recording and the server of rerun's page."""
+    return [
+        child
+        for child in running.child("recorder").children(recursive=True)
+        if "cosim.output.viewer.live_viewer" in live.command_of(child) or is_rerun(child)
+    ]
+
+
+def is_rerun(process: psutil.Process) -> bool:
+    try:
+        return "rerun" in Path(process.exe()).name
+    except psutil.Error:  # the process has ended
+        return False
+
+
+def disturbed_run(folder: Path) -> Disturbed:
+    with pytest.MonkeyPatch.context() as environment, live.begun(folder) as start:
+        for name in [name for name in os.environ if "DISPLAY" in name]:
+            environment.delenv(name)  # the viewer opens in a browser
+        running = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=DISTURBED_S), "--live")
+        running.wait_recording()
+        viewers = viewers_of(running)
+        (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
+        os.killpg(group, signal.SIGSTOP)
+        for role in ROLES:
+            pause(running.child(role), PAUSE_S)
+        # The launcher's process routes all telemetry.
+        pause(psutil.Process(running.process.pid), SILENT_S)
+        finished = running.finish()
+        record = load_record(finished.run_dir)
+        return Disturbed(finished, record, running.left_behind(), viewers, group)
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Disturbed:
+    """A run that the machine has not stalled at its horizon, where no step can be made up for."""
+    for _ in range(3):
+        found = disturbed_run(tmp_path_factory.mktemp("disturbed"))
+        if ": overrun: " not in found.finished.summary["exit"]["reason"]:
+            break
+    assert found.finished.status == 0, found.finished.stderr
+    return found
+
+
+def test_every_step_is_executed_recorded_and_replayed(disturbed: Disturbed) -> None:
+    """The steps due during a pause are executed late and in order."""
+    summary, record = disturbed.finished.summary, disturbed.record
+    assert summary["exit"]["reason"] == "horizon"
+    assert summary["reached_s"] == DISTURBED_S
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        rows = record[table]
+        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
+    assert len(record["plant_step"]) == DISTURBED_S * live.RATE_HZ + 1
+    for table in record.tables:
+        assert (np.diff(record[table]["now_ns"]) >= 0).all()
+    loop = disturbed.finished.loop
+    live.assert_complete(loop)
+    assert loop["identity_residual_relative"] < 1e-11
+    assert loop["longest_loss_burst"] <= summary["mansd"]
+    assert disturbed.left_behind == []
+
+
+def test_inputs_too_old_for_a_certificate_make_its_claims_void(disturbed: Disturbed) -> None:
+    record = disturbed.record
+    for role in ("plant", "sensor", "controller"):  # netem may have had no packet
+        assert disturbed.finished.loop["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
+    certified = [
+        claim for claim in disturbed.finished.loop["claims"] if "certificate" in claim["source"]
+    ]
+    assert certified
+    for claim in certified:
+        assert claim["verdict"] == "void"
+        assert 0 <= claim["since_s"] < DISTURBED_S
+    late = [notice["text"] for notice in record.notices if notice["level"] == "late"]
+    assert any(" s old, " in text or "took effect after " in text for text in late), late
+    for text in late:
+        assert disturbed.finished.stderr.count(text) == 1
+    own = [claim for claim in disturbed.finished.loop["claims"] if claim["source"] == "(I1)"]
+    assert {claim["verdict"] for claim in own} == {"held"}
+
+
+def test_the_recording_is_complete_and_the_stalled_viewer_is_ended(disturbed: Disturbed) -> None:
+    assert len(disturbed.viewers) == 2
+    assert "live view: http://127.0.0.1:" in disturbed.finished.stderr
+    chunks = read(disturbed.finished.run_dir / "recording.rrd")
+    assert sum(chunk.num_rows for chunk in chunks["error/log10"]) > DISTURBED_S * live.RATE_HZ
+    live.wait_for(lambda: not is_left(disturbed.viewer_group))
+    assert all(live.is_over(viewer) for viewer in disturbed.viewers)
+
+
+PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
+WALL_CLOCK = {
+    "noack/runtime/command_line.py": "lines of the log",
+    "noack/plants/systems/code_cache.py": "ages of files",
+    "cosim/record/run_directory.py": "the run's name and its environment",
+    "cosim/live/coordinator.py": "when a change was requested",
+    "cosim/live/remote_access.py": "the validity of an invitation",
+    "netem/relay.py": "the times of a capture",
+    "netem/control/emulator_statistics.py": "lines of statistics",
+    "native/relay/loop.c": "time stamps of the kernel, compared with the monotonic clock",
+    "noack/runtime/host_clocks/time_exchange.py": "the same",
+}
+
+
+def test_no_time_of_a_run_is_read_from_the_wall_clock() -> None:
+    root = Path(__file__).parents[2]
+    folders = (*PACKAGES, "native")
+    reads = re.compile(r"\btime\.time(_ns)?\(|CLOCK_REALTIME\)|datetime\.(now|today)\(|utcnow")
+    found = {
+        str(path.relative_to(root))
+        for folder in folders
+        for path in (root / folder).rglob("*.[pc]*")
+        if path.suffix in (".py", ".c") and reads.search(path.read_text())
+    }
+    assert found == WALL_CLOCK.keys()

@@ -1,20 +1,23 @@
-"""A live, encrypted run with impairments of updates and of acknowledgements, over real UDP."""
+"""Live, encrypted runs with impairments of updates, acknowledgements and actuations."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cosim.analysis.replay import replay
+from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
 from noack.protocol.record_tables import (
-    ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
     NETEM_PACKET,
     SENSOR_ACKNOWLEDGEMENT,
     UPDATES,
 )
 from noack.protocol.wire_format import Flow, read_header
+from tests.integration import conftest as live
 from tests.integration.conftest import (
     AT_RATE,
     Finished,
@@ -70,32 +73,17 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
     assert_complete(finished.loop)
     assert [claim["verdict"] for claim in finished.loop["claims"]] == ["void"]
+    heads = record[NETEM_PACKET]["head"]
+    assert {read_header(head.tobytes()).version for head in heads} == {2}  # encrypted
+    answers = finished.loop["acknowledgements"]
+    assert answers["sent"] == finished.loop["deliveries"] > 10
+    assert 0 <= answers["sent"] - answers["lost"] - answers["received"] <= 2  # in flight
     found = replay(record)
     compared = {leg.leg: leg.compared for leg in found.messages}
     assert compared["controller → netem"] == len(record[CONTROLLER_DELIVERY])
     assert compared["netem → sensor"] == len(record[SENSOR_ACKNOWLEDGEMENT])
     logs = [log.read_text() for log in (finished.run_dir / "logs").iterdir()]
     assert not any("Traceback" in text for text in (finished.stderr, *logs))
-
-
-def test_acknowledgements_are_counted_by_outcome(finished: Finished, record: RunRecord) -> None:
-    found = finished.loop["acknowledgements"]
-    assert found["sent"] == finished.loop["deliveries"] > 10
-    assert found["lost"] > 3
-    assert found["received"] > 3
-    assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # in flight at the end
-    packets = record[NETEM_PACKET]
-    answers = packets[packets["flow"] == ACKNOWLEDGEMENTS]
-    heads = [read_header(head.tobytes()) for head in answers["head"]]
-    assert {head.flow for head in heads} == {Flow.ACKNOWLEDGEMENT}
-    expected = record[CONTROLLER_DELIVERY]["sequence"]
-    assert [head.sequence for head in heads] == expected.tolist()
-    assert set(answers["size_bytes"].tolist()) == {48}
-
-
-def test_every_datagram_is_encrypted(record: RunRecord) -> None:
-    heads = record[NETEM_PACKET]["head"]
-    assert {read_header(head.tobytes()).version for head in heads} == {2}
 
 
 def test_each_process_receives_from_its_senders_only(finished: Finished) -> None:
@@ -131,3 +119,25 @@ def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     causes = finished.loop["drops_by_cause"]
     assert {"dropped", "corrupted"} <= set(causes)
     assert sum(causes.values()) == finished.loop["drops"]
+
+
+ACTUATION = (
+    'network.actuation={mansd=3, loss={model="bernoulli", probability=0.4}, '
+    'impairments=[{kind="delay", delay_s=0.005, jitter_s=0.01}]}'
+)
+
+
+def test_actuations_are_lost_within_their_guarantee(tmp_path: Path) -> None:
+    sets = ("horizon_s=4", ACTUATION, "controller.predictions=5", "trigger.beta=0.02")
+    options = [word for one in sets for word in ("--set", one)]
+    finished = run_scenario(tmp_path, *AT_RATE, *options)
+    assert finished.status == 0, finished.stderr
+    live.assert_complete(finished.loop)
+    record = load_record(finished.run_dir)
+    found, outcomes = finished.loop["actuations"], packet_outcomes(record, Flow.ACTUATION)
+    assert found["sent"] == len(record[CONTROLLER_STEP])
+    assert found["lost"] > 0.2 * found["sent"]
+    assert found["longest_loss_burst"] == outcomes.longest_loss_burst() <= 3
+    assert found["received"] == outcomes.forwarded.sum()
+    channels = {role: report["channel"] for role, report in record.reports.items()}
+    assert set(channels["plant"]["received_from"]) == {channels["netem"]["local"]}

@@ -5,7 +5,6 @@ stall the runs differ. The test compares them up to the stall and repeats a live
 stall.
 """
 
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,8 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    Fate,
 )
-from tests.integration.conftest import PATIENCE_S, noack_command, run_scenario, settings
+from tests.integration.conftest import run_scenario, settings
 
 RATE_HZ = 5.0
 HORIZON_S = 8.0
@@ -108,25 +106,3 @@ def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
     if until_ns > simulated.scenario.timing.horizon_ns:
         for table in SAME:
             assert len(live[table]) == len(simulated[table]), table
-
-
-def test_margin_plays_the_destabilising_pattern(tmp_path: Path) -> None:
-    """Every update of the run has the fate that the pattern gives it."""
-    values = {
-        "mode": "zoh",
-        "plant__rate_hz": 20.0,
-        "controller__rate_hz": 20.0,
-        "horizon_s": 5.0,
-        "speed": 4.0,
-    }
-    trigger = ("--set", 'trigger={policy="periodic", period_s=0.5}')
-    options = (*settings(**values), *trigger, "--no-period", "--play", "--runs", str(tmp_path))
-    played = noack_command("margin", "double_integrator", *options)
-    done = subprocess.run(played, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert done.returncode == 0, done.stderr
-    pattern = "DDLLLDLLL"
-    assert f"destabilises M = 4: {pattern}" in " ".join(done.stdout.split())
-    packets = load_record((tmp_path / "latest").resolve())[NETEM_PACKET]
-    lost = packets["fate"] == Fate.DROPPED
-    assert len(lost) >= len(pattern)
-    assert lost.tolist() == [pattern[i % len(pattern)] == "L" for i in range(len(lost))]

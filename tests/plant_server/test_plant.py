@@ -1,153 +1,121 @@
-"""The plant: late steps, shared descriptions, and the watchdog of the last actuation."""
+"""The plant: its disturbances, its measurement noise, and the watchdog of the last actuation."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from noack.protocol.machine_interface import Notice, Record
-from noack.protocol.record_tables import PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
-from noack.scenario.resolution import resolve, resolved_loops
+from noack.scenario.resolution import resolve, tables_of
+from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from plant_server.plant import plants_of
-from tests.machine_parts import OneLoop, linear_plant, plant_of, state_of
+from plant_server.plant import BLOCK, MeasurementModel, disturbance_of
+from tests.machine_parts import OneLoop, plant_of
 
-H_NS = 2_000_000
-A = np.array([[0.0, 1.0], [-3.0, 0.4]])
-B = np.array([[0.0, 1.0], [2.0, -1.0]])
+STEPS = 4000
 
 
-def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> OneLoop:
-    x0 = np.array([1.0, -0.5])
-    return linear_plant(A, B, x0, H_NS, horizon_ns=horizon_ns, measure_every=measure_every)
+@pytest.fixture
+def disturbed(content: dict[str, Any]) -> dict[str, Any]:
+    content["horizon_s"] = 2.0
+    content["plant"] |= {
+        "rate_hz": 100.0,
+        "disturbances": [
+            {"kind": "gaussian", "std": [0.3]},
+            {"kind": "uniform", "at": "state", "bound": [0.2, 0.0]},
+            {"kind": "sine", "at": "state", "amplitude": [0.0, 1.5], "hz": 0.7, "phase_rad": 0.4},
+            {"kind": "step", "amplitude": [2.0], "from_s": 0.5, "until_s": 1.0},
+        ],
+        "measurement": {"noise_std": [0.1, 0.0], "noise_bound": [0.0, 0.05]},
+    }
+    return content
 
 
-def actuation(sequence: int, u: Sequence[float]) -> Message:
-    return Message(Flow.ACTUATION, sequence, sequence, np.array(u, dtype=float))
+def resolved(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "test"))
 
 
-def measured(outputs: Sequence[object]) -> list[Message]:
-    return [output for output in outputs if isinstance(output, Message)]
+def steps_of(plant: OneLoop, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
+    rows, sent = [], []
+    for k in range(count):
+        plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)
+        for out in plant.on_timer(k * scenario.timing.plant_period_ns):
+            if isinstance(out, Record):
+                rows.append(out.row)
+            elif isinstance(out, Message):
+                sent.append(out)
+    return np.array(rows, tables_of(scenario)["plant_step"]), sent
 
 
-def rows(outputs: Sequence[object], table: str) -> Any:
-    """The table's rows in the form that is recorded."""
-    found = [out.row for out in outputs if isinstance(out, Record) and out.table == table]
-    return np.array(found, tables(2, 2)[table])
-
-
-def test_late_steps_keep_their_length_and_are_caught_up() -> None:
-    on_time, late = new_plant(), new_plant()
-    expected, found = [], []
-    for plant in (on_time, late):
-        plant.handle(actuation(0, [1.0, -1.0]), 0)
-    for step in range(20):
-        expected += on_time.on_timer(step * H_NS)
-    now_ns = 0
-    for step in range(20):
-        assert late.next_deadline_ns() == step * H_NS  # the grid does not shift
-        # Stopped for a quarter of the run, then every step at once.
-        now_ns = max(now_ns, step * H_NS) if step != 5 else 10 * H_NS + 123
-        found += late.on_timer(now_ns)
-    for one, other in zip(measured(expected), measured(found), strict=True):
-        assert (one.sequence, one.t_ns) == (other.sequence, other.t_ns)
-        assert one.vector.tobytes() == other.vector.tobytes()
-    steps = rows(found, PLANT_STEP)
-    assert steps["t_ns"].tolist() == [step * H_NS for step in range(20)]
-    assert steps["now_ns"][[4, 5, 6, 10, 11]].tolist() == [
-        4 * H_NS,
-        10 * H_NS + 123,
-        10 * H_NS + 123,
-        10 * H_NS + 123,
-        11 * H_NS,
-    ]
-
-
-@pytest.mark.parametrize("noise", [False, True])
-def test_loops_with_the_same_plant_share_its_description(
-    content: dict[str, Any], *, noise: bool
+def test_disturbances_have_their_distributions_and_are_independent(
+    disturbed: dict[str, Any],
 ) -> None:
-    content["loops"] = [{"name": "loop", "count": 3}]
-    if noise:
-        content["plant"]["measurement"] = {"noise_std": [0.1, 0.1]}
-    plants = plants_of(resolved_loops(validate(content, "loops")))
-    assert len({id(part) for part in plants.parts}) == (3 if noise else 1)
-    for name in ("x", "u"):
-        assert np.array_equal(state_of(plants, name, 2), state_of(plants, name))
+    disturbance = disturbance_of(resolved(disturbed))
+    assert disturbance is not None
+    d, w = disturbance.values(range(STEPS))
+    d = d[:, 0]
+    t_s = np.arange(STEPS) * 0.01
+    there = (t_s >= 0.5) & (t_s < 1.0)
+    normal = (d - 2.0 * there) / 0.3
+    assert kstest(normal, "norm").pvalue > 1e-3
+    assert kstest(w[:, 0], "uniform", (-0.2, 0.4)).pvalue > 1e-3
+    np.testing.assert_allclose(w[:, 1], 1.5 * np.sin(2 * np.pi * 0.7 * t_s + 0.4), atol=1e-12)
+    model = MeasurementModel(np.eye(2), np.array([0.5, 0.0]), np.array([0.0, 0.2]), seed=7)
+    noise = model.noise(0, STEPS)
+    assert kstest(noise[:, 0] / 0.5, "norm").pvalue > 1e-3
+    assert kstest(noise[:, 1], "uniform", (-0.2, 0.4)).pvalue > 1e-3
+    # White and mutually independent: correlations of 4,000 samples are within 4/√4000.
+    for one, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
+        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
+
+
+def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(disturbed: dict[str, Any]) -> None:
+    one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
+    assert one is not None
+    assert other is not None
+    d, w = one.values(range(BLOCK, 3 * BLOCK))
+    for first in (2 * BLOCK, BLOCK):
+        rows = slice(first - BLOCK, first)
+        again = other.values(range(first, first + BLOCK))
+        assert tuple(v.tobytes() for v in again) == (d[rows].tobytes(), w[rows].tobytes())
+
+
+def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> None:
+    base = resolved(disturbed)
+    rows, sent = steps_of(plant_of(base), base, 20)
+    noise = base.model_copy(update={"seeds": base.seeds.model_copy(update={"noise": 1})})
+    other, heard = steps_of(plant_of(noise), noise, 20)
+    assert rows.tobytes() == other.tobytes()
+    assert all(a.vector.tobytes() != b.vector.tobytes() for a, b in zip(sent, heard, strict=True))
+    gusts = base.model_copy(update={"seeds": base.seeds.model_copy(update={"disturbance": 1})})
+    rows_2, sent_2 = steps_of(plant_of(gusts), gusts, 20)
+    assert (rows_2["d"] != rows["d"]).all()
+    v, v_2 = (
+        np.array([m.vector for m in messages]) - some["x"]
+        for messages, some in ((sent, rows), (sent_2, rows_2))
+    )
+    np.testing.assert_allclose(v, v_2, atol=1e-12)
 
 
 MS = 1_000_000
-K = np.array([[-3.0, -1.5]])
 
 
-def scenario(policy: str, **changes: Any) -> Any:
-    content: dict[str, Any] = {
-        "name": "watched", "horizon_s": 1.0,
-        "model": {"A": [[0.0, 1.0], [1.0, 0.5]], "B": [[0.0], [1.0]], "gain": K.tolist()},
-        "plant": {
-            "initial_state": [1.0, 0.0], "rate_hz": 100.0,
-            "watchdog": {"policy": policy, "timeout_s": 0.05},
-        },
-        "controller": {"rate_hz": 100.0},
-        "trigger": {"beta": 0.1, "alpha_per_s": 0.1},
-        "network": {"mansd": 2, "loss": {"model": "lossless"}},
-    }  # fmt: skip
-    return resolve(validate(content | changes, "here"))
-
-
-class Driven:
-    """A plant that executes every step on time."""
-
-    def __init__(self, plant: OneLoop) -> None:
-        self.plant = plant
-        self.steps: dict[int, Any] = {}
-        self.notices: list[Notice] = []
-
-    def until(self, t_ns: int) -> None:
-        """Execute every step up to ``t_ns``."""
-        while (due_ns := self.plant.next_deadline_ns()) is not None and due_ns <= t_ns:
-            for out in self.plant.on_timer(due_ns):
-                if isinstance(out, Notice):
-                    self.notices.append(out)
-                elif isinstance(out, Record):
-                    self.steps[due_ns] = np.array([out.row], tables(2, 1)[PLANT_STEP])[0]
-
-    def u(self, t_ns: int) -> float:
-        return float(self.steps[t_ns]["u"].item())
-
-    def take(self, sequence: int, t_ns: int, *entries: float) -> None:
-        self.plant.handle(Message(Flow.ACTUATION, sequence, t_ns, np.array(entries)), t_ns)
-
-
-def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> None:
-    for policy, then in (("hold", 2.0), ("zero", 0.0)):
-        for sent_ns, u, trips in ((10 * MS, 2.0, False), (10 * MS - 1, then, True)):
-            driven = Driven(plant_of(scenario(policy)))
-            driven.take(0, sent_ns, 2.0)
-            driven.until(60 * MS)
-            assert (driven.u(50 * MS), driven.u(60 * MS)) == (2.0, u)
-            expected = [(60 * MS, "watchdog")] if trips else []
-            assert [(notice.t_ns, notice.level) for notice in driven.notices] == expected
-
-
-def test_the_default_timeout_is_50_controller_periods() -> None:
-    plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
-    default = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
-    assert default.timing.actuation_timeout_ns == 250 * MS
-    assert default.plant.watchdog.policy == "hold"
-
-
-def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
-    driven = Driven(plant_of(scenario("hold")))
-    driven.until(50 * MS)
-    assert driven.notices == []
-    driven.until(60 * MS)
-    assert driven.notices == [
-        Notice(
-            60 * MS, "watchdog",
-            "no actuation for 0.06 s, 0.05 s allowed; the input is held",
-        )
-    ]  # fmt: skip
-    assert driven.u(60 * MS) == 0.0
+@pytest.mark.parametrize(("policy", "then"), [("hold", 2.0), ("zero", 0.0)])
+@pytest.mark.parametrize(("sent_ns", "trips"), [(10 * MS, False), (10 * MS - 1, True)])
+def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout(
+    content: dict[str, Any], policy: str, then: float, sent_ns: int, *, trips: bool
+) -> None:
+    watchdog = {"policy": policy, "timeout_s": 0.05}
+    content["plant"] |= {"rate_hz": 100.0, "watchdog": watchdog}
+    scenario = resolved(content)
+    plant, outputs = plant_of(scenario), []
+    plant.handle(Message(Flow.ACTUATION, 0, sent_ns, np.array([2.0])), sent_ns)
+    for t_ns in range(0, 70 * MS, 10 * MS):
+        outputs += plant.on_timer(t_ns)
+    rows = [one.row for one in outputs if isinstance(one, Record)]
+    u = np.array(rows, tables_of(scenario)["plant_step"])["u"][:, 0]
+    assert (u[5], u[6]) == (2.0, then if trips else 2.0)
+    notices = [(one.t_ns, one.level) for one in outputs if isinstance(one, Notice)]
+    assert notices == [(60 * MS, "watchdog")] * trips

@@ -1,6 +1,5 @@
 """The sensor's events and its observers; cosim/simulation/test_whole_loop.py has whole runs."""
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -10,10 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from noack.core.core_library import core, ffi
-from noack.core.linear_systems import Matrix, Vector, discretise
-from noack.observers.luenberger import LuenbergerSettings
 from noack.observers.observer_settings import (
-    EstimationModel,
     observer_gain,
     unobservable_mode,
 )
@@ -23,10 +19,9 @@ from noack.protocol.wire_format import Encoder, Flow, Message, Wire
 from noack.scenario.resolution import assumed_model, resolve, steady_state, true_model
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from sensor_node.sensor import Observer, Sensor
-from tests.machine_parts import OneLoop, machine, sensor_of, state_of
-from tests.trigger_rules import absolute_rule, decaying_rule
-from tests.wire_decoder import NO_VECTOR
+from sensor_node.sensor import Sensor
+from tests.machine_parts import machine, sensor_of
+from tests.trigger_rules import decaying_rule
 
 GRID_NS = 10_000_000
 ZOH = np.zeros((1, 1))
@@ -71,42 +66,6 @@ def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
     assert runs[0] == runs[1]
 
 
-H = np.array([[0.0, 1.0], [-2.0, -3.0]])
-ALWAYS = absolute_rule(1e-9)
-
-
-def split(outputs: Sequence[Output]) -> tuple[list[Message], Any]:
-    sent = [output for output in outputs if isinstance(output, Message)]
-    (record,) = (output for output in outputs if isinstance(output, Record))
-    return sent, np.array([record.row], tables(2, 1, acknowledged=True)[record.table])[0]
-
-
-def waiting(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> OneLoop:
-    known = None if x0 is None else np.asarray(x0, dtype=float)
-    return machine(Sensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS))
-
-
-def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
-    one = waiting(x0=[1.0, 1.0])
-    before = state_of(one, "x_s")
-    _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
-    assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()
-
-
-A = np.array([[0.0, 1.0], [4.0, -0.3]])
-B = np.array([[0.0], [1.5]])
-C = np.array([[1.0, 0.2]])
-H_NS = 10_000_000
-Q = np.array([[1e-4, 2e-5], [2e-5, 4e-4]])
-R = np.array([[0.03]])
-
-
-def model(steps: int = 1) -> EstimationModel:
-    Ad, Bd = discretise(A, B, H_NS)
-    _, Gd = discretise(A, np.eye(2), H_NS)
-    return EstimationModel(Ad, Bd, Gd, C, Q, R, steps)
-
-
 @pytest.fixture
 def observed(content: dict[str, Any]) -> dict[str, Any]:
     """The double integrator with a noisy position measurement."""
@@ -120,19 +79,6 @@ def observed(content: dict[str, Any]) -> dict[str, Any]:
 
 def resolved(content: dict[str, Any]) -> Scenario:
     return resolve(validate(content, "test"))
-
-
-def luenberger(L: Matrix) -> LuenbergerSettings:
-    return LuenbergerSettings.model_validate_json(
-        json.dumps({"kind": "luenberger", "gain": L.tolist()})
-    )
-
-
-def observing(L: Matrix, x_hat: Sequence[float], steps: int) -> OneLoop:
-    """A sensor with a Luenberger observer that starts at a known estimate."""
-    start = np.array(x_hat)
-    observer = Observer(luenberger(L), model(steps), start, steps, H_NS, knows_start=True)
-    return machine(Sensor(np.zeros((2, 2)), absolute_rule(1.0), observer=observer))
 
 
 def test_complex_poles_and_several_outputs_are_placed() -> None:
@@ -149,22 +95,6 @@ def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
     assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
     assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
     assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
-
-
-def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
-    sensor = observing(np.zeros((2, 1)), [1.0, 1.0], 2)
-    x = estimates(sensor.handle(measurement(0, 5 * H_NS, [0.0, 0.7, -0.4]), 0))
-    Ad, Bd, *_ = model()
-    expected = np.ones(2)
-    for u in (0.7, 0.7, 0.7, 0.7, -0.4):
-        expected = Ad @ expected + Bd @ np.array([u])
-    np.testing.assert_allclose(x, expected, rtol=1e-14)
-
-
-def estimates(outputs: Sequence[Output]) -> Vector:
-    (record,) = [one for one in outputs if isinstance(one, Record)]
-    found: Vector = record.row[4]
-    return found
 
 
 def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(

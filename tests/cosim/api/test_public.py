@@ -1,5 +1,6 @@
 """The interface of ``import noack``: documented, typed, and without heavy imports until used."""
 
+import doctest
 import inspect
 import json
 import pydoc
@@ -51,6 +52,7 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
     found = getattr(noack, name)
     text = inspect.getdoc(found)
     assert text
+    assert f"{name} in module noack" in pydoc.render_doc(found, renderer=pydoc.plaintext)
     if inspect.isfunction(found):
         assert {"Args:", "Raises:"} <= set(text.split())
         for parameter in inspect.signature(found).parameters:
@@ -63,24 +65,13 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
                 assert inspect.signature(target).return_annotation is not inspect.Signature.empty
 
 
-@pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
-def test_the_help_of_a_public_name_names_noack(name: str) -> None:
-    found = getattr(noack, name)
-    assert found.__module__.partition(".")[0] == "noack"
-    assert f"{name} in module noack" in pydoc.render_doc(found, renderer=pydoc.plaintext)
-
-
-def test_importing_noack_loads_no_heavy_modules() -> None:
-    assert not loaded_by("import noack; dir(noack)") & set(HEAVY)
-
-
-def test_loading_a_scenario_imports_no_viewer_zenoh_or_plots() -> None:
-    loaded = loaded_by("import noack; noack.load('lane_following')")
-    assert not loaded & {"matplotlib", "numba", "rerun", "zenoh"}
-
-
-def test_a_process_of_a_run_does_not_import_cosim() -> None:
-    assert "cosim" not in loaded_by("import controller_node.__main__, plant_server.__main__")
+@pytest.mark.parametrize(("program", "heavy"), [
+    ("import noack; dir(noack)", HEAVY),
+    ("import noack; noack.load('lane_following')", ("matplotlib", "numba", "rerun", "zenoh")),
+    ("import controller_node.__main__, plant_server.__main__", ("cosim",)),
+])  # fmt: skip
+def test_a_program_loads_no_modules_that_it_does_not_need(program: str, heavy: tuple[str]) -> None:
+    assert not loaded_by(program) & set(heavy)
 
 
 def test_an_unknown_name_is_refused_with_a_message() -> None:
@@ -89,6 +80,14 @@ def test_an_unknown_name_is_refused_with_a_message() -> None:
     assert set(noack.__all__) <= set(dir(noack))
 
 
-def test_the_package_is_marked_as_typed() -> None:
-    assert (ROOT / "noack/py.typed").is_file()
-    assert (ROOT / "cosim/py.typed").is_file()
+EXAMPLES = [name for name in noack.__all__ if ">>>" in (getattr(noack, name).__doc__ or "")]
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_of_the_docstrings_run(name: str) -> None:
+    (example,) = doctest.DocTestFinder(recurse=False).find(
+        getattr(noack, name), name, module=False, globs={}
+    )
+    found = doctest.DocTestRunner().run(example)
+    assert found.attempted > 1
+    assert found.failed == 0

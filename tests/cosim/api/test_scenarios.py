@@ -8,17 +8,7 @@ import numpy as np
 import pytest
 
 import noack
-from noack.scenario.scenario_file import dumps
 from tests.cosim.api.conftest import GAIN, SYSTEM, TRUE
-
-
-def test_a_scenario_loads_equally_by_name_file_and_table(tmp_path: Path) -> None:
-    shipped = noack.load("double_integrator")
-    path = tmp_path / "own.toml"
-    path.write_text(dumps(shipped))
-    assert noack.load(path) == noack.load(str(path)) == shipped
-    assert noack.load(shipped.model_dump(mode="json", exclude_none=True)) == shipped
-    assert noack.load(shipped) is shipped
 
 
 def test_files_are_found_relative_to_the_scenario(
@@ -30,24 +20,6 @@ def test_files_are_found_relative_to_the_scenario(
     assert noack.load(content).model.matrices[0].tolist() == SYSTEM[0]
 
 
-def test_settings_replace_values_in_a_copy_of_the_scenario() -> None:
-    scenario = noack.load("lane_following")
-    other = noack.with_settings(
-        scenario,
-        {
-            "network.mansd": np.int64(9),
-            "network.loss": {"model": "bernoulli", "probability": np.float64(0.9)},
-            "trigger.weight": np.eye(4),
-            "seeds": None,
-        },
-    )
-    assert (other.network.mansd, scenario.network.mansd) == (9, 4)
-    assert other.network.loss.model_dump()["probability"] == 0.9
-    assert other.trigger.weight == tuple(map(tuple, np.eye(4)))
-    assert (other.seeds.plant, scenario.seeds.plant) == (0, 1)
-    assert noack.load("lane_following", {"network.mansd": 9}).network.mansd == 9
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -57,31 +29,15 @@ def test_settings_replace_values_in_a_copy_of_the_scenario() -> None:
         ({"horizon_s.x": 1}, "settings: horizon_s.x: horizon_s is not a table"),
         ({"plant.initial_state": np.zeros(3)}, "plant.initial_state"),
         ({"horizon_s": object()}, "is no value of a setting"),
+        (["network.mansd=2"], "settings: ['network.mansd=2'] is no table"),
+        ({3: 1}, "settings: 3 is not a key"),
     ],
 )
-def test_a_wrong_setting_gives_one_line(settings: dict[str, Any], message: str) -> None:
+def test_a_wrong_setting_gives_one_line(settings: Any, message: str) -> None:
     with pytest.raises(noack.NoackError) as caught:
         noack.with_settings(noack.load("lane_following"), settings)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_an_unknown_scenario_name_gives_one_line() -> None:
-    with pytest.raises(noack.NoackError, match="lane_folowing") as caught:
-        noack.load("lane_folowing")
-    assert "lane_following" in str(caught.value)
-
-
-def test_settings_that_are_no_table_give_one_line() -> None:
-    given: Any = ["network.mansd=2"]
-    with pytest.raises(noack.NoackError, match=r"^settings: \['network.mansd=2'\] is no table"):
-        noack.load("lane_following", given)
-
-
-def test_a_key_that_is_no_text_gives_one_line() -> None:
-    given: Any = {3: 1}
-    with pytest.raises(noack.NoackError, match=r"^settings: 3 is not a key"):
-        noack.load("lane_following", given)
 
 
 def test_a_system_becomes_a_scenario_with_the_documented_choices() -> None:
@@ -123,15 +79,3 @@ def test_an_invalid_system_gives_one_line(gain: Any, initial_state: Any, message
         noack.from_system(SYSTEM, gain, initial_state)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_notebook_shows_a_short_form_of_a_scenario() -> None:
-    scenario = noack.load("lane_following")
-    table = scenario._repr_html_()
-    for word in ("lane_following", "beta = 0.5", "bernoulli", "M − 1 = 4", "20 s"):
-        assert word in str(scenario)
-        assert word in table
-    assert len(str(scenario).splitlines()) < 10
-    assert table.startswith("<table>")
-    harmless = noack.with_settings(scenario, {"description": "<script>"})._repr_html_()
-    assert "<script>" not in harmless

@@ -1,9 +1,7 @@
 """Behaviour that all commands share."""
 
 import json
-import shutil
-import subprocess
-import sys
+import signal
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -14,31 +12,8 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli import command as cli
-from cosim.shipped_files import find_shipped
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's redirection")
-def test_a_command_without_standard_output_ends_normally() -> None:
-    command = f"'{sys.executable}' -m cosim.cli schema --json >&-"
-    done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("keys", [
-    {"policy": "lyapunov", "rate_per_s": 1.0},
-    {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5},
-])  # fmt: skip
-def test_check_refuses_a_policy_that_needs_a_stable_loop_if_it_is_unstable(
-    tmp_path: Path, content: dict[str, Any], keys: dict[str, Any]
-) -> None:
-    content["trigger"] = keys
-    content["model"] |= {"gain": [[3.0, 3.0]], "allow_unstable": True}
-    path = tmp_path / "unstable.toml"
-    path.write_text(tomli_w.dumps(content))
-    result = CliRunner().invoke(app, ["check", str(path)])
-    assert result.exit_code == 2
-    assert result.stderr.endswith("but Â + B̂K is not stable\n")
-    assert result.stdout == ""
+from cosim.live import finalize
+from cosim.record.run_directory import SUMMARY_FILE
 
 
 def test_check_prints_the_defaults_that_depend_on_other_keys(
@@ -55,10 +30,8 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
         return " ".join(done.stdout.replace("\n# ", "\n").split())
 
     silent = message()
-    assert "plant.watchdog: policy hold, after 0.1 s without an actuation" in silent
-    assert "controller.safe_input: 0, the input before the first update" in silent
-    assert "recovery.rejoin_within_s: 0, a process that dies ends the run;" in silent
-    assert "start_within_s: 30, longer on a busy machine" in silent
+    assert "watchdog: policy hold" in silent
+    assert "rejoin_within_s: 0" in silent
     content["plant"]["watchdog"] = {"timeout_s": 0.2}
     content["controller"] = {"safe_input": [0.1]}
     content["recovery"] = {"rejoin_within_s": 5.0}
@@ -68,26 +41,6 @@ def test_check_prints_the_defaults_that_depend_on_other_keys(
 
 
 INTERRUPTED = "noack: stopped by the user (SIGINT)\n"
-
-
-def test_ctrl_c_during_a_simulation_gives_one_line_and_leaves_no_run(tmp_path: Path) -> None:
-    """The trigger's class sends the signal, amid the run."""
-    (tmp_path / "own.py").write_text(
-        "import signal\n"
-        "class Own:\n"
-        "    def start(self, t_s, x): pass\n"
-        "    def test(self, t_s, x, e_s):\n"
-        "        if t_s > 0.5: signal.raise_signal(signal.SIGINT)\n"
-        "        return False\n"
-    )
-    trigger = 'trigger={policy="python", file="own.py", name="Own"}'
-    shutil.copy(find_shipped("double_integrator", "scenarios"), tmp_path / "own.toml")
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim.cli", "simulate", "own.toml", "--set", trigger],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", INTERRUPTED)
-    assert list((tmp_path / "runs").iterdir()) == []
 
 
 @pytest.mark.parametrize("line", [
@@ -105,3 +58,45 @@ def test_ctrl_c_during_any_command_gives_one_line(
     assert (done.exit_code, done.stdout, done.stderr) == (130, "", INTERRUPTED)
     done = CliRunner().invoke(app, [*line.split(), "--json"], prog_name="noack")
     assert json.loads(done.stdout)["exit"]["status"] == 130
+
+
+SHORT = ("lane_following", "--no-report", "--set", "horizon_s=1.0")
+
+
+@pytest.mark.usefixtures("usual_signals")
+@pytest.mark.parametrize(
+    ("number", "status", "why"),
+    [
+        (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
+        (signal.SIGHUP, 143, "stopped because the terminal was closed (SIGHUP)"),
+    ],
+)
+def test_a_signal_while_a_run_is_finalised_names_the_command_that_completes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, status: int, why: str
+) -> None:
+    def signalled(*_: Any) -> None:
+        signal.raise_signal(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finalize, "summarise", signalled)
+        done = CliRunner().invoke(app, ["simulate", *SHORT, "--runs", str(tmp_path)])
+    assert done.exit_code == status
+    (run_dir,) = (path for path in tmp_path.iterdir() if not path.is_symlink())
+    assert done.stderr.splitlines()[-1] == (
+        f"noack: {why}; `noack summary {run_dir}` completes its record"
+    )
+    assert not (run_dir / SUMMARY_FILE).exists()
+    assert CliRunner().invoke(app, ["summary", str(run_dir)]).exit_code == 0
+    assert (run_dir / SUMMARY_FILE).is_file()
+
+
+def test_check_refuses_a_policy_that_needs_a_stable_loop_if_it_is_unstable(
+    tmp_path: Path, content: dict[str, Any]
+) -> None:
+    content["trigger"] = {"policy": "lyapunov", "rate_per_s": 1.0}
+    content["model"] |= {"gain": [[3.0, 3.0]], "allow_unstable": True}
+    path = tmp_path / "unstable.toml"
+    path.write_text(tomli_w.dumps(content))
+    done = CliRunner().invoke(app, ["check", str(path)])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.endswith("but Â + B̂K is not stable\n")

@@ -1,9 +1,8 @@
-"""The help: an introduction, examples that work, and one word for each concept."""
+"""The help and the completion: examples that work, and the words that fit."""
 
 import json
 import re
 import shlex
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -37,19 +36,18 @@ def words_of(example: str) -> list[str]:
 
 
 @pytest.mark.parametrize("command", ["", *OURS])
-def test_help_fits_a_terminal(command: str) -> None:
+def test_help_fits_a_terminal_and_has_examples(command: str) -> None:
     text = help_of(*filter(None, [command]))
     assert max(map(len, text.splitlines())) <= 80
     wrapped = [" ".join(line.split()) for line in text.splitlines()]
-    for example in examples_of(COMMANDS[command]) if command else []:
+    if not command:
+        return
+    shown = examples_of(COMMANDS[command])
+    assert len(shown) >= 2
+    for example in shown:
+        assert words_of(example)[0] == command
         assert any(line.startswith(example) for line in wrapped), example
-
-
-@pytest.mark.parametrize("command", OURS)
-def test_every_help_page_ends_with_examples(command: str) -> None:
-    found = examples_of(COMMANDS[command])
-    assert len(found) >= 2
-    assert all(words_of(example)[0] == command for example in found)
+    assert "--json" in {name for one in COMMANDS[command].params for name in one.opts}
 
 
 @pytest.mark.parametrize("command", ["", *EMULATOR_COMMANDS])
@@ -77,18 +75,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-MORE = {
-    "archive": (),
-    "check": (),
-    "export": (),
-    "schema": (),
-    "summary": (),
-    "replay": (),
-    "fidelity": (),
-    "report": (),
-    "scenarios": (),
-    "measure": (),
-    "certify": (),
+AS_THEY_ARE = (
+    "archive", "check", "export", "schema", "summary", "replay", "fidelity", "report", "scenarios",
+    "measure", "certify",
+)  # fmt: skip
+MORE = dict.fromkeys(AS_THEY_ARE, ()) | {
     "margin": ("--most", "2", "--no-period"),
     "simulate": ("--set", "horizon_s=1", "--no-report"),
     "adversary": ("--nodes", "200", "--beam", "2", "--set", "horizon_s=0.5"),
@@ -114,51 +105,38 @@ def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPat
         json.loads(done.stdout)
 
 
-def test_only_long_and_live_commands_have_no_example_that_is_run() -> None:
-    assert set(OURS) - MORE.keys() == {
-        "campaign", "capacity", "collect", "compare", "controller", "demo", "design", "doctor",
-        "lab", "paper", "plant", "record", "reproduce", "run", "sensor", "set", "view",
-    }  # fmt: skip
+def completed(line: str) -> list[str]:
+    """The completions that bash offers for the last word of a line."""
+    place = str(len(line.split(" ")) - 1)
+    asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": place}
+    done = CliRunner().invoke(app, env=asked, prog_name="noack")
+    assert done.stderr == ""
+    return done.stdout.split()
 
 
-@pytest.mark.parametrize("command", OURS)
-def test_every_command_has_a_json_option(command: str) -> None:
-    assert "--json" in {name for one in COMMANDS[command].params for name in one.opts}
-
-
-OF_THEIR_OWN = {
-    "--draws": "at each grid point, in all, to choose by",
-    "--format": "of figures, or of an export",
-    "--invitation": "the file to write, or to join by",
-    "--listen": "where probes arrive, or where processes of other hosts join",
-    "--out": "a folder of results, or a scenario file",
-    "--runs": "where they are made, or the last one is looked for",
-}
-"""Options with a different meaning in each command, which their help states."""
-
-
-def test_an_option_has_one_name_and_one_meaning() -> None:
-    meanings: dict[str, set[tuple[str, str | None, str | None]]] = defaultdict(set)
-    names: dict[str, set[str]] = defaultdict(set)
-    for command in OURS:
-        for one in COMMANDS[command].params:
-            if one.help:
-                names[one.help].add(one.name)
-            if one.param_type_name == "option":
-                variant = "/".join(one.secondary_opts), one.metavar, one.help
-                meanings["/".join(one.opts)].add(variant)
-    several = {name for name, variants in meanings.items() if len(variants) > 1}
-    assert several <= OF_THEIR_OWN.keys(), {name: meanings[name] for name in several}
-    assert not [variants for variants in names.values() if len(variants) > 1]
-
-
-def test_arguments_have_few_names() -> None:
-    arguments: dict[str, set[str | None]] = defaultdict(set)
-    for name in OURS:
-        for one in COMMANDS[name].params:
-            if one.param_type_name == "argument":
-                arguments[one.name].add(name)
-    assert arguments.keys() == {
-        "scenario", "run_dir", "directories", "recording", "file", "name", "settings",
-        "sources",
-    }  # fmt: skip
+@pytest.mark.parametrize(("line", "offered"), [
+    ("noack ca", ["campaign", "capacity"]),
+    ("noack rep", ["replay", "report", "reproduce"]),
+    ("noack certify lane_f", ["lane_following"]),
+    ("noack doctor quad", ["quadrotor_hover"]),
+    ("noack campaign mb", ["mb_vs_zoh"]),
+    ("noack run lane_following --set trigger.be", ["trigger.beta="]),
+    ("noack run lane_following --set network.mansd", ["network.mansd="]),
+    ("noack view runs/l", ["runs/latest"]),
+    ("noack replay runs/2", ["runs/20260102-000000-b", "runs/20260101-000000-a"]),
+    ("noack run lane_following --set loss", ["loss=", "loss.p="]),
+    ("noack set loss", ["loss", "loss.p"]),
+    ("noack set network.loss", ["network.loss", "network.loss.probability"]),
+    ("noack simulate lane_following --tri", ["--trigger"]),
+    ("noack simulate lane_following --trigger c", ["continuous"]),
+])  # fmt: skip
+def test_words_are_completed(
+    line: str, offered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("20260101-000000-a", "20260102-000000-b"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "scenario.toml").touch()
+    (tmp_path / "runs" / "campaigns").mkdir()
+    (tmp_path / "runs" / "latest").symlink_to("20260102-000000-b")
+    assert completed(line) == offered

@@ -1,16 +1,118 @@
-"""``noack doctor`` on the machine of the tests: that it measures, not the values."""
+"""From measured values to findings, independent of the machine."""
 
 import json
+import re
 import socket
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from cosim.doctor.machine_measures import requirements_of
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
+from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
+from cosim.doctor.machine_measures import (
+    Buffer,
+    Disk,
+    Lateness,
+    MachineFacts,
+    RoundTrips,
+    RunRequirements,
+    lateness,
+)
+
+WANTED = RunRequirements(
+    name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,
+    fifo_priority=50, spin_us=0.0, ports={"plant": 47001, "netem": 47005},
+)  # fmt: skip
+PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
+ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")
+IDEAL = MachineFacts(
+    cores=4, cores_online=4, load=0.1, governor="performance",
+    granted=dict.fromkeys(ALL, "applied"),
+    timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
+    round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
+    ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
+    display=True, viewer="0.41.0", extras={"fmi": True, "vehicle": True},
+    versions={"python": "3.12.1", "noack": "0.1.0"},
+)  # fmt: skip
+
+
+def about(what: str, wanted: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
+    """The first finding of a kind that is not good, or the first one if all are good."""
+    found = [one for one in judge(replace(IDEAL, **changed), wanted) if one.what.startswith(what)]
+    return next((one for one in found if one.verdict is not FindingStatus.GOOD), found[0])
+
+
+def test_a_machine_without_limits_is_good() -> None:
+    findings = judge(IDEAL, WANTED)
+    assert worst(findings) is FindingStatus.GOOD
+    assert not [one for one in findings if one.remedy]
+
+
+@pytest.mark.parametrize(("what", "changed", "verdict"), [
+    ("cores", {"cores": 1}, FindingStatus.LIMITED),
+    ("cores", {"load": 7.0}, FindingStatus.LIMITED),
+    ("cores", {"governor": "powersave"}, FindingStatus.LIMITED),
+    ("cores", {"load": None, "governor": None}, FindingStatus.GOOD),
+    ("real-time", {"granted": {"sched_fifo": "not permitted: no"}}, FindingStatus.LIMITED),
+    ("timers", {"timer_resolution_ns": 4_000_000}, FindingStatus.LIMITED),
+    ("wake-ups with the", {"realtime": "it timed out"}, FindingStatus.LIMITED),
+    ("UDP", {"round_trips": "datagrams on the loopback are lost"}, FindingStatus.BAD),
+    ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, FindingStatus.LIMITED),
+    ("receive buffer", {"buffer": Buffer(256, 212_992, 212_992)}, FindingStatus.LIMITED),
+    ("receive buffer", {"buffer": "nothing"}, FindingStatus.BAD),
+    ("ports", {"ports_taken": ["plant: UDP port 47001 is taken"]}, FindingStatus.BAD),
+    ("control plane", {"control": "no answer within 2 s"}, FindingStatus.BAD),
+    ("disk", {"disk": "runs: cannot be written: no space left"}, FindingStatus.BAD),
+    ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, FindingStatus.BAD),
+    ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, FindingStatus.LIMITED),
+    ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, FindingStatus.LIMITED),
+    ("viewer", {"display": False}, FindingStatus.LIMITED),
+    ("viewer", {"viewer": None}, FindingStatus.BAD),
+    ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),
+    ("versions", {"versions": {"python": "3.12.1", "noack": None}}, FindingStatus.LIMITED),
+])  # fmt: skip
+def test_each_finding_has_a_verdict_and_a_remedy(
+    what: str, changed: dict[str, Any], verdict: FindingStatus
+) -> None:
+    found = about(what, **changed)
+    assert found.verdict is verdict
+    if verdict is not FindingStatus.GOOD:
+        assert found.means
+        assert found.remedy or isinstance(next(iter(changed.values())), str)
+        assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
+
+
+def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
+    late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
+    found = about("wake-ups with the real-time settings applied", realtime=late)
+    assert found.verdict is FindingStatus.LIMITED
+    without = replace(WANTED, realtime=False)  # what is not used does not matter
+    assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
+    assert about("wake-ups", without, plain=late).verdict is FindingStatus.LIMITED
+    refused = {"sched_fifo": "not permitted: Operation not permitted"}
+    assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
+    # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
+    assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in found.means
+    assert "one every 0.5 s of a run of 20 s" in found.means
+    assert "certificate.late_periods" in found.remedy
+
+
+def test_every_finding_is_documented() -> None:
+    text = (Path(__file__).parents[3] / "docs/command-line.md").read_text()
+    rows = re.findall(r"^\| `([^`]+)` \|", text.partition("| finding |")[2], re.MULTILINE)
+    named = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
+    found = {one.what for one in judge(IDEAL, WANTED)}
+    assert all(any(what.startswith(name) for name in named) for what in found)
+    assert all(any(what.startswith(name) for what in found) for name in named)
+
+
+def test_lateness_statistics_are_those_of_the_sample() -> None:
+    found = lateness(range(0, 101_000, 1000), 98_500)  # 0 to 100 µs
+    assert found == Lateness(101, 50.0, 99.0, 100.0, 2)
+    assert isinstance(lateness([], 1), str)
 
 
 def doctor(*arguments: str) -> Result:
@@ -42,13 +144,6 @@ def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(
     assert set(measured["granted"]) >= {"sched_fifo", "memory_lock"}
     assert {one["verdict"] for one in document["findings"]} <= {"good", "limited", "bad"}
     assert not list(tmp_path.iterdir())
-
-
-def test_the_requirements_of_a_scenario_are_in_wall_time() -> None:
-    wanted = requirements_of(resolve(load(Path("scenarios/lane_following.toml"), ["speed=4"])))
-    assert (wanted.duration_s, wanted.period_ns, wanted.allowance_ns) == (5.0, 500_000, 1_000_000)
-    assert wanted.rate_hz == 2000
-    assert set(wanted.ports) == {"plant", "sensor", "netem", "controller"}
 
 
 @pytest.mark.parametrize("arguments", [("--seconds", "0"), ("no_such_scenario",)])

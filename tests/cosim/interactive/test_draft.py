@@ -1,17 +1,27 @@
 """The edited scenario: comments are kept, mistakes have their key, the address repeats it."""
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.interactive.controls import chosen, controls_of, dragged
+from cosim.interactive.controls import (
+    Field,
+    by_field,
+    chosen,
+    controls_of,
+    dragged,
+    filled,
+    form_of,
+)
 from cosim.interactive.draft import (
     Draft,
     DraftError,
-    Mistake,
     draft_of_query,
     known_scenarios,
     open_draft,
@@ -24,36 +34,12 @@ from noack.scenario.scenario_file import put
 LANE = {"lane_following": "lane_following"}
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("network.loss.probability", 0.95),
-        ("network.mansd", 9),
-        ("trigger.beta", 0.125),
-        ("trigger.floor", 0.01),
-        ("horizon_s", 33.0),
-        ("mode", "zoh"),
-        ("seeds.loss", 12),
-        ("network.loss", {"model": "gilbert_elliott", "mean_loss": 0.5, "mean_burst": 3.0}),
-        ("trigger", {"policy": "periodic", "period_s": 1.0}),
-        ("plant.uncertainty_A", [[0.5] * 4] * 4),
-        ("plant.uncertainty_B", [[0.5, 0.0]] * 4),
-    ],
-)
-def test_a_changed_value_keeps_the_comments(key: str, value: object) -> None:
-    before = open_draft("lane_following")
-    after = before.with_value(key, value)
-    assert after.value(key) == value
-    assert "# M - 1: at most four consecutive losses" in after.text
-    assert toml_file.parsed(after.text, "") == after.content
-    assert after.scenario != before.scenario
-
-
 def test_the_model_error_multiplies_both_boxes() -> None:
     draft = open_draft("lane_following")
     (slider,) = [one for one in controls_of(draft).sliders if one.scaled]
     assert slider.value == 1.0
     wide = dragged(dragged(draft, slider, 3.0), slider, 12.0)
+    assert "# M - 1: at most four consecutive losses" in wide.text
     assert wide.value("plant.uncertainty_A")[0] == [1.2, 1.2, 0.0, 0.0]
     assert wide.value("plant.uncertainty_B")[1] == [0.0, 0.6]
     assert [one.value for one in controls_of(wide).sliders if one.scaled] == [12.0]
@@ -85,7 +71,6 @@ def test_mistakes_are_shown_at_their_keys() -> None:
         _ = draft.with_text("name = ").scenario
     assert error.value.mistakes[0].key == ""
     assert "not valid TOML" in error.value.mistakes[0].text
-    assert Mistake("", "x").text == "x"
 
 
 @pytest.mark.parametrize("name", shipped_names("scenarios"))
@@ -103,31 +88,97 @@ def test_every_scenario_has_controls_and_an_address(name: str) -> None:
             assert again.scenario == moved.scenario  # it is valid
 
 
+def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:
+    code = quote('{ kind = "python", file = "evil.py", name = "Evil" }')
+    for query, why in (
+        (f"plant.system={code}", "files to execute"),
+        ("scenario=/etc/passwd", "opens shipped scenarios"),
+        ("a=" + "1" * 20_000, "too long"),
+        ("a.b=[", "TOML"),
+    ):
+        with pytest.raises(CallerError, match=why):
+            draft_of_query(query, "lane_following", LANE)
+    assert draft_of_query("", "lane_following", LANE).base == "lane_following"
+
+
+SCHEMA = json.loads(
+    (Path(__file__).parents[3] / "docs/scenario.schema.json").read_text(encoding="utf-8")
+)
+
+
+def field(key: str, scenario: str = "lane_following") -> Field:
+    (found,) = [one for one in form_of(open_draft(scenario)).all_fields() if one.key == key]
+    return found
+
+
+def leaves(content: Any, key: str = "") -> Iterator[str]:
+    if isinstance(content, dict) and content:
+        for name, inner in content.items():
+            yield from leaves(inner, f"{key}.{name}".removeprefix("."))
+    else:
+        yield key
+
+
+def test_every_key_of_the_schema_has_a_field() -> None:
+    keys = {one.key for one in form_of(open_draft("lane_following")).all_fields()}
+    top = {key.partition(".")[0] for key in keys}
+    assert top == set(SCHEMA["properties"])
+    for section in ("NetworkSection", "PlantSection", "ModelSection", "DecayingSettings",
+                    "BernoulliLoss", "SeedsSection", "RealtimeSection"):  # fmt: skip
+        for name in SCHEMA["$defs"][section]["properties"]:
+            assert any(f".{name}" in key for key in keys), name
+
+
+@pytest.mark.parametrize("name", shipped_names("scenarios"))
+def test_every_value_of_a_shipped_scenario_is_in_its_form(name: str) -> None:
+    draft = open_draft(name)
+    form = form_of(draft)
+    shown = {one.key: one for one in form.all_fields()}
+    for key in leaves(draft.content):
+        parts = key.split(".")
+        known = [".".join(parts[:i]) for i in range(1, len(parts) + 1)]
+        assert set(known) & shown.keys(), key
+    for one in shown.values():
+        if text := one.text(draft):
+            assert one.value(text) == draft.value(one.key)
+            assert not one.options or text in one.options, one.key
+
+
+def test_a_wrong_text_stays_as_it_is_typed_and_is_named_at_its_field() -> None:
+    draft = filled(open_draft("lane_following"), field("trigger.beta"), "about 1: or 2")
+    assert field("trigger.beta").text(draft) == "about 1: or 2"
+    draft = filled(draft, field("plant.initial_state"), '[1.0, "a", 0, 0]')
+    draft = filled(draft, field("network.mansd"), "-3")
+    with pytest.raises(DraftError) as caught:
+        _ = draft.scenario
+    assert by_field(form_of(draft), caught.value.mistakes) == {
+        "trigger.beta": "should be a valid number",
+        "plant.initial_state": "should be a valid number",
+        "network.mansd": "should be greater than or equal to 0",
+    }
+
+
 def test_every_choice_gives_a_valid_scenario() -> None:
     draft = open_draft("lane_following")
     for choice in controls_of(draft).choices:
         for value in choice.options:
             other = chosen(draft, choice.key, value)
             assert {one.key: one.value for one in controls_of(other).choices}[choice.key] == value
-            again = draft_of_query(other.query(), "lane_following", LANE)
-            assert again.scenario == other.scenario
+            assert draft_of_query(other.query(), "lane_following", LANE).scenario == other.scenario
             for slider in controls_of(other).sliders:
                 for place in slider.ends:
                     if slider.key != "network.loss.mean_loss":  # limited by the mean burst
                         assert dragged(other, slider, slider.value_at(place)).scenario
 
 
-def test_an_address_cannot_name_code_or_foreign_files(tmp_path: Path) -> None:
-    code = quote('{ kind = "python", file = "evil.py", name = "Evil" }')
-    with pytest.raises(CallerError, match="files to execute"):
-        draft_of_query(f"plant.system={code}", "lane_following", LANE)
-    with pytest.raises(CallerError, match="opens shipped scenarios"):
-        draft_of_query("scenario=/etc/passwd", "lane_following", LANE)
-    with pytest.raises(CallerError, match="too long"):
-        draft_of_query("a=" + "1" * 20_000, "lane_following", LANE)
-    with pytest.raises(CallerError):
-        draft_of_query("a.b=[", "lane_following", LANE)
-    assert draft_of_query("", "lane_following", LANE).base == "lane_following"
+def test_another_kind_keeps_what_both_kinds_have() -> None:
+    draft, choice = open_draft("lane_following"), field("controller.kind")
+    python = filled(draft, choice, "python")
+    assert python.value("controller") == {"rate_hz": 500.0, "kind": "python"}
+    with pytest.raises(DraftError) as caught:
+        _ = python.scenario
+    assert by_field(form_of(python), caught.value.mistakes)["controller.name"]
+    assert filled(python, choice, "").value("controller") is None
 
 
 def test_the_scenarios_of_a_folder_are_offered(tmp_path: Path) -> None:

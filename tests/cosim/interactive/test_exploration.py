@@ -8,9 +8,8 @@ import pytest
 import noack
 from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
-from cosim.interactive.exploration_figure import BAND, Shown, exploration_figure
+from cosim.interactive.exploration_figure import Shown, exploration_figure
 from cosim.lab.chart import data_options
-from cosim.output.figure_description import Line
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.core.errors import CallerError
@@ -31,54 +30,26 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
         assert found.e_s_norm[first] == pytest.approx(np.linalg.norm(before.e_s))
         assert found.e_c_norm[first + 1] == pytest.approx(np.linalg.norm(after.e_c))
         assert found.e_s_norm[first + 1] == 0.0
+    known = noack.load("lane_following", {"network.initial_sync": "known_state"})
+    shown = Shown(exploration.explore(known), 0)._replace(guarantee=guarantee.certify(known))
+    figure = exploration_figure(shown)
+    errors = figure.rows[1].panels[0].legend or ()
+    assert "certified bound" in errors
+    assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
 
 
-def test_the_controllers_curves_begin_with_its_first_update() -> None:
-    found = exploration.explore(noack.load("lane_following"))
-    assert found.e_c_norm[0] == pytest.approx(found.x_norm[0])  # it knows no state
-    x, x_c, e_c = (curve(found, label) for label in ("plant x", "controller x_c", "‖e_c‖"))
-    for values in (x_c, e_c):
-        assert np.flatnonzero(np.isnan(values)).tolist() == [0]
-    assert x_c[1] == x[1]
-    known = exploration.explore(
-        noack.load("lane_following", {"network.initial_sync": "known_state"})
-    )
-    assert np.isfinite(curve(known, "‖e_c‖")).all()
-
-
-def curve(run: exploration.Exploration, label: str) -> np.ndarray:
-    rows = exploration_figure(Shown(run, 0)).rows
-    items = [item for row in rows for item in row.panels[0].items if isinstance(item, Line)]
-    return next(item.y for item in items if item.label == label)
-
-
-def test_a_legend_names_what_is_drawn() -> None:
-    scenario = noack.load("lane_following")
-    run = exploration.explore(scenario)
-    alone = Shown(run, 0)
-    certified = alone._replace(guarantee=guarantee.certify(scenario))
-    void = alone._replace(guarantee=guarantee.certify(noack.load("unstable_pendulum", {
-        "mode": "zoh", "network.mansd": 10, "trigger": {"policy": "periodic", "period_s": 0.1},
-    })))  # fmt: skip
-    assert void.guarantee is not None
-    assert void.guarantee.verdict != guarantee.CERTIFIED
-    for shown, expected in ((alone, False), (certified, True), (void, False)):
-        figure = exploration_figure(shown)
-        state, errors, *_ = (row.panels[0].legend or () for row in figure.rows)
-        assert ("certified bound" in errors) is expected
-        assert BAND not in state
-        assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
-
-
-def test_a_run_that_diverges_is_drawn_up_to_that_time() -> None:
+def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> None:
     scenario = noack.load("lane_following", {
         "mode": "zoh", "network.mansd": 20, "network.loss": {"model": "worst_case"},
-        "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 2000.0,
+        "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 3000.0,
     })  # fmt: skip
     found = exploration.explore(scenario)
     assert found.diverged_at_s is not None
-    assert found.t_s[-1] <= 2000.0
+    assert found.t_s[-1] <= 3000.0
     assert found.numbers[0][1].startswith("diverged at")
+    draws = ensemble.explore_ensemble(scenario, draws=8)
+    assert draws.diverged == 8
+    assert not math.isfinite(draws.x_norm.high[-1])
 
 
 def test_a_run_with_very_many_events_is_drawn_until_there() -> None:
@@ -116,16 +87,6 @@ def test_trajectories_of_an_ensemble_are_those_of_the_exact_simulator(name: str)
         np.testing.assert_allclose(states[draw], wanted, rtol=1e-6, atol=1e-8)
 
 
-def test_draws_that_diverge_are_counted_and_widen_the_band() -> None:
-    scenario = noack.load("lane_following", {
-        "mode": "zoh", "network.mansd": 20, "network.loss": {"model": "worst_case"},
-        "trigger": {"policy": "periodic", "period_s": 1.0}, "horizon_s": 3000.0,
-    })  # fmt: skip
-    found = ensemble.explore_ensemble(scenario, draws=8)
-    assert found.diverged == 8
-    assert not math.isfinite(found.x_norm.high[-1])
-
-
 def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     certified = guarantee.certify(noack.load("lane_weighted"))
     assert certified.verdict == guarantee.CERTIFIED
@@ -134,6 +95,7 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     run = exploration.explore(noack.load("lane_weighted"))
     bound = np.interp(run.t_s, certified.t_s, certified.e_c)
     assert (run.e_c_norm <= bound * 1.01).all()
+    assert "loop gain" in guarantee.certify(noack.load("reactor_petc")).reason
     missing = guarantee.certify(noack.load("lane_vehicle"))
     assert missing.verdict == guarantee.NOT_COVERED
     assert "not linear" in missing.reason

@@ -1,15 +1,162 @@
-"""The page, served for all tests of a file, and a headless browser for all of them."""
+"""The page for the tests: its server, and a tab of a headless browser that shows it."""
 
+import json
 import os
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Self
 
 import pytest
 
-from tests.cosim.lab.lab_browser import Served
+from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
+
+SLIDERS = "document.querySelectorAll('.q-slider').length"
+_TWO_FRAMES = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+TEXT = "document.body.innerText"
+
+
+class Served:
+    """A server of the page, whose errors are in a file; a context that ends it by Ctrl-C."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.errors = folder / "errors.txt"
+        command = live.noack_command(
+            "lab", "--no-browser", "--json", "--set", "horizon_s=4", *arguments
+        )
+        with self.errors.open("w") as errors:
+            self._process = subprocess.Popen(
+                command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True
+            )
+        assert self._process.stdout is not None
+        text = "".join(iter(self._process.stdout.readline, "}\n")) + "}"
+        self.address: str = json.loads(text)["address"]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        try:
+            assert self._process.wait(timeout=live.PATIENCE_S) == 0
+        finally:
+            self._process.kill()
+            assert self._process.stdout is not None
+            self._process.stdout.close()
+        errors = self.errors.read_text()
+        assert not errors, errors
+
+
+class Page:
+    """A tab of the browser."""
+
+    def __init__(
+        self,
+        browser: Browser,
+        address: str,
+        *,
+        size: tuple[int, int] = (1280, 900),
+        scheme: str = "light",
+    ) -> None:
+        self.browser = browser
+        browser.open("about:blank", *size)
+        preferred = [{"name": "prefers-color-scheme", "value": scheme}]
+        browser.call("Emulation.setEmulatedMedia", features=preferred)
+        browser.call("Emulation.setFocusEmulationEnabled", enabled=True)
+        self._session = browser.session
+        self.go(address)
+
+    def go(self, address: str) -> None:
+        """Open an address and wait until the page can be used."""
+        self.call("Page.navigate", url=address)
+        self.wait(f"{SLIDERS} > 5 && {TEXT}.includes('transmissions')")  # it is connected
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command to this tab."""
+        self.browser.session = self._session
+        return self.browser.call(method, **parameters)
+
+    def press(self, key: str, code: int) -> None:
+        """Press a key, given by its name and its Windows code."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
+            )
+
+    def js(self, expression: str) -> Any:
+        found = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
+        return found["result"].get("value")
+
+    def wait(self, condition: str) -> None:
+        deadline_s = time.monotonic() + live.PATIENCE_S
+        while not self.js(condition):
+            assert time.monotonic() < deadline_s, (condition, self.js(TEXT))
+            time.sleep(0.05)
+
+    def click(self, text: str, kind: str) -> None:
+        found = (
+            f"[...document.querySelectorAll('{kind}')].filter(e => "
+            f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
+        )
+        self.wait(f"{found}.length > 0")
+        self.js(f"{found}.at(-1).click()")
+
+    def press_button(self, text: str) -> None:
+        """Click on a button with the mouse, once it can be clicked."""
+        found = (
+            f"[...document.querySelectorAll('button')].find(e => !e.disabled && "
+            f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
+        )
+        self.wait(f"!!{found}")
+        self.js(f"{found}.scrollIntoView({{ block: 'center' }})")
+        x, y = self.js(
+            f"(r => [r.x + r.width / 2, r.y + r.height / 2])({found}.getBoundingClientRect())"
+        )
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                clickCount=1,
+            )  # fmt: skip
+
+    def unfold(self, title: str) -> None:
+        """Open a part of the settings."""
+        found = (
+            "[...document.querySelectorAll('.q-expansion-item .q-item')].filter(e => "
+            f"e.innerText.replace('keyboard_arrow_down', '').trim() === {json.dumps(title)})"
+        )
+        self.wait(f"{found}.length > 0")
+        self.js(f"{found}[0].click()")
+
+    def fill(self, label: str, text: str) -> None:
+        """Type a text into a field of the form."""
+        found = f"document.querySelector('input[aria-label={json.dumps(label)}]')"
+        self.wait(f"!!{found}")
+        self.js(f"{found}.focus(), {found}.select()")
+        self.call("Input.insertText", text=text)
+
+    def drag(self, label: str, to: float) -> None:
+        """Drag the slider with a label to a share of its length."""
+        place = (
+            f"(() => {{ const s = [...document.querySelectorAll('.q-slider')].find(e => "
+            f"e.previousElementSibling.innerText.startsWith({json.dumps(label)})); "
+            "s.scrollIntoView({ block: 'center' }); const r = s.getBoundingClientRect(); "
+            "return [r.x, r.y + r.height / 2, r.width]; })()"
+        )
+        x, y, width = self.js(place)
+        for kind, share in (("mousePressed", 0.4), ("mouseMoved", 0.45), ("mouseMoved", to),
+                            ("mouseReleased", to)):  # fmt: skip
+            self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x + share * width, y=y, button="left",
+                buttons=1, clickCount=1,
+            )  # fmt: skip
+            self.js(_TWO_FRAMES)  # the browser joins moves within a frame
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,36 @@
-"""Fits of loss models, against brute force, closed forms and simulated networks."""
+"""Bursts, outages and fits of loss models: against definitions, closed forms and simulation."""
 
 import math
+from itertools import combinations, groupby
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.measurement.chain_fits import ChainFits, ChainRates, LossLikelihood
+from cosim.measurement import chain_fits as rule
+from cosim.measurement.chain_fits import (
+    ChainFits,
+    ChainRates,
+    LossLikelihood,
+    find_outages,
+    fit_outages,
+)
 from cosim.measurement.loss_bursts import (
     binomial_estimate,
     exponential_estimate,
+    histogram,
     loss_bursts,
+    most_losses,
+    outcomes,
     poisson_estimate,
+    quantile_m,
 )
+from cosim.measurement.network_measurement import Measurement, MeasurementOptions
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.traces.packet_trace import packet_trace
+from noack.traces.trace_formats import read_trace
 from tests.cosim.measurement.chains import chain_losses
 
 GILBERT = ChainRates(0.02, 0.2, 0.0, 1.0)
@@ -56,16 +72,6 @@ def test_the_chain_is_the_emulators() -> None:
     np.testing.assert_allclose(loses, chain.moves * chain.acts)
 
 
-def test_lengths_follow_the_survival_function() -> None:
-    lost = chain_losses(100_000, ELLIOTT, seed=1)
-    bursts = loss_bursts(~lost)
-    for observed, which in ((bursts.length, True), (bursts.deliveries()[1:-1], False)):
-        at = np.array([1, 2, 4, 8, 16])
-        expected = ELLIOTT.survival(lost=which)(at.astype(float))
-        found = (observed[:, None] >= at).mean(axis=0)
-        np.testing.assert_allclose(found, expected, atol=4 * 0.5 / math.sqrt(len(observed)))
-
-
 def test_gilberts_chain_in_closed_form() -> None:
     lost = np.array([0, 0, 1, 1, 0, 1, 0, 0, 0, 1], bool)  # by hand: 6 from good, 3 of them to bad
     fit = ChainFits(loss_bursts(~lost)).gilbert.estimates
@@ -96,18 +102,6 @@ def test_intervals_of_the_hidden_chain_cover_its_parameters() -> None:
         biases.append(np.log(np.array(fit.rates) / np.array(ELLIOTT)))
     assert covered >= 13
     assert (abs(np.mean(biases, axis=0)) < 0.2).all()
-
-
-@pytest.mark.parametrize("seed", [105, 112, 119])
-def test_profiles_with_several_valleys_have_ends(seed: int) -> None:
-    """Of 200 random chains, those with which the likelihood's valleys were taken for each other."""
-    rng = np.random.default_rng(seed)
-    p, r = 10 ** rng.uniform(-2.5, -0.3), 10 ** rng.uniform(-1.5, 0)
-    one = ChainRates(p, r, rng.choice([0, rng.uniform(0, 0.2)]), rng.uniform(0.2, 1))
-    fits = ChainFits(loss_bursts(~chain_losses(int(rng.choice([300, 700, 1500])), one, seed)))
-    for estimate in fits.gilbert_elliott.estimates.values():
-        assert estimate is not None
-        assert 0 <= estimate.low <= estimate.value <= estimate.high <= 1
 
 
 def test_the_preferred_model_is_the_true_one() -> None:
@@ -157,3 +151,171 @@ def test_binomial_and_exponential_intervals_at_their_edges() -> None:
         one = exponential_estimate(4, rng.exponential(2.0, 4).sum())
         inside.append(one is not None and one.low <= 2.0 <= one.high)
     assert abs(np.mean(inside) - 0.95) < 0.03
+
+
+TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
+
+
+def test_the_rural_run_has_one_outage_of_ten_seconds_and_an_m_without_it() -> None:
+    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
+    found = Measurement(trace, MeasurementOptions(deadline_s=0.1))
+    (outage,) = found.to_json()["outages"]
+    assert outage["losses"] == 175
+    assert 10 < outage["duration_s"] < 11.5
+    assert found.longest_loss_burst + 1 == found.quantiles[-1].bursts == 49
+    by_hand = Measurement(trace, MeasurementOptions(deadline_s=0.1, outage_s=2.0))
+    durations_s = by_hand.bursts.times_s(trace)[1]
+    assert by_hand.is_outage.tolist() == (durations_s >= 2.0).tolist()
+    assert by_hand.is_outage.sum() == 2
+
+
+@pytest.mark.parametrize(
+    "truth", [ChainRates(0.03, 0.25, 0.0, 1.0), ChainRates(0.01, 0.05, 0.02, 0.7)]
+)
+def test_networks_without_outages_have_none_and_added_ones_are_found(truth: ChainRates) -> None:
+    rng = np.random.default_rng(1)
+    for seed in range(40):
+        lost = chain_losses(3000, truth, seed)
+        assert not find_outages(loss_bursts(~lost)).flags.any()
+    for outages in (1, 2, 4):
+        lost = chain_losses(5000, truth, seed=outages)
+        starts = np.sort(rng.choice(np.arange(2, 48), outages, replace=False)) * 100
+        for start in starts[::-1]:
+            lost = np.insert(lost, start, np.ones(rng.integers(220, 260), bool))
+        bursts = loss_bursts(~lost)
+        found = find_outages(bursts).flags
+        assert found.sum() == outages
+        assert bursts.length[found].min() >= 220
+
+
+def test_the_bound_for_geometric_bursts_counts_the_ways_to_divide_the_losses() -> None:
+    lengths = np.array([7, 2, 1, 1])
+    total, parts = lengths.sum(), len(lengths)
+    divisions = [np.diff([0, *cuts, total]) for cuts in combinations(range(1, total), parts - 1)]
+    exact = np.mean([np.max(one) >= lengths[0] for one in divisions])
+    bound = rule._geometric(lengths)[0]
+    assert exact == pytest.approx(bound)  # two parts of 7 or more do not fit into 11
+
+
+def test_the_outage_fit_covers_rate_and_duration() -> None:
+    rng, covered = np.random.default_rng(4), np.zeros(2)
+    for _ in range(200):
+        starts = np.cumsum(rng.exponential(20.0, 100))
+        count = int((starts < 100).sum())
+        durations_s = rng.exponential(3.0, count)
+        every = np.ones(count, bool)
+        fit = fit_outages(durations_s, every, 100 + durations_s.sum())
+        for place, (one, truth) in enumerate(((fit.rate_per_s, 1 / 20), (fit.duration_s, 3.0))):
+            covered[place] += one is not None and one.low <= truth <= one.high
+    assert (covered / 200 > 0.92).all()  # exact intervals cover at least 95 %
+    many = np.full(40, 2.0) + 0.01 * np.arange(40)
+    assert "rejected" in fit_outages(many, np.ones(40, bool), 500.0).text
+    assert "not rejected" in fit_outages(rng.exponential(2.0, 40), np.ones(40, bool), 500.0).text
+    none = fit_outages(np.zeros(0), np.zeros(0, bool), 100.0)
+    assert none.rate_per_s is not None
+    assert none.duration_s is None
+    assert none.rate_per_s.high == pytest.approx(0.0369, rel=1e-3)
+
+
+flags = st.lists(st.booleans(), min_size=1, max_size=60)
+
+
+@given(
+    st.lists(st.one_of(st.none(), st.integers(0, 9)), min_size=1, max_size=12), st.integers(0, 9)
+)
+def test_a_packet_is_effective_if_it_arrives_in_time_before_every_later_one(
+    delays: list[int | None], deadline: int
+) -> None:
+    """The definition of docs/mansd.md, by a receiver that keeps only what is newer."""
+    sent = 2 * np.arange(len(delays))
+    arrivals = [(2 * k + d, k) for k, d in enumerate(delays) if d is not None]
+    kept, newest = set(), -1
+    for at, k in sorted(arrivals):
+        if at - 2 * k <= deadline and k > newest:
+            kept.add(k)
+            newest = k
+    lost = np.array([d is None for d in delays])
+    received = sent + np.array([d or 0 for d in delays])
+    found = outcomes(packet_trace(sent, received, lost), deadline)
+    assert set(np.flatnonzero(found.effective).tolist()) == kept
+    groups = np.array([found.lost, found.out_of_order, found.late, found.effective])
+    assert (groups.sum(axis=0) == 1).all()
+
+
+@given(flags)
+def test_bursts_are_the_groups_of_consecutive_losses(effective: list[bool]) -> None:
+    bursts = loss_bursts(np.array(effective))
+    lengths = [len(list(group)) for ok, group in groupby(effective) if not ok]
+    assert bursts.length.tolist() == lengths
+    assert histogram(bursts) == {n: lengths.count(n) for n in sorted(set(lengths))}
+    assert bursts.deliveries().sum() == sum(effective)
+    assert bursts.complete.tolist() == [
+        first > 0 and end < len(effective)
+        for first, end in zip(bursts.first, bursts.end, strict=True)
+    ]
+
+
+@given(flags, st.sampled_from([0.1, 0.5, 0.75, 0.9, 1.0]))
+def test_m_of_a_share_is_the_smallest_that_covers_it(effective: list[bool], share: float) -> None:
+    bursts = loss_bursts(np.array(effective))
+    counts, count = [], 0
+    for ok in effective:
+        count = 0 if ok else count + 1
+        counts.append(count)
+    found = quantile_m(bursts, share)
+    of = {found.packets: counts, found.bursts: bursts.length.tolist()}
+    for m, values in of.items():
+        for smaller, covered in ((m, True), (m - 1, False)):
+            within = sum(value <= smaller - 1 for value in values)
+            assert (smaller < 1) or (within >= share * len(values) - 1e-9) is (
+                covered or not values
+            )
+
+
+@given(flags, st.data())
+def test_most_losses_are_those_of_the_worst_window(
+    effective: list[bool], data: st.DataObject
+) -> None:
+    bursts = loss_bursts(np.array(effective))
+    chosen = data.draw(
+        st.lists(st.booleans(), min_size=len(bursts.length), max_size=len(bursts.length))
+    )
+    left_out = np.array(chosen, bool)
+    skipped = np.zeros(len(effective), bool)
+    for first, end in zip(bursts.first[left_out], bursts.end[left_out], strict=True):
+        skipped[first:end] = True
+    windows = range(1, len(effective) + 3)
+    expected = {}
+    for window in windows:
+        starts = range(len(effective) - window + 1)
+        worst = [
+            window - sum(effective[i : i + window])
+            for i in starts
+            if not skipped[i : i + window].any()
+        ]
+        if worst:
+            expected[window] = max(worst)
+    assert most_losses(bursts, windows, left_out) == expected
+
+
+@pytest.mark.parametrize(("share", "fewest"), [(0.9, 29), (0.99, 299)])
+def test_confidence_needs_as_many_bursts_as_wilks_says(share: float, fewest: int) -> None:
+    """ln 0.05 / ln share, rounded up: then the longest burst is the limit."""
+    assert fewest == math.ceil(math.log(0.05) / math.log(share))
+    for count in (fewest - 1, fewest):
+        effective = np.tile([True, False], count)
+        found = quantile_m(loss_bursts(effective), share).bursts_confident
+        assert (found is None) == (count < fewest)
+    rng = np.random.default_rng(1)
+    covered = [
+        quantile_m(loss_bursts(_bursts(rng.geometric(0.3, 400))), share).bursts_confident
+        for _ in range(400)
+    ]
+    truth = 1 + math.ceil(math.log(1 - share) / math.log(0.7))
+    assert np.mean([m is not None and m >= truth for m in covered]) >= 0.93
+
+
+def _bursts(lengths: np.ndarray) -> np.ndarray:
+    steps = np.zeros(int(lengths.sum()) + len(lengths), bool)
+    steps[np.cumsum(lengths + 1) - 1] = True
+    return steps

@@ -1,9 +1,12 @@
-"""``noack measure``: tables, JSON, page, ``[network]`` section, mistakes."""
+"""``noack measure``: sources, tables, page, written networks, the time without a certificate."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +14,9 @@ from typer.testing import CliRunner, Result
 
 import noack
 from cosim.cli import app
+from cosim.measurement.certificate_time import DELAY, certificate_time
 from cosim.measurement.chain_fits import ChainRates
+from cosim.measurement.loss_bursts import histogram
 from cosim.measurement.measurement_outputs import measurement_figures, measurement_tables, trace_csv
 from cosim.measurement.network_measurement import (
     Measurement,
@@ -19,10 +24,22 @@ from cosim.measurement.network_measurement import (
     autocorrelation,
     normal_scores,
 )
+from cosim.measurement.trace_sources import SourceOptions, read_source, updates_trace
+from cosim.record.run_events import packet_outcomes
+from cosim.simulation.virtual_time import simulate
+from netem.fates import description
+from noack.core.errors import CallerError
+from noack.impairments.loss_prediction import read_files
 from noack.scenario import toml_file
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import validate
 from noack.scenario.sections import NetworkSection
-from noack.traces.packet_trace import packet_trace
-from tests.cosim.measurement.chains import chain_losses, trace_of
+from noack.traces.packet_trace import LOST_NS, PacketTrace, packet_trace
+from noack.traces.trace_formats import read_trace
+from tests.cosim.measurement.chains import PERIOD_NS, chain_losses, trace_of
+from tests.fuzz.parsers.fates import SPECS, TABLE
+from tests.oracles.link import Link
 
 RURAL = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g" / "rural_n8_10kmh.csv"
 
@@ -137,17 +154,16 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     [
         (["missing.csv"], "missing.csv: cannot be read: No such file or directory"),
         ([RURAL, "--deadline", "100"], "--deadline 100: expected a time in s, ms, us or ns"),
-        ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
         ([RURAL, "--outage", "-1s"], "--outage -1s: expected a time"),
-        ([RURAL, "--share", "99"], "--share 99: expected a share, e.g. 0.99 or 99%"),
         ([RURAL, "--share", "x%"], "--share x%: expected a share, e.g. 0.99 or 99%"),
         ([RURAL, "--flow", 2], "--flow: has no effect on a packet trace"),
         ([RURAL, "--rate", "20hz"], "--rate: has no effect on a packet trace"),
+        ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
+        ([":1", "--share", "99%"], "the sender of a one-way probe does not know what arrives"),
         ([RURAL, "--silence", "3s"], f"--silence: has no effect on {RURAL}"),
         (["--listen", ":1", "--for", "5s"], "--for: has no effect on a listener"),
         ([":1", "--silence", "5s"], "--silence: has no effect on a sender"),
         ([":1", "--out", "a.html"], "the sender of a one-way probe does not know what arrives"),
-        ([":1", "--share", "99%"], "the sender of a one-way probe does not know what arrives"),
         ([RURAL, "--as", "model"], "--as model: is the form of --write; give its FILE.toml"),
         ([RURAL, "--set", "trigger.beta=0.3"], "--set: replaces a value of the scenario of"),
         ([RURAL, "--out", "page.pdf"], "--out page.pdf: the file's name must end in .html"),
@@ -161,3 +177,199 @@ def test_mistakes_are_one_line(words: list[object], message: str) -> None:
     assert result.exit_code in (1, 2)
     (line,) = result.stderr.strip().splitlines()
     assert message in line
+
+
+def through(path: Path, sent_ns: np.ndarray) -> PacketTrace:
+    """Send packets at some times through a written network."""
+    section = toml_file.validated(NetworkSection, toml_file.read(path)["network"], str(path))
+    link = Link(read_files(section.link, path.parent), 1, "test")
+    releases = np.array([link.decide(0, 100, at_ns).release_ns for at_ns in sent_ns.tolist()])
+    return packet_trace(sent_ns, np.maximum(releases, sent_ns), releases < 0)
+
+
+def measured_again(source: Path | str, path: Path, form: str) -> tuple[noack.Measurement, ...]:
+    first = noack.measure(source)
+    first.write_network(path, form)  # type: ignore[arg-type]
+    sent_ns = first.trace.sent_ns
+    if form == "model":
+        sent_ns = PERIOD_NS * np.arange(40_000)
+    again = through(path, sent_ns)
+    csv = path.with_suffix(".again.csv")
+    csv.write_text(trace_csv(again))
+    return first, noack.measure(csv)
+
+
+@pytest.mark.parametrize("first_lost", [False, True])
+def test_a_written_trace_repeats_each_packet(tmp_path: Path, first_lost: bool) -> None:
+    rng = np.random.default_rng(1)
+    lost = chain_losses(800, ChainRates(0.1, 0.4, 0.02, 0.9), 3)
+    lost[0] = first_lost
+    trace = trace_of(lost)
+    late_ns = np.where(lost, 0, rng.integers(0, 3 * PERIOD_NS, len(lost)))  # overtakes
+    csv = tmp_path / "trace.csv"
+    csv.write_text(trace_csv(packet_trace(trace.sent_ns, trace.sent_ns + late_ns, lost)))
+    first, again = measured_again(csv, tmp_path / "network.toml", "trace")
+    assert (first.trace.received_ns == again.trace.received_ns).all()
+    assert histogram(first.bursts) == histogram(again.bursts)
+    assert bool(first.trace.received_ns[0] == LOST_NS) is first_lost
+
+
+def test_a_written_model_has_the_parameters_and_delays(tmp_path: Path) -> None:
+    """A Gilbert chain with correlated delays below the period, so that nothing is overtaken."""
+    rng, z = np.random.default_rng(2), np.zeros(6000)
+    for k in range(1, len(z)):
+        z[k] = 0.7 * z[k - 1] + np.sqrt(1 - 0.49) * rng.normal()
+    lost = chain_losses(len(z), ChainRates(0.05, 0.4, 0, 1), 3)
+    sent_ns = PERIOD_NS * np.arange(len(z))
+    delay_ns = (PERIOD_NS * (0.3 + 0.2 * np.tanh(z))).astype(np.int64)
+    csv = tmp_path / "trace.csv"
+    csv.write_text(trace_csv(packet_trace(sent_ns, sent_ns + delay_ns, lost)))
+    first, again = measured_again(csv, tmp_path / "network.toml", "model")
+    fits = [one.models["gilbert"].fit.rates for one in (first, again)]
+    assert fits[0] == pytest.approx(fits[1], rel=0.1)
+    for share, delay_s in first.delays.quantiles_s.items():
+        assert again.delays.quantiles_s[share] == pytest.approx(delay_s, abs=2e-4)
+    correlations = [one.delays.correlation[0] for one in (first, again)]
+    assert correlations[0] == pytest.approx(correlations[1], abs=0.03)
+
+
+def test_a_fate_file_gives_the_first_intact_delivery(tmp_path: Path) -> None:
+    path = tmp_path / "fates.parquet"
+    pq.write_table(TABLE.replace_schema_metadata(description(SPECS, 0)), path)
+    trace = read_source([path])
+    assert (
+        trace.notes[0]
+        == "flow 1: up forward, flow 0, 4 packets; --flow chooses another of the 3 flows"
+    )
+    assert trace.sent_ns.tolist() == [0, 10, 20, 30]
+    # Delivered; dropped; corrupted, but its copy is intact and arrives 9 ns later; forced.
+    assert trace.delay_ns.tolist() == [5, -1, 9, 5]
+    assert len(read_source([path], SourceOptions(flow=3))) == 1
+    with pytest.raises(CallerError, match="has no flow 4; its flows are 1 to 3"):
+        read_source([path], SourceOptions(flow=4))
+    incomplete = TABLE.replace_schema_metadata(description(SPECS, 7))
+    pq.write_table(incomplete, path)
+    with pytest.raises(CallerError, match="7 events are missing"):
+        read_source([path])
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(CallerError, match="not a fate trace"):
+        read_source([path])
+
+
+def test_a_run_gives_its_effective_losses(content: dict[str, Any]) -> None:
+    content |= {"horizon_s": 5.0, "trigger": {"policy": "periodic", "period_s": 0.05}}
+    loss = {"model": "bernoulli", "probability": 0.3}
+    delay = {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.1}
+    content["network"] = {"mansd": 4, "loss": loss, "impairments": [delay]}
+    record = simulate(resolve(validate(content, "test")))
+    outcomes = packet_outcomes(record)
+    trace = updates_trace(record)
+    newest = np.minimum.accumulate(np.where(trace.lost, 2**62, trace.received_ns)[::-1])[::-1]
+    effective = ~trace.lost & (trace.received_ns <= newest)
+    assert (~effective).tolist() == outcomes.lost[: len(trace)].tolist()
+    assert outcomes.lost.any()
+
+
+def test_opportunities_delay_a_probe_until_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "link.up"
+    times_ms = [0, 30, 31, 100, 200]
+    path.write_text("".join(f"{t}\n" for t in times_ms))
+    trace = read_source([path], SourceOptions(period_ns=20_000_000))
+    # An opportunity at the very time of an arrival is lost, as in mahimahi.
+    expected = [min(t for t in times_ms if t > at) - at for at in range(0, 200, 20)]
+    assert trace.delay_ns.tolist() == [one * 10**6 for one in expected]
+    assert (
+        "5 in 0.2 s, 0.3008 Mbit/s; longest time without one: 100 ms, before 0.2 s"
+        in trace.notes[0]
+    )
+
+
+def test_sources_that_are_none(tmp_path: Path) -> None:
+    csv = tmp_path / "a.csv"
+    csv.write_text("sent_ms,received_ms\n0,1\n")
+    for paths, options, message in (
+        ([tmp_path], SourceOptions(), str(tmp_path)),
+        ([tmp_path / "none"], SourceOptions(), "No such file"),
+        ([csv, csv], SourceOptions(), "expected one file, or two captures"),
+        ([csv], SourceOptions(sequence_at="0:4"), "--sequence-at: has no effect on a packet trace"),
+    ):
+        with pytest.raises(CallerError, match=message) as refused:
+            read_source(paths, options)
+        assert "\n" not in str(refused.value)
+
+
+MS = 1_000_000
+TRACES = Path(__file__).parents[3] / "noack/traces/shipped/cicv5g"
+
+
+def lane(**network: object) -> Scenario:
+    return noack.load("lane_following", {f"network.{key}": value for key, value in network.items()})
+
+
+LANE = lane(mansd=2)  # allows 4 ms in the network
+
+
+def share(found: object, cause: str) -> float:
+    return next((one.share for one in found.causes if one.cause == cause), 0.0)  # type: ignore[attr-defined]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.one_of(st.none(), st.integers(0, 40)), min_size=2, max_size=14))
+def test_shares_are_those_of_a_step_through_the_time(delays: list[int | None]) -> None:
+    """In every millisecond: are more than two packets missing, is one overdue?"""
+    sent = 10 * np.arange(len(delays))
+    received = [None if d is None else 10 * k + d for k, d in enumerate(delays)]
+    lost = np.array([d is None for d in delays])
+    trace = packet_trace(sent * MS, (sent + np.array([d or 0 for d in delays])) * MS, lost)
+    end = max(sent[-1], *(at for at in received if at is not None), 0)
+
+    def replaced(k: int) -> float:
+        return min((at for at in received[k + 1 :] if at is not None), default=np.inf)
+
+    stale = [at is not None and replaced(k) < at for k, at in enumerate(received)]
+    gone = [at is None or (stale[k] and replaced(k) - 10 * k > 4) for k, at in enumerate(received)]
+    late = void = 0
+    for ms in range(end):
+        overdue = any(
+            at is not None and not stale[k] and 10 * k + 4 <= ms < at
+            for k, at in enumerate(received)
+        )
+        missing = False
+        for k in range(2, len(delays)):
+            if all(gone[k - 2 : k + 1]) and 10 * k <= ms < replaced(k):
+                missing = True
+        late += overdue
+        void += overdue or missing
+    found = certificate_time(trace, LANE)
+    assert found.allowed_delay_s == 0.004
+    assert found.allowed_losses == 2
+    if end:
+        assert found.share == pytest.approx(void / end)
+        assert share(found, DELAY) == pytest.approx(late / end)
+
+
+def test_every_rule_of_the_guarantee_counts() -> None:
+    """Two losses in any five packets, at 10 ms a packet: one too many from 60 to 71 ms."""
+    scenario = lane(mansd=2, constraints=[{"kind": "at_most", "losses": 2, "window": 5}])
+    sent, lost = 10 * np.arange(15), np.zeros(15, bool)
+    lost[[2, 4, 6]] = True
+    found = certificate_time(packet_trace(sent * MS, (sent + 1) * MS, lost), scenario)
+    (one,) = found.causes
+    assert (one.cause, one.worst, one.first_s) == ("atmost 2 in 5", 3, pytest.approx(0.06))
+    assert found.kept["dropouts"] == "kept: 1 consecutive updates lost, 2 allowed"
+    assert one.share == pytest.approx(11 / 141)
+
+
+def test_the_certificates_of_the_scenario_are_named() -> None:
+    trace = read_trace(TRACES / "rural_n8_10kmh.csv")
+    found = certificate_time(trace, lane())
+    assert None in found.certificates.values()
+    assert [one.cause for one in found.causes] == [DELAY]
+    assert found.causes[0].worst == pytest.approx(9.744)
+    slow = lane(impairments=[{"kind": "delay", "delay_s": 9.8}])
+    kept = certificate_time(trace, slow)
+    assert kept.share == 0.0
+    assert kept.kept["dropouts"] == "kept"  # nothing was lost
+    assert kept.kept[DELAY].startswith("kept: an update was in the network for 9.744 s, 9.8")
+    acknowledged = certificate_time(trace, noack.load("lane_acknowledged"))
+    assert all(reason is not None for reason in acknowledged.certificates.values())

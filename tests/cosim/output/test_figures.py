@@ -1,5 +1,7 @@
+"""Figures: every curve is named, the same bytes each time, as wide as a paper wants."""
+
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,11 +10,12 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.legend import Legend
-from PIL import ImageColor
+from typer.testing import CliRunner
 
+import noack
 from cosim.analysis.value_reduction import QuantileSketch
+from cosim.cli import app
 from cosim.output import palette
 from cosim.output.figure_description import (
     Axis,
@@ -26,25 +29,22 @@ from cosim.output.figure_description import (
 )
 from cosim.output.figure_drawing import draw
 from cosim.output.figure_files import inline, save_figure
-from cosim.output.figure_layout import figure_width, rgb, settings
-from cosim.output.page_kit import PAGES
 from cosim.output.run_figures import (
     Trajectory,
     Transmissions,
     run_figures,
     states_figure,
 )
+from cosim.output.run_tables import key_numbers
 from cosim.output.timing_figures import later_than
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
-from tests.cosim.output.conftest import CASES, HOSTILE
-from tests.cosim.output.test_palette import BACKGROUNDS, luminance
+from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
+from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
+from tests.cosim.record.changed_records import changed
+from tests.cosim.summaries import summary_of
 
-CONTROLLER = rgb(palette.CONTROLLER)
-UNITS = re.compile(r"\[(s|wall µs)\]$")
-UNITLESS = re.compile(
-    r"x_\d|norm|input|count|share of steps at least as late|bursts|consecutive .*"
-)
-"""Dimensionless quantities, and those in the model's own units."""
 T_S = np.arange(1.0, 5.0)
 
 
@@ -75,66 +75,22 @@ def described(case: str) -> dict[str, FigureDescription]:
     return {name: describe() for name, describe in found.items()}
 
 
-def drawn_for(case: str) -> dict[str, Figure]:
-    return {name: draw(figure) for name, figure in described(case).items()}
-
-
-@pytest.fixture(scope="module", params=CASES)
-def drawn(request: pytest.FixtureRequest) -> dict[str, Figure]:
-    return drawn_for(request.param)
-
-
-def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
-    for name, figure in drawn.items():
-        for place, axes in enumerate(figure.axes):
-            beside = place == 1 and name in ("inter-event", "latency")
-            shared = axes.xaxis.get_tick_params().get("labelbottom") is False
-            for label, is_hidden in ((axes.get_ylabel(), beside), (axes.get_xlabel(), shared)):
-                has_unit = UNITS.search(label) or UNITLESS.fullmatch(label)
-                assert is_hidden or has_unit or (name == "states" and label), (name, label)
-
-
-def test_every_figure_can_be_saved(tmp_path: Path) -> None:
-    """Warnings are errors here: no log of zero, no limits that coincide."""
-    for name, figure in described("diverged").items():
-        save_figure(figure, tmp_path / f"{name}.png")
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
-WIDE = [case for case in CASES if case != "two steps"]
-"""Its states hardly change, and matplotlib's common offset of their numbers needs more room."""
-
-
-@pytest.fixture(
-    scope="module", params=[(case, width_in) for width_in in (3.5, 10.0) for case in WIDE]
-)
-def as_wide(request: pytest.FixtureRequest) -> Iterator[dict[str, Figure]]:
-    case, width_in = request.param
-    with figure_width(width_in):
-        yield drawn_for(case)
-
-
 def legends(axes: Axes) -> list[Legend]:
     """The rows of the legend of axes, each of which is a legend of matplotlib."""
     return [one for one in axes.get_children() if isinstance(one, Legend)]
 
 
-def test_nothing_is_cut_off_and_no_texts_overlap(as_wide: dict[str, Figure]) -> None:
-    for name, figure in as_wide.items():
-        with settings():
-            figure.draw_without_rendering()
-            box, size_in = figure.get_tightbbox(), figure.get_size_inches()
-            assert min(box.x0, box.y0) >= 0, name
-            assert box.x1 <= size_in[0], name
-            assert box.y1 <= size_in[1], name
-            for axes in figure.axes:
-                heads = [*axes.texts, axes.yaxis.get_offset_text(), axes._left_title]
-                for legend in legends(axes):
-                    assert legend.get_window_extent().y0 >= axes.bbox.y1 - 1, name
-                    heads += legend.get_texts()
-                boxes = [text.get_window_extent() for text in heads if text.get_text()]
-                for i, one in enumerate(boxes):
-                    assert not any(one.overlaps(other) for other in boxes[:i]), name
+@pytest.mark.parametrize("case", CASES)
+def test_every_figure_is_drawn_with_its_curves_in_the_legend(case: str, tmp_path: Path) -> None:
+    """Warnings are errors here: no log of zero, no limits that coincide."""
+    for name, figure in described(case).items():
+        shown = {label for axes in draw(figure).axes for label in labels(axes)}
+        for row in figure.rows:
+            lines = [item for item in row.panels[0].items if isinstance(item, Line)]
+            assert {line.label for line in lines if line.label} <= shown, name
+        if case == "diverged":
+            save_figure(figure, tmp_path / f"{name}.png")
+            assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_figure_without_data_states_that() -> None:
@@ -143,39 +99,20 @@ def test_a_figure_without_data_states_that() -> None:
             assert {"no data", "no loss"} & {text.get_text() for text in axes.texts}, name
 
 
-def spike(k: int) -> np.ndarray:
-    y = np.zeros(k)
-    y[k // 3] = 7.0
-    return y
-
-
-def test_a_long_curve_is_drawn_with_its_peaks_and_few_points(tmp_path: Path) -> None:
-    k = 200_000
-    figure = norms(line(np.arange(k) * 0.002, 1.0 + spike(k)))
-    (drawn,) = draw(figure).axes[0].lines
-    assert 8.0 in drawn.get_ydata()
-    assert len(drawn.get_ydata()) <= 2400
-    save_figure(figure, tmp_path / "long.svg")
-    assert (tmp_path / "long.svg").stat().st_size < 1_000_000
-
-
 def labels(axes: Axes) -> list[str]:
     return [text.get_text() for legend in legends(axes) for text in legend.get_texts()]
 
 
-@pytest.mark.parametrize(("mode", "head"), [("model", "MB-ET"), ("zoh", "ZOH-ET")])
-def test_intervals_and_fates_are_drawn_at_their_times(mode: Any, head: str) -> None:
-    """The figure is named as in the paper."""
+def test_intervals_and_fates_are_drawn_at_their_times() -> None:
     sent_s = np.array([0.0, 1.0, 1.5, 3.0, 3.25])
     lost, x = np.array([False, True, False, True, False]), np.zeros((10, 1))
     figure = states_figure(
-        mode,
-        "one draw out of 1,000",
+        "model",
+        "one draw",
         Trajectory(["x"], np.linspace(0, 4, 10), x, x, x, x),
         Transmissions(sent_s, lost, sent_s[~lost], np.array([True, False, True])),
     )
-    first, above, below = draw(figure).axes
-    assert first.get_title("left") == f"{head}: one draw out of 1,000"
+    _, above, below = draw(figure).axes
     assert labels(above) == ["sent", "sent, lost"]
     assert labels(below) == ["received", "received, forced", "lost"]
     found = {
@@ -221,29 +158,76 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
         assert trace not in content
 
 
-def test_another_file_extension_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg, \.png, \.pdf"):
-        save_figure(FigureDescription(name="none", rows=[]), tmp_path / "figure.eps")
+ALLOWED_US, SENSOR_NS, MS = 1000.0, 63_200, 1_000_000
+FIRST_LOST = 7
 
 
-def contrast(one: str, other: str) -> float:
-    low, high = sorted(luminance(ImageColor.getrgb(colour)[:3]) for colour in (one, other))
-    return (high + 0.05) / (low + 0.05)
+@pytest.fixture
+def clocked(content: dict[str, Any]) -> RunRecord:
+    """A run whose sensor is on a host with another clock, and loses its bound."""
+    clocks = {"largest_error_us": ALLOWED_US}
+    record = simulate(scenario_of(content | {"clocks": clocks}))
+    tables = {}
+    for table in CLOCK_TABLES:
+        rows = np.zeros(20, record.tables[table])
+        rows["input"] = np.arange(20)
+        rows["t_ns"] = np.arange(20) * 50 * MS
+        rows["now_ns"] = rows["t_ns"] + 50 * MS
+        if OWNER[table] == "sensor":
+            rows["error_ns"] = SENSOR_NS
+            rows["error_ns"][FIRST_LOST:10] = LOST_NS
+        tables[table] = rows
+    return changed(record, tables)
 
 
-def test_the_palette_is_tested_on_the_backgrounds_of_the_page() -> None:
-    css = (PAGES / "report.css").read_text()
-    found = {ImageColor.getrgb(colour) for colour in re.findall(r"--paper: (#\w+)", css)}
-    assert found <= set(BACKGROUNDS.values())
+def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
+    clocked: RunRecord,
+) -> None:
+    found = run_figures(clocked)["clocks"]()
+    assert "Largest: sensor 63.2 µs." in found.caption
+    assert "the bound was lost (sensor)" in found.caption
+    curve, cross, limit = draw(found).axes[0].lines
+    assert np.nanmax(curve.get_ydata()) == pytest.approx(SENSOR_NS * 1e-3)
+    assert cross.get_xdata().tolist() == pytest.approx([FIRST_LOST * 0.05])
+    assert set(limit.get_ydata()) == {ALLOWED_US}
+    conditions: dict[str, float | None] = dict.fromkeys(
+        ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
+    )
+    summary = summary_of(clocked, conditions=conditions | {"clock_error_s": SENSOR_NS * 1e-9})
+    assert ("largest bound of a clock's error", "63.2 µs") in key_numbers(summary)
 
 
-@pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
-def test_text_has_enough_contrast(paper: str) -> None:
-    """4.5 to 1, WCAG's minimum for text."""
-    css = (PAGES / "report.css").read_text()
-    (block,) = [block for block in css.split(":root") if f"--paper: {paper}" in block][:1]
-    shade = re.search(r"--shade: (#\w+)", block)
-    assert shade
-    for name, colour in re.findall(r"--(ink|quiet|good|bad|doubt): (#\w+)", block):
-        assert contrast(colour, paper) >= 4.5, name
-        assert contrast(colour, shade[1]) >= 4.5, name
+def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
+    run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
+    done = CliRunner().invoke(app, ["report", str(run.directory), "--format", "pdf", "--json"])
+    assert done.exit_code == 0, done.output
+    names = {path.stem for path in (run.directory / "report-figures").iterdir()}
+    assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
+    with pytest.raises(CallerError, match='"eps": a figure is saved as svg, png, pdf'):
+        run.save_figures("eps")
+    with pytest.raises(CallerError, match=r"figure\.eps: a figure is saved as \.svg"):
+        save_figure(norms(line(T_S, T_S)), tmp_path / "figure.eps")
+    for width, points in ((None, 252.0), ("page", 515.52), (5, 360.0)):
+        for path in run.save_figures("pdf", width):
+            content = path.read_bytes()
+            box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ", content)
+            assert box is not None
+            assert float(box[1]) == pytest.approx(points, abs=0.01)
+            assert b"Cmr10" in content  # the font of LaTeX
+            assert b"/Type3" not in content.replace(b" ", b"")  # refused by publishers
+    drawn = run.save_figures("svg")
+    assert drawn[0].read_text().count('width="720pt"') == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--width", "column"], "--width: is the width of the figures of --format"),
+        (["--format", "pdf", "--width", "wide"], "width wide: expected column, page, or inches"),
+        (["--format", "pdf", "--width", "nan"], "width nan: expected column, page, or inches"),
+    ],
+)
+def test_a_wrong_width_is_refused(words: list[str], message: str) -> None:
+    done = CliRunner().invoke(app, ["campaign", "mb_vs_zoh", *words])
+    assert done.exit_code == 2
+    assert message in done.stderr

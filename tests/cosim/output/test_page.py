@@ -18,10 +18,10 @@ from cosim.output import figure_files, report_page
 from cosim.output.figure_description import Axis, Line, Panel, one_panel
 from cosim.output.figure_files import inline
 from cosim.output.report_page import Report, page, write_report
-from cosim.output.run_figures import BOUNDED, run_figures
+from cosim.output.run_figures import run_figures
 from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
-from noack.core.errors import ExitStatus, MachineError
+from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.summaries import alone, summary_of
@@ -145,16 +145,7 @@ def test_the_report_of_a_live_run_is_complete(record: RunRecord, tmp_path: Path)
         assert assumption.why in parsed.text
     assert scenario_toml(record.scenario) in parsed.text
     assert "guarantee broken since 0.000 s: violated: controller error" in parsed.text
-    assert "live run, model-based, M − 1 = 2, started 2020-01-02" in parsed.text
-    assert "noack run" in parsed.text
-    assert "plant lateness" in parsed.text
-
-
-def test_the_report_of_a_simulated_run_has_no_lateness(record: RunRecord) -> None:
-    assert list(run_figures(record, timed=False)) == FIGURES
-    text = shown(record, kind="simulated", lateness_us={}, latency_us=None)
-    assert "simulated run" in text
-    assert "lateness" not in text
+    assert "started 2020-01-02" in parsed.text
 
 
 def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
@@ -179,61 +170,31 @@ def test_user_text_is_escaped(content: dict[str, Any], tmp_path: Path) -> None:
     assert parsed.attributes("title") == [{}]
 
 
-def fidelity(**changed: Any) -> dict[str, Any]:
-    """A run's difference to the ideal loop, in the form of its summary."""
-    shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "residual": 0.0}
-    return {
-        "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
-        "rms_x_live": 2.0, "shares": shares, "events_ideal": 31, "events_live": 30,
-        "max_event_difference_s": 0.0125, "first_different_event": None, "reason": None,
-    } | changed  # fmt: skip
-
-
-def replayed(**changed: Any) -> dict[str, Any]:
-    found = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}
-    return found | changed
-
-
-def test_the_difference_to_the_ideal_loop_is_explained(record: RunRecord) -> None:
-    text = shown(record, fidelity=fidelity())
-    for sentence in (
-        "by 0.25 (RMS), 12 % of x itself, and by at most 0.5",
-        "explain the difference: the residual is 1e-07 % of the difference.",
-        "30 events, the ideal loop 31; the times of an event differ by at most 12.5 ms",
-        "An effect with a negative share",
-        "held actuation", "-42.0 %",
-    ):  # fmt: skip
-        assert sentence in text
-    assert "held_actuation" not in text
-    assert "Replay" not in text
-    shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "residual": 0.0}
-    text = shown(record, fidelity=fidelity(explained=False, explained_relative=0.4,
-                                           shares=shares, first_different_event=7))  # fmt: skip
-    assert "do not explain the difference" in text
-    assert "the residual is 40 % of the difference, which is too large" in text
-    assert "They agree up to event 7" in text
-    assert "negative share" not in text
-    nothing = {"reason": "the run diverged"}
-    assert "Not compared with the ideal loop: the run diverged." in shown(record, fidelity=nothing)
-
-
-def test_the_replay_has_a_section(record: RunRecord) -> None:
-    text = shown(record, replay=replayed())
-    assert "The 10,001 recorded inputs were replayed" in text
-    assert "bit for bit" in text
-    assert "gaps" not in text
+def test_the_report_names_what_is_not_explained_or_not_replayed(record: RunRecord) -> None:
+    """A run without problems is among the approved texts."""
+    fidelity: dict[str, Any] = {
+        "explained": False, "explained_relative": 0.4, "rms_x": 0.25, "max_x": 0.5,
+        "rms_x_live": 2.0, "shares": {"sampling": 1.0, "delay": -0.42}, "events_ideal": 31,
+        "events_live": 30, "max_event_difference_s": 0.0125, "first_different_event": 7,
+        "reason": None,
+    }  # fmt: skip
     other = difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0).model_dump()
-    text = shown(record, replay=replayed(bit_exact=False, complete=False, first_difference=other))
-    assert "differs from its record" in text
-    assert "plant_step row 7, x_1: another x: recorded 1.0" in text
-    assert "The record has gaps" in text
-    text = shown(record, replay={"bit_exact": None, "error": "KeyError('x')"})
-    assert "Nothing could be replayed: KeyError('x')." in text
-
-
-def test_a_section_without_data_is_left_out(record: RunRecord) -> None:
-    text = shown(record)
-    assert not any(heading in text for heading in ("Fidelity", "Replay", "Claims"))
+    replay = {"bit_exact": False, "complete": False, "inputs": 10001, "first_difference": other}
+    text = shown(record, fidelity=fidelity, replay=replay)
+    for words in (
+        "the residual is 40 % of the difference, which is too large",
+        "They agree up to event 7", "-42.0 %", "12 % of x itself",
+        "differs from its record", "plant_step row 7, x_1: another x: recorded 1.0",
+        "The record has gaps",
+    ):  # fmt: skip
+        assert words in text
+    text = shown(
+        record, fidelity={"reason": "it diverged"}, replay={"bit_exact": None, "error": "KeyError"}
+    )
+    assert "Not compared with the ideal loop: it diverged." in text
+    assert "Nothing could be replayed: KeyError." in text
+    exact = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}
+    assert "The 10,001 recorded inputs were replayed" in shown(record, replay=exact)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -241,22 +202,6 @@ def test_every_run_gets_a_report(case: str) -> None:
     record = CASES[case]()
     assert [*run_figures(record)] == FIGURES + TIMED
     shown(record)
-
-
-def test_envelopes_are_drawn_with_their_signals(record: RunRecord) -> None:
-    t_s = np.linspace(0, 1, 50)
-    envelopes: list[Any] = [
-        ("a", "e_c", t_s, 1 + t_s, "identity"),
-        ("b", "x", t_s, t_s, "certified"),
-        ("c", "inter_event", t_s, t_s, "printed"),
-    ]
-    found = {
-        name: [label for label in "abc" if label in describe().rows[-1].panels[0].labels]
-        for name, describe in run_figures(record, envelopes).items()
-    }
-    assert {name: labels for name, labels in found.items() if labels} == dict(
-        zip(BOUNDED, (["a"], ["b"], ["c"]), strict=True)
-    )
 
 
 def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,15 +213,6 @@ def test_a_large_figure_becomes_a_bitmap(monkeypatch: pytest.MonkeyPatch) -> Non
     (image,) = Page(inline(figure)).attributes("img")
     assert image["alt"] == 'named "so"'
     assert (image["src"] or "").startswith("data:image/png;base64,")
-
-
-def test_a_report_that_cannot_be_written_gives_one_line(
-    record: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(report_page, "run_figures", lambda *_, **options: {})
-    (tmp_path / REPORT_FILE).mkdir()
-    with pytest.raises(MachineError, match=r"report\.html: cannot be written"):
-        written(record, tmp_path)
 
 
 @pytest.fixture
@@ -313,20 +249,3 @@ def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: 
     assert path.read_text() == "as it was"
     assert CliRunner().invoke(app, ["report", str(dead_run), "--again"]).exit_code == 0
     assert Page(path.read_text(encoding="utf-8")).text == parsed.text
-
-
-def test_the_command_reports_what_is_wrong(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(app, ["report", str(tmp_path)])
-    assert ran.exit_code == 2
-    assert ran.stderr == f"noack: {tmp_path}: not a run directory (no scenario.toml)\n"
-
-
-@pytest.mark.parametrize(
-    ("exit_", "message"),
-    [
-        ({"status": 0, "reason": "horizon"}, "completed 1 s"),
-        ({"status": 1, "reason": "plant died"}, "failed after 1 s of 1 s: plant died"),
-    ],
-)
-def test_the_verdict_comes_first(record: RunRecord, exit_: dict[str, Any], message: str) -> None:
-    assert message in shown(record, exit=exit_).partition("Key numbers")[0]

@@ -1,6 +1,5 @@
 """The pictures of plants and of the network in the recording."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -105,39 +104,6 @@ def test_the_car_is_drawn_in_its_direction_of_travel() -> None:
     slope = np.gradient(place[:, 1], passed)
     sideslip = states[:, 0] / speed
     np.testing.assert_allclose(slope[1:-1], (angle + sideslip)[1:-1], atol=2e-3)
-
-
-def test_the_internal_state_of_a_vehicle_gives_its_position() -> None:
-    """With its own y and yaw, it moves forward along x; Y_g is −y."""
-    picture, n, internal = PICTURES["vehicle"]
-    frames = frames_of(n, internal)
-    assert frames.z is not None
-    place, angle = pose(picture.frames(frames)["plant"])
-    np.testing.assert_allclose(place[:, 1], -frames.z[:, 1], atol=1e-6)
-    np.testing.assert_allclose(angle, -frames.z[:, 4], atol=1e-6)
-    _, steered = pose(picture.frames(frames)["plant/steered/left"])
-    np.testing.assert_allclose(steered, -frames.z[:, 2], atol=1e-6)
-    place, angle = pose(picture.frames(frames)["sensor"])
-    np.testing.assert_allclose(place[:, 1], frames.x_s[:, 3], atol=1e-6)
-
-
-def test_a_pole_is_drawn_at_the_side_of_its_angle() -> None:
-    picture = PendulumPicture(0, 2)
-    x = np.array([[0.5, 0.0, 0.1, 0.0]])
-    moved = picture.frames(Frames(np.zeros(1), x, x, x))
-    assert pose(moved["plant"])[0].tolist() == [[0.5, 0.0]]
-    (angle,) = pose(moved["plant/pole"])[1]
-    assert -math.sin(angle) == pytest.approx(math.sin(0.1))  # the image of the tip (0, 1)
-
-
-def test_tank_levels_are_drawn_to_scale() -> None:
-    frames = frames_of(4, 4)
-    z = np.full((7, 4), 10.0)
-    moved = TanksPicture().frames(frames._replace(z=z))
-    drawn = np.array(arrays(moved["sensor/1"])["strips"], dtype=float)[:, 0, 0, 1]
-    (low,) = {0.0}
-    expected = low + (10.0 + frames.x_s[:, 0] - frames.x[:, 0]) / 20.0 * 1.6
-    np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
 
 
 def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:

@@ -1,6 +1,7 @@
 """The recording of several loops that is written while they run, against that of the record."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -22,13 +23,15 @@ from cosim.output.viewer.run_recording import (
     SIZE,
     open_recording,
 )
-from cosim.record.align import align_tables
+from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import RECORDING_FILE
 from cosim.record.run_record import RecordedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate_loops
 from noack.protocol.machine_interface import Notice
-from noack.protocol.record_tables import NETEM_PACKET
+from noack.protocol.record_tables import NETEM_PACKET, PACKET_HEAD_BYTES, Fate, tables
+from noack.protocol.wire_format import Encoder, Flow, Message
+from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.live.test_claim_monitor import live_rows
 from tests.cosim.output.viewer.test_viewer import Chunks, read, series
@@ -85,18 +88,6 @@ def test_all_loops_are_shown_as_from_the_record(tmp_path: Path, count: int, phas
     assert bp.LOG in found
 
 
-def test_few_loops_are_shown_in_detail(tmp_path: Path) -> None:
-    run, found, _ = shown(tmp_path, 3)
-    for record in run.loops:
-        folder = bp.loop_folder(record.scenario.name)
-        aligned = align_tables(record)
-        t_ns, states = series(found, f"{folder}{bp.state_path('angle')}")
-        assert np.ptp(t_ns - aligned.t_ns) == 0
-        np.testing.assert_array_equal(states[:, 2], aligned.x_c[:, 0])
-        assert any(one.startswith(f"{folder}picture/") for one in found)
-    assert f"{bp.loop_folder('p-2')}log" in found
-
-
 def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,3 +100,43 @@ def test_loops_in_detail_that_cannot_keep_up_are_given_up_and_named(
     assert len(series(found, ERROR)[0]) == INTERVALS
     with pytest.raises(ValueError, match="at least one array"):  # nothing but static data
         series(found, f"{bp.loop_folder('p-1')}{bp.state_path('angle')}")
+
+
+SCENARIO = resolve(load(find_shipped("lane_following", "scenarios")))
+LOOP = loop_of(SCENARIO)
+TYPES = tables(LOOP.n, LOOP.m)
+MS = 1_000_000
+
+
+def ticks(first: int, count: int) -> np.ndarray:
+    rows = np.zeros(count, TYPES["controller_step"])
+    rows["input"] = rows["sequence"] = np.arange(first, first + count)
+    rows["t_ns"] = rows["model_t_ns"] = rows["now_ns"] = rows["input"] * 2 * MS
+    return rows
+
+
+def received(view: Mock) -> list[tuple[int, bool]]:
+    calls = [call.args for call in view.receptions.call_args_list]
+    return [one for t_ns, _, forced in calls for one in zip(t_ns, forced, strict=True)]
+
+
+def test_a_delivery_is_drawn_once_the_networks_row_has_arrived() -> None:
+    view = Mock()
+    feed = ViewFeed(SCENARIO, view)
+    delivery = np.zeros(1, TYPES["controller_delivery"])
+    delivery["t_ns"] = delivery["model_t_ns"] = 100 * MS
+    delivery["sequence"] = 5
+    delivery["input"] = 50
+    feed.add("controller_delivery", delivery)
+    feed.add("controller_step", ticks(0, 50))
+    feed.advance()
+    assert received(view) == []
+
+    packet = np.zeros(1, TYPES["netem_packet"])
+    update = Message(Flow.UPDATE, 5, 100 * MS, np.zeros(LOOP.n))
+    packet["head"] = np.void(Encoder(1, bytes(32)).encode(update)[:PACKET_HEAD_BYTES])
+    packet["fate"] = Fate.FORCED
+    feed.add("netem_packet", packet)
+    feed.add("controller_step", ticks(51, 300))
+    feed.advance()
+    assert received(view) == [(100 * MS, True)]

@@ -1,13 +1,14 @@
 import contextlib
 import http.client
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin, urlsplit
@@ -16,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 import rerun.chunk
+import rerun.experimental
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
@@ -25,6 +27,9 @@ from cosim.output.viewer.live_viewer import (
     LiveView,
     RecordingServer,
     has_display,
+    move_window_to,
+    opening_time_ns,
+    script_to_open_at,
     view_recording,
 )
 from cosim.output.viewer.pictures.picture import TIMELINE, Frames
@@ -32,14 +37,13 @@ from cosim.output.viewer.recording import APPLICATION_ID, LoopView, RecordingFil
 from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
 from cosim.shipped_files import find_shipped
+from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
-from noack.protocol.record_tables import Fate
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.output.test_approved import compare
-from tests.integration.conftest import wait_for
-
-ROOT = Path(__file__).parents[4]
+from tests.cosim.summaries import summary_of
+from tests.integration.conftest import noack_command, wait_for
 
 Floats = NDArray[np.float64]
 
@@ -69,17 +73,10 @@ def add_samples(view: RunRecording, batches: int, n: int = 4) -> None:
         t_ns = times(batch * K)
         norm = t_ns.astype(np.float64) * 1e-9
         x: Floats = norm[:, None] + np.arange(n)
-        bounds = np.stack([norm + 3, norm + 4], axis=1)
-        found = aligned(t_ns, (x, x + 100, x + 200), (norm, norm + 1, norm + 2))
+        bounds, none = np.stack([norm + 3, norm + 4], axis=1), np.full(K, -1)
+        states, norms = (x, x + 100, x + 200), (norm, norm + 1, norm + 2)
+        found = AlignedRun(t_ns, *states, *norms, received=none, sensor=none)
         view.views[0].samples(found, bounds, bounds + 2)
-
-
-def aligned(
-    t_ns: NDArray[np.int64], states: tuple[Floats, ...], norms: tuple[Floats, ...]
-) -> AlignedRun:
-    """x, x_s, x_c and ‖e_s‖, threshold, ‖e_c‖ at times (k,)."""
-    none = np.full(len(t_ns), -1)
-    return AlignedRun(t_ns, *states, *norms, received=none, sensor=none)
 
 
 Chunks = dict[str, list[Any]]
@@ -118,12 +115,6 @@ def series(chunks: Chunks, entity: str) -> tuple[NDArray[np.int64], Floats]:
     batches = [c.to_record_batch() for c in moving]
     t_ns = np.concatenate([b.column("t").to_numpy(zero_copy_only=False) for b in batches])
     return t_ns.astype(np.int64), np.array(column(moving, "Scalars:scalars"), dtype=np.float64)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait until the condition is true; the test's own time limit ends the wait."""
-    while not condition():
-        time.sleep(0.02)
 
 
 def is_left(group: int) -> bool:
@@ -184,7 +175,11 @@ def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float
     with new_view(path, horizon_s=horizon_s) as view:
         add_samples(view, 5)
         view.views[0].inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+        x = np.zeros((3, 4))
+        for _ in range(2):  # the picture has a maximum frame rate
+            view.views[0].move(times(0, 3), Frames(np.zeros(3), x, x, x))
     chunks = read(path)
+    assert sum(c.num_rows for c in chunks["picture/plant"] if not c.is_static) == 1
     for i, name in enumerate(STATES):
         t_ns, values = series(chunks, f"state/{name}")
         np.testing.assert_array_equal(t_ns, times(0, 5 * K))
@@ -202,16 +197,10 @@ def test_the_file_contains_every_sample_exactly(tmp_path: Path, horizon_s: float
     np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording without samples."""
-    path = tmp_path_factory.mktemp("empty") / "recording.rrd"
-    new_view(path).close()
-    return path
-
-
-def test_the_recording_shows_what_was_approved(path: Path) -> None:
+def test_the_recording_shows_what_was_approved(tmp_path: Path) -> None:
     """Names, colours and texts of what is drawn, and the panels of the layout."""
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
     reader = rerun.chunk.RrdReader(path)
     (recording,), (layout,) = reader.recordings(), reader.blueprints()
     assert recording.application_id == layout.application_id == APPLICATION_ID
@@ -225,73 +214,6 @@ def test_the_recording_shows_what_was_approved(path: Path) -> None:
     ]
     shown += sorted(of_views(read(path, "blueprint"), "ViewBlueprint:display_name"))
     compare("recording.txt", "\n".join(shown))
-
-
-def test_the_plots_show_the_whole_run_with_a_margin(path: Path) -> None:
-    shared = read(path, "blueprint")["view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"]
-    ((whole,),) = column(shared, "TimeAxis:view_range")
-    assert -0.05 * 20 * S < whole["start"] < 0
-    assert 1.05 * 20 * S < whole["end"] < 1.1 * 20 * S
-
-
-@pytest.mark.parametrize("states", [["a"], ["a/b", "a b", "ψ"], [f"x{i}" for i in range(17)]])
-def test_every_coordinate_has_a_panel(tmp_path: Path, states: list[str]) -> None:
-    """Names with special characters give different entities, too."""
-    path = tmp_path / "recording.rrd"
-    shown = ShownLoop("", states, ["u"])
-    with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
-        LoopView(file, shown)
-    entities = {entity for entity in read(path) if entity.startswith("state/")}
-    assert len(entities) == len(states)
-    origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
-    assert entities <= {o.removeprefix("/") for o in origins}
-
-
-@pytest.mark.parametrize("threshold", [0.1, 0.0, np.inf, np.nan])
-def test_the_logarithm_of_a_reset_error_stays_in_range(tmp_path: Path, threshold: float) -> None:
-    """It is cut off at a thousandth of the threshold, or at 1e-12 if the rule has none."""
-    path = tmp_path / "recording.rrd"
-    with new_view(path) as view:
-        x, e = np.zeros((3, 4)), np.array([0.1, 0.0, np.nan])
-        none = np.full((3, 2), np.nan)
-        found = aligned(times(0, 3), (x, x, x), (e, np.full(3, threshold), e))
-        view.views[0].samples(found, none, none)
-    assert not np.isinf(series(read(path), "error/norm")[1]).any()
-    _, values = series(read(path), "error/log10")
-    floor = -4.0 if threshold == 0.1 else -12.0
-    np.testing.assert_allclose(values[:, 1], [-1.0, floor, np.nan], rtol=1e-12)
-    assert not np.isinf(values).any()
-
-
-def test_events_deliveries_losses_lateness_and_log_are_recorded(tmp_path: Path) -> None:
-    """Every event is a mark on a stem; the first has height 0."""
-    path = tmp_path / "recording.rrd"
-    t_ns = np.array([0, 300, 700], dtype=np.int64)
-    with new_view(path) as recording:
-        view = recording.views[0]
-        view.broadcasts(t_ns[:1], np.array([np.nan]))
-        view.broadcasts(t_ns[1:], np.array([0.3, 0.4]))
-        view.receptions(t_ns, np.array([np.nan, 0.3, 0.4]), np.array([False, True, False]))
-        view.drops(np.array([100, 200], dtype=np.int64))
-        view.drops(np.array([], dtype=np.int64))
-        view.lateness("sensor", times(0, 3), np.array([1.0, 2.5, 900.0]))
-        view.log(1_500_000_000, "WARN", "three measurements late")
-    chunks = read(path)
-    at, values = series(chunks, "event/interval")
-    np.testing.assert_array_equal(at, t_ns)
-    np.testing.assert_array_equal(values[:, 0], [0.0, 0.3, 0.4])
-    at, values = series(chunks, "event/stem")
-    np.testing.assert_array_equal(at, np.repeat(t_ns, 3))
-    np.testing.assert_array_equal(values.reshape(3, 3), [[0, h, np.nan] for h in (0.0, 0.3, 0.4)])
-    assert series(chunks, "reception/interval")[0].tolist() == [0, 700]
-    at, values = series(chunks, "reception/forced")
-    assert (at.tolist(), values.tolist()) == ([300], [[0.3]])
-    assert series(chunks, "reception/stem")[0].tolist() == np.repeat(t_ns, 3).tolist()
-    assert series(chunks, "drop")[0].tolist() == [100, 200]
-    assert series(chunks, "lateness/sensor")[1].ravel().tolist() == [1.0, 2.5, 900.0]
-    assert column(chunks["log"], "TextLog:level") == [["WARN"]]
-    ((line,),) = column(chunks["log"], "TextLog:text")
-    assert line.split(maxsplit=2) == ["1.500", "s", "three measurements late"]
 
 
 def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
@@ -313,26 +235,6 @@ def test_a_disk_that_fills_during_the_run_is_reported_by_the_closing(tmp_path: P
     assert "ViewError" in last
     assert str(path) in last
     assert "the recording is incomplete" in last
-
-
-def test_the_file_of_a_killed_writer_contains_all_written_rows(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    code = (
-        "import time; view = t.new_view(path); t.add_samples(view, 5);"
-        "print('written', flush=True); time.sleep(1000)"
-    )
-    with another_process(code, path) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "written\n"
-        until(lambda: holds(path, 5 * K))
-    assert rows_of(path) == 5 * K
-
-
-def holds(path: Path, rows: int) -> bool:
-    """Whether a file, possibly in the middle of a write, contains these rows."""
-    with contextlib.suppress(RuntimeError, ValueError):
-        return rows_of(path) == rows
-    return False
 
 
 def rows_of(path: Path) -> int:
@@ -394,7 +296,7 @@ def test_a_live_view_ends_when_the_recorder_is_killed(tmp_path: Path) -> None:
         assert child.stdout is not None
         group = int(child.stdout.readline())
         assert is_left(group)
-    until(lambda: not is_left(group))
+    wait_for(lambda: not is_left(group))
 
 
 WINDOW = """#!{python}
@@ -412,44 +314,27 @@ def pretend_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, opens: bo
     """Replace rerun's program by one that opens no window; its web server is rerun's."""
     folder = Path(str(__import__("rerun_cli").__file__)).parent
     program, seen = tmp_path / "viewer", tmp_path / "seen.rrd"
-    program.write_text(
-        WINDOW.format(
-            python=sys.executable,
-            viewer=str(folder / "rerun"),
-            opens=opens,
-            seen=str(seen),
-            status=0 if opens else 1,
-        )
-    )
+    values = {"python": sys.executable, "viewer": str(folder / "rerun"), "seen": str(seen)}
+    program.write_text(WINDOW.format(**values, opens=opens, status=int(not opens)))
     program.chmod(0o755)
     monkeypatch.setenv("RERUN_CLI_PATH", str(program))
     return seen
 
 
-def test_a_window_is_shown_the_whole_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("opens", [True, False])
+def test_a_window_or_a_browser_is_served_the_whole_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, opens: bool
 ) -> None:
-    seen = pretend_window(tmp_path, monkeypatch, opens=True)
+    seen = pretend_window(tmp_path, monkeypatch, opens=opens)
     path = tmp_path / "recording.rrd"
     live = LiveView(native=True)
     with new_view(path, live=live) as view:
         add_samples(view, 5)
-        assert live.url is None
-        assert live.status == "live view: in a window"
+        assert (live.url is None) == opens
+        assert (live.status == "live view: in a window") == opens
+    assert live.url is None or get(live.url)[0] == 200
     live.close()
-    until(lambda: seen.exists() and seen.read_bytes() == path.read_bytes())
-
-
-def test_a_browser_is_served_if_no_window_opens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pretend_window(tmp_path, monkeypatch, opens=False)
-    path = tmp_path / "recording.rrd"
-    live = LiveView(native=True)
-    new_view(path, live=live).close()
-    assert live.url is not None
-    assert get(live.url)[0] == 200
-    live.close()
+    wait_for(lambda: not opens or (seen.exists() and seen.read_bytes() == path.read_bytes()))
 
 
 def test_other_host_names_and_files_are_refused(tmp_path: Path) -> None:
@@ -488,22 +373,31 @@ def listening(viewer: "subprocess.Popen[str]") -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("sent", "status"),
+    ("sent", "status", "words"),
     [
-        (signal.SIGINT, 0),
-        (signal.SIGHUP, ExitStatus.TERMINATED),
+        (signal.SIGINT, 0, ()),
+        (signal.SIGHUP, ExitStatus.TERMINATED, ("--web",)),
         pytest.param(
-            signal.SIGKILL, -signal.SIGKILL,
+            signal.SIGKILL, -signal.SIGKILL, (),
             marks=pytest.mark.skipif(sys.platform != "linux", reason="tells no child elsewhere"),
         ),
     ],
 )  # fmt: skip
-def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
-    tmp_path: Path, sent: int, status: int
+def test_the_command_serves_a_page_on_the_loopback_until_it_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sent: int, status: int, words: tuple[str, ...]
 ) -> None:
+    """Without a display, or if no window is wanted."""
+    pretend_window(tmp_path, monkeypatch, opens=True)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if words:
+        monkeypatch.setenv("DISPLAY", ":0")
     path = tmp_path / "recording.rrd"
     new_view(path).close()
-    with another_process("t.view_recording(path)", path) as child:
+    with subprocess.Popen(
+        noack_command("view", str(path), *words),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as child:  # fmt: skip
         assert child.stdout is not None
         page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
         assert get(page)[0] == 200
@@ -514,66 +408,91 @@ def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
         wait_for(lambda: not is_left(child.pid))
 
 
-def test_a_picture_has_a_maximum_frame_rate_across_batches(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    with new_view(path) as recording:
-        view = recording.views[0]
-        for first in range(0, 1000, 37):
-            t_ns = times(first, min(37, 1000 - first))
-            x = np.tile(t_ns[:, None] * 1e-9, (1, 4))
-            view.move(t_ns, Frames(t_ns * 1e-9, x, x, x))
-        view.packets(np.array([S]), np.array([S]), np.array([Fate.FORCED]))
-        view.travel(2 * S)
-    chunks = read(path)
-    moving = [c for c in chunks["picture/plant"] if not c.is_static]
-    places = np.array(column(moving, "Transform3D:translation"))[:, 0, :]
-    assert len(places) == 2 * 60  # of 2 s, out of 1000 samples
-    # the lateral offset grows; +y points down in the viewer
-    assert (np.diff(places[:, 1]) < 0).all()
-    shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
-    assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
+T_NS = 4_244_000_000
 
 
-def test_a_dead_viewer_does_not_delay_the_recorder(tmp_path: Path, live: LiveView) -> None:
-    path = tmp_path / "recording.rrd"
-    view = new_view(path, live=live)
-    assert live.pid is not None
-    os.killpg(live.pid, signal.SIGKILL)
-    add_samples(view, 5)
-    view.close()
-    live.close()
-    assert rows_of(path) == 5 * K
+def summary_at(at_s: float | None) -> str:
+    scenario = resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=0.1"]))
+    return summary_of(simulate(scenario), sup_e_c_at_s=at_s).model_dump_json()
 
 
-@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="there is always a display")
-@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY", None])
-def test_a_display_is_detected_from_the_environment(
-    monkeypatch: pytest.MonkeyPatch, variable: str | None
+def test_the_page_sets_the_viewers_time_and_pauses_it() -> None:
+    """The request is a ``SetTimeCursor`` (6): timeline (2), time (3), paused (5)."""
+    found = re.search(rb"Uint8Array\((\[[^]]*\])\)", script_to_open_at(T_NS))
+    assert found is not None
+    timeline, time = b"\x0a\x01t", b"\x08" + bytes.fromhex("809ad9e70f")
+    cursor = b"\x12\x03" + timeline + b"\x1a\x06" + time + b"\x28\x01"
+    assert bytes(json.loads(found[1])) == b"\x32\x0f" + cursor
+
+
+@pytest.mark.parametrize(
+    ("summary", "expected"),
+    [
+        (4.244, T_NS), (None, None), ("{}", None),
+        ("[]", None), ("{", None),
+    ],
+)  # fmt: skip
+def test_the_opening_time_is_taken_from_the_summary(
+    tmp_path: Path, summary: str | float | None, expected: int | None
 ) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    if variable is not None:
-        monkeypatch.setenv(variable, ":0")
-    assert has_display() is (variable is not None)
+    text = summary if isinstance(summary, str) else summary_at(summary)
+    (tmp_path / "summary.json").write_text(text)
+    assert opening_time_ns(tmp_path / "recording.rrd") == expected
 
 
-def test_a_browser_is_served_with_a_display_if_no_window_is_wanted(
+def test_the_time_is_sent_until_the_window_has_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On loopback only."""
-    pretend_window(tmp_path, monkeypatch, opens=True)
-    monkeypatch.setenv("DISPLAY", ":0")
+    asked: list[tuple[str, Any]] = []
+
+    class Client:
+        @classmethod
+        def connect(cls, url: str) -> "Client":
+            asked.append(("connect", url))
+            if len(asked) == 1:
+                raise ConnectionError("transport error")
+            return cls()
+
+        def set_time(self, timeline: str, **more: Any) -> None:
+            asked.append((timeline, more))
+            if len(asked) == 3:
+                raise ConnectionError("no active recording to set the time for")
+
+    monkeypatch.setattr(rerun.experimental, "ViewerClient", Client)
+    log, address = tmp_path / "log", "rerun+http://127.0.0.1:1234/proxy"
+    log.write_text(f"Listening. Connect by running `rerun --connect {address}`")
+    with subprocess.Popen(["sleep", "600"]) as window:
+        move_window_to(T_NS, window, log.open("rb"))
+        window.kill()
+    wanted = ("t", {"duration": 4.244, "play_state": "paused"})
+    connected = ("connect", address)
+    assert asked == [connected, connected, wanted, connected, wanted]
+    move_window_to(T_NS, window, log.open("rb"))  # closed: no further request
+    assert len(asked) == 5
+
+
+def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
-    new_view(path).close()
-    with subprocess.Popen(
-        [sys.executable, "-m", "cosim.cli", "view", str(path), "--web"],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
-    ) as child:  # fmt: skip
-        try:
-            assert child.stdout is not None
-            page = next(word for word in child.stdout.readline().split() if "http" in word)
-            assert get(page + RECORDING) == (200, path.read_bytes())
-            assert listening(child) == ["127.0.0.1"] * 2
-        finally:
-            child.send_signal(signal.SIGTERM)
-            assert child.wait() == ExitStatus.TERMINATED
+    path.write_bytes(b"RRF2")
+    with RecordingServer(path, follow=False) as server:
+        page = server.start_page()
+        assert b"openAt" not in get(page)[1]
+        (tmp_path / "summary.json").write_text(summary_at(4.244))
+        assert get(page)[1].endswith(script_to_open_at(T_NS))
+        assert b"openAt" not in get(page + "re_viewer.js")[1]
+
+
+def test_a_loop_without_a_picture_has_a_panel_for_every_coordinate(tmp_path: Path) -> None:
+    """Names with special characters give different entities, too."""
+    path, shown = tmp_path / "recording.rrd", ShownLoop("", ["a/b", "a b", "ψ"], ["u"])
+    with RecordingFile(path, "1", over_time(shown.panels(), 1.0), indexed=True) as file:
+        LoopView(file, shown)
+    entities = {entity for entity in read(path) if entity.startswith("state/")}
+    origins = of_views(read(path, "blueprint"), "ViewBlueprint:space_origin")
+    assert len(entities) == 3
+    assert entities <= {origin.removeprefix("/") for origin in origins}
+
+
+def test_a_display_is_detected_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WAYLAND_DISPLAY", ":0")
+    assert has_display()

@@ -1,22 +1,26 @@
 """The counterexamples, each against a closed form or an independent computation."""
 
 import json
+import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from typer.testing import CliRunner
 
+from cosim.cli import app, command
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.paper import paper_page
 from cosim.studies.paper.paper_evidence import (
     Numbers,
     evidence,
-    open_loop_eigenvalues,
     resolved_draw,
 )
-from cosim.studies.paper.paper_page import _rounded
+from cosim.studies.paper.paper_page import _rounded, render
 from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of
 
@@ -43,16 +47,6 @@ def test_no_draw_exceeds_its_certified_bounds(computed: Numbers) -> None:
     assert 1 < found["representative"]["error"] <= found["representative"]["delta"]
     # eq:tau is smallest at t_i = 0 or as t_i → ∞.
     assert found["theorem_2"]["inter_event_s"][0] <= found["theorem_2"]["first_s"][0]
-
-
-def test_the_double_eigenvalue_at_zero_is_recognised_in_every_plant() -> None:
-    for draw in range(20):
-        loop = loop_of(resolved_draw(SCENARIO, draw, "model"))
-        assert (open_loop_eigenvalues(loop.A) == 0).sum() == 2
-        assert np.linalg.matrix_rank(loop.A) == 3
-        lateral = np.sort(np.linalg.eigvals(loop.A[:2, :2]).real)
-        others = np.sort(open_loop_eigenvalues(loop.A).real)[[0, -1]]
-        np.testing.assert_allclose(others, [lateral[0], max(lateral[1], 0.0)], atol=1e-9)
 
 
 def assert_close(first: Any, second: Any) -> None:
@@ -157,3 +151,43 @@ def test_theorem_3s_equation_is_solved_with_and_without_the_factor(computed: Num
             left = row["norm"] * (np.exp(gamma * delta_s) - 1)
             assert left == pytest.approx(level * np.exp(-0.25 * delta_s), rel=1e-6)
     assert found["rows"][-1]["printed"] > 5 * found["rows"][-1]["derived"]
+
+
+def test_the_page_is_the_template_with_the_committed_numbers() -> None:
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert text == render(COMMITTED)
+    for name in re.findall(r"figures/[\w.-]+", text):
+        assert (ROOT / "docs" / name).stat().st_size > 1000
+
+
+def test_the_committed_campaign_is_complete() -> None:
+    campaign, summary = load(ROOT / "campaigns" / "paper.toml"), COMMITTED["summary"]
+    assert summary["draws"] == campaign.draws >= 1000
+    assert len(summary["points"]) == math.prod(len(axis.labels) for axis in campaign.axes)
+    assert [claim["says"] for claim in summary["claims"]] == [one.says for one in campaign.claims]
+
+
+def test_the_command_runs_the_campaign_and_writes_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "cores", lambda: 1)
+    monkeypatch.setattr(command, "DEFAULT_RUNS", tmp_path / "runs")
+    # test_evidence.py computes it
+    monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
+    done = CliRunner().invoke(app, ["paper", "--draws", "5", "--out", str(tmp_path), "--json"])
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert report["draws"] == 5
+    assert all(Path(file).is_file() for file in report["files"])
+    assert (tmp_path / "runs" / "campaigns" / "paper" / "campaign.html").is_file()
+    written = json.loads((tmp_path / "figures" / "paper.json").read_bytes())
+    assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
+    assert 0 <= written["representative"] < 5
+
+
+def test_a_folder_that_cannot_be_written_gives_one_line_before_any_simulation(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "file").touch()
+    blocked = CliRunner().invoke(app, ["paper", "--out", str(tmp_path / "file")])
+    assert (blocked.exit_code, blocked.stderr.count("\n")) == (1, 1)

@@ -5,8 +5,6 @@ import io
 import json
 import os
 import shutil
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +17,7 @@ from typer.testing import CliRunner
 import noack
 from cosim.cli import app
 from cosim.studies.run_archive import MANIFEST, write_archive
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError
 from noack.protocol.record_tables import OWNER
 
 PLANT = """\
@@ -150,12 +148,6 @@ def damaged(files: Files, path: Path) -> Path:
     return write(path, files | {"summary.json": bytes(content)})
 
 
-def cut(files: Files, path: Path) -> Path:
-    whole = write(path, files).read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    return path
-
-
 def twice(files: Files, path: Path) -> Path:
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("summary.json", files["summary.json"])
@@ -166,10 +158,6 @@ def twice(files: Files, path: Path) -> Path:
 
 def renamed(name: str) -> Callable[[Files, Path], Path]:
     return lambda files, path: write(path, checked(files | {name: b"x"}))
-
-
-def with_manifest(content: bytes) -> Callable[[Files, Path], Path]:
-    return lambda files, path: write(path, files | {MANIFEST: content})
 
 
 def with_claim(key: str, value: str) -> Callable[[Files, Path], Path]:
@@ -208,16 +196,13 @@ def fifo(files: Files, path: Path) -> Path:
 
 HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
     "traversal": (renamed("../../evil"), "not the name of a file in a run directory"),
-    "inner traversal": (renamed("record/../../evil"), "not the name of a file"),
     "absolute": (renamed("/etc/evil"), "not the name of a file in a run directory"),
     "drive": (renamed("C:\\evil"), "not the name of a file in a run directory"),
     "control characters": (renamed("record/\x1b[31m"), "not the name of a file"),
     "deep": (renamed("record/a/b"), "an archive has no such file"),
-    "other folder": (renamed(".git/config"), "an archive has no such file"),
     "compressed": (compressed, "is compressed; noack's archives are not"),
     "overlapping": (overlapping, "its entries overlap"),
     "damaged": (damaged, "summary.json: is damaged: its SHA-256 is not that of archive.json"),
-    "cut": (cut, "not an archive of a run: File is not a zip file"),
     "twice": (twice, "summary.json: is there twice"),
     "extra file": (
         lambda files, path: write(path, files | {"record/more": b""}), "do not have the same files"
@@ -231,9 +216,10 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
         ),
         "has no scenario.toml",
     ),
-    "manifest is no JSON": (with_manifest(b"\xff"), "archive.json: content: Invalid JSON"),
-    "another format": (with_manifest(b'{"format": "2"}'), "archive.json: format: Input should be"),
-    "deep JSON": (with_manifest(b"[" * 100_000), "archive.json: content: Invalid JSON"),
+    "deep JSON": (
+        lambda files, path: write(path, files | {MANIFEST: b"[" * 100_000}),
+        "archive.json: content: Invalid JSON",
+    ),
     "another kind": (with_claim("kind", "live"), "describes another run than the archive contains"),
     "another name": (with_claim("scenario", "\x1b[31mred"), "describes another run"),
     "rows without end": (with_rows, "plant_step.parquet: has 5,000,000 rows; a run of this"),
@@ -273,18 +259,3 @@ def test_code_runs_only_on_request_and_only_from_the_archive(tmp_path: Path) -> 
     path = write(path, checked(files | {"scenario.toml": elsewhere}))
     with pytest.raises(CallerError, match=r"names .*moved\.py, which is not in the archive"):
         noack.reproduce(path, run_code=True)
-
-
-def test_a_repetition_that_is_terminated_leaves_no_folder(archive: Path, tmp_path: Path) -> None:
-    """The signal comes while the run is repeated."""
-    code = (
-        "import os, signal, sys, tempfile; tempfile.tempdir = sys.argv[2];"
-        "from cosim.studies import run_archive as module;"
-        "module.simulate_run = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM);"
-        "from cosim.cli import app; app(['reproduce', sys.argv[1]])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, archive, tmp_path], capture_output=True, check=False
-    )
-    assert done.returncode == ExitStatus.TERMINATED, done.stderr
-    assert not list(tmp_path.iterdir())

@@ -1,7 +1,6 @@
-"""Campaigns of the library give what the command writes."""
+"""Campaigns and certificates of the library give what the commands write."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,8 +66,43 @@ def test_what_is_not_there_is_named(found: noack.CampaignResult) -> None:
         noack.campaign({**PLAN, "axes": []})
 
 
-def test_a_campaign_in_a_folder_is_continued(tmp_path: Path) -> None:
-    first = noack.campaign(PLAN, folder=tmp_path / "kept", workers=1)
-    again = noack.campaign(PLAN, folder=tmp_path / "kept", workers=1)
-    assert again.estimates().equals(first.estimates())
-    assert again._finished.made == 0
+def test_a_system_is_certified(scenario: noack.Scenario) -> None:
+    found = noack.certify(scenario)
+    for certificate in (found.paper, found.schedule):
+        assert certificate.void is None
+        assert certificate.constants is not None
+        assert certificate.constants.delta >= 1
+        assert certificate.constants.state >= 0.2
+        assert certificate.inter_event_s is not None
+    assert found.paper_box is None
+    assert found.schedule_box is None
+    assert found.limits.sampling_s > 0.002
+    assert found.theorem_2 is not None
+    assert found.weight is None
+    assert json.loads(json.dumps(found.to_json()))["scenario"] == "own_system"
+
+
+def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
+    box = {"plant.uncertainty_A": [[0.0, 0.0], [0.3, 0.1]]}
+    found = noack.certify(noack.with_settings(scenario, box), late=0)
+    assert found.paper_box is not None
+    assert found.schedule_box is not None
+    assert found.paper_box.constants is not None
+    for shown in (repr(found), found._repr_html_()):
+        assert "schedule, box" in shown
+        assert f"{found.paper_box.constants.delta:.4g}" in shown
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("double_integrator", {"weight": "best"}, "weight: given, identity or chosen, not"),
+        ("double_integrator", {"late": -1}, "late: -1 steps; give 0 to 1000"),
+        ("cart_pole", {}, "the plant is not linear"),
+    ],
+)
+def test_a_missing_certificate_gives_one_line(
+    name: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(noack.NoackError, match=message):
+        noack.certify(name, **options)

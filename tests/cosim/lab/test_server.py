@@ -1,0 +1,358 @@
+"""The page's server without a browser: what it computes, whom it answers, its live runs."""
+
+import asyncio
+import gc
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Awaitable, Callable, MutableMapping
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import urlsplit
+
+import pytest
+
+pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
+
+from cosim.interactive.draft import open_draft
+from cosim.interactive.exploration_figure import CERTIFICATE
+from cosim.interactive.scenario_guarantee import Margin
+from cosim.lab import lab_server, lab_services, live_run
+from cosim.lab.lab_server import AddressGuard, LabOptions
+from cosim.lab.lab_services import LabServices, PageCalls, Session
+from cosim.lab.live_run import LiveRun
+from tests.integration import conftest as live
+
+
+class Inline:
+    """Computes in this process."""
+
+    async def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Session]:
+    monkeypatch.setattr(lab_services, "explore_ensemble", lambda scenario: None)
+    monkeypatch.setattr(lab_services, "margin_of", lambda scenario: Margin("stable", (), True))
+    monkeypatch.setattr(lab_services, "_QUIET_S", 0.0)
+    monkeypatch.setattr(lab_services, "_MARGIN_S", 0.0)
+    return []
+
+
+def session_of(name: str, drawn: list[Session], calls: object = None, **settings: Any) -> Session:
+    draft = open_draft(name)
+    for key, value in settings.items():
+        draft = draft.with_value(key.replace("__", "."), value)
+
+    async def on_drawn() -> None:
+        drawn.append(found)
+        # What is there is not waited for any more.
+        assert not known(found, CERTIFICATE) or "certificate" not in found.pending
+        await asyncio.sleep(0)  # as the browser's answer is awaited
+
+    found = Session(cast("PageCalls", calls or Inline()), draft, on_drawn)
+    return found
+
+
+def known(session: Session, name: str) -> bool:
+    return session.results is not None and name in session.results.known
+
+
+async def settled(found: Session) -> None:
+    await found.change(found.draft)
+    assert found._later is not None
+    await found._later
+
+
+class Watched(Inline):
+    """Notes what the page shows when a computation begins."""
+
+    def __init__(self) -> None:
+        self.session: Session | None = None
+        self.begun: list[tuple[str, bool]] = []
+
+    async def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        assert self.session is not None
+        while not self.session.pending.endswith("waiting for the processor"):
+            await asyncio.sleep(0)
+        self.begun.append((self.session.pending, known(self.session, CERTIFICATE)))
+        return await super().compute(function, *arguments)
+
+
+def test_the_certificate_is_shown_before_the_bands_and_waiting_is_said(
+    drawn: list[Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lab_services, "_SLOW_S", 0.0)
+    calls = Watched()
+    found = calls.session = session_of("lane_following", drawn, calls, horizon_s=2.0)
+    asyncio.run(settled(found))
+    assert calls.begun == [
+        ("certificate: waiting for the processor", False),
+        ("bands: waiting for the processor", True),
+        ("margin: waiting for the processor", True),
+    ]
+    assert found.pending == ""
+
+
+def test_of_many_changes_the_newest_is_drawn(drawn: list[Session]) -> None:
+    found = session_of("lane_following", drawn, horizon_s=2.0)
+
+    async def drag() -> None:
+        values = [0.1 * step for step in range(1, 9)]
+        drafts = [found.draft.with_value("trigger.beta", value) for value in values]
+        await asyncio.gather(*map(found.change, drafts))
+
+    asyncio.run(drag())
+    assert found.results is not None
+    assert found.results.run.scenario.trigger.beta == pytest.approx(0.8)
+    assert len(drawn) <= 4
+
+
+def with_services(use: Callable[[LabServices], Awaitable[Any]], folder: Path) -> Any:
+    unhandled = list[dict[str, Any]]()
+
+    async def run() -> Any:
+        asyncio.get_running_loop().set_exception_handler(lambda _, what: unhandled.append(what))
+        with LabServices("lane_following", folder, folder / "runs") as services:
+            return await asyncio.wait_for(use(services), live.PATIENCE_S)
+
+    found = asyncio.run(run())
+    gc.collect()  # the loop hears of exceptions that nobody asked for when they are removed
+    assert unhandled == []
+    return found
+
+
+def test_a_closed_page_gives_up_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lab_services, "_GIVE_UP_S", 0.0)
+    begun = tmp_path / "begun"
+
+    async def use(services: LabServices) -> int:
+        closed, other = PageCalls(services), PageCalls(services)
+        given_up = [
+            asyncio.create_task(closed.compute(time.sleep, 1e6)),
+            asyncio.create_task(closed.compute(begun.touch)),
+        ]
+        wanted = asyncio.create_task(other.compute(int, "7"))
+        while not services._turn.locked():  # the first of them is begun
+            await asyncio.sleep(0)
+        closed.give_up()
+        found = await asyncio.gather(*given_up, return_exceptions=True)
+        assert [type(one) for one in found] == [asyncio.CancelledError] * 2
+        return await wanted
+
+    assert with_services(use, tmp_path) == 7
+    assert not begun.exists()
+
+
+def test_the_newest_run_that_has_ended_is_known(tmp_path: Path) -> None:
+    for name in ("1", "2"):
+        (folder := tmp_path / "runs" / name).mkdir(parents=True)
+        (folder / "scenario.toml").touch()
+    (tmp_path / "runs" / "1" / "summary.json").touch()
+    with LabServices("lane_following", tmp_path, tmp_path / "runs") as services:
+        assert services.recorded() == ["2", "1"]
+        assert [services.has_ended(name) for name in services.recorded()] == [False, True]
+
+
+def test_mistakes_leave_no_run(drawn: list[Session]) -> None:
+    found = session_of("lane_following", drawn)
+    asyncio.run(found.change(found.draft.with_text(found.draft.text + "\nbeta = 1\n")))
+    assert found.results is None
+    assert found.mistakes
+
+
+SECRET, OPENING = "s" * 43, "o" * 43
+
+
+def answer(kind: str, path: str, **headers: str) -> list[MutableMapping[str, Any]]:
+    """What a request is answered with."""
+    sent: list[MutableMapping[str, Any]] = []
+
+    async def inner(scope: Any, receive: Any, send: Any) -> None:
+        assert scope["root_path"] == f"/{SECRET}"
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    async def receive() -> MutableMapping[str, Any]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message)
+
+    given = [(name.encode(), value.encode()) for name, value in headers.items()]
+    scope = {
+        "type": kind, "path": path, "headers": given, "query_string": b"a=1",
+        "client": ("127.0.0.1", 4711), "server": ("127.0.0.1", 8765),
+    }  # fmt: skip
+    asyncio.run(AddressGuard(inner, SECRET, OPENING)(scope, receive, send))
+    return sent
+
+
+OWN = f"/{SECRET}/"
+HOST = {"host": "127.0.0.1:8765"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "headers", "status"),
+    [
+        ("http", OWN, HOST, 200),
+        ("http", "/", HOST, 404),
+        ("http", f"/{SECRET[:-1]}/", HOST, 404),
+        ("http", f"/{SECRET}x/", HOST, 404),
+        ("http", OWN, {}, 403),
+        ("http", OWN, {"host": "evil.example:8765"}, 403),
+        ("http", OWN, {"host": "127.0.0.1.evil.example"}, 403),
+        ("http", OWN, HOST | {"origin": "http://evil.example"}, 403),
+        ("http", OWN, HOST | {"origin": "http://127.0.0.1:9999"}, 403),
+        ("http", OWN, HOST | {"origin": "null"}, 403),
+        ("websocket", OWN, HOST, None),
+        ("websocket", OWN, HOST | {"origin": "http://evil.example"}, None),
+    ],
+)
+def test_only_the_page_itself_is_answered(
+    kind: str, path: str, headers: dict[str, str], status: int | None
+) -> None:
+    first, *_ = answer(kind, path, **headers)
+    assert first.get("status") == status
+    assert (first["type"] == "websocket.close") == (status is None)
+    if status == 200:
+        names = {name for name, _ in first["headers"]}
+        assert {b"content-security-policy", b"x-frame-options", b"referrer-policy"} <= names
+
+
+@pytest.mark.parametrize("user", [os.getuid(), os.getuid() + 1, None])
+def test_the_address_on_a_command_line_is_for_processes_of_this_user(
+    user: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every user can read command lines."""
+    asked = []
+    monkeypatch.setattr(lab_server, "socket_user", lambda *of: asked.append(of) or user)
+    first, _ = answer("http", f"/{OPENING}/", host="127.0.0.1:8765")
+    assert asked == [(("127.0.0.1", 4711), ("127.0.0.1", 8765))]
+    if user == os.getuid():
+        assert first["status"] == 303
+        assert dict(first["headers"])[b"location"] == f"/{SECRET}/?a=1".encode()
+    else:
+        assert first["status"] == 404
+        assert SECRET not in str(first)
+
+
+def test_the_browser_is_started_with_the_address_for_command_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened, announced = list[str](), list[str]()
+
+    def open_page(address: str) -> None:
+        opened.append(address)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(lab_server.webbrowser, "open", open_page)
+    options = LabOptions("lane_following", "", tmp_path, tmp_path / "runs", 0, open_browser=True)
+    lab_server.serve(options, announced.append)
+    (page,), (line) = announced, opened[0]
+    assert urlsplit(page).netloc == urlsplit(line).netloc
+    assert urlsplit(page).path != urlsplit(line).path
+
+
+def said(run: LiveRun, what: str, **fields: object) -> None:
+    run._take(json.dumps({"what": what, **fields}))
+
+
+REPORT = {
+    "t_s": 1.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 0.5,
+    "live": None, "warnings": [], "changes": [],
+}  # fmt: skip
+
+
+def test_the_states_follow_each_other() -> None:
+    run = LiveRun(20.0)
+    assert run.state == "starting"
+    said(run, "started", run_dir="/runs/one")
+    assert (run.state, run.run_dir) == ("running", Path("/runs/one"))
+    live = "live view: http://127.0.0.1:1234/secret/"
+    for changes in ([], ["M 3"]):  # each warning is shown once
+        said(run, "progress", **REPORT | {"warnings": ["void"], "changes": changes, "live": live})
+    assert run.lines == ["all processes run", "void", "changed: M 3"]
+    assert run.viewer == "http://127.0.0.1:1234/secret/"
+    said(run, "finalising", reason="horizon")
+    assert run.state == "finalising"
+    assert not run.is_over
+    lines = [["completed 20 s", "green"], ["3 transmissions, 2 delivered", ""]]
+    said(run, "ended", run_dir="/runs/one", reason="horizon", ok=True, verdict=lines)
+    assert run.is_over
+    assert run.ok
+    assert run.progress is not None
+    assert run.progress.events == 3
+    assert run.verdict == [("completed 20 s", "green"), ("3 transmissions, 2 delivered", "")]
+    failed = LiveRun(20.0)
+    said(failed, "error", text="the port is taken")
+    assert failed.is_over
+    assert failed.ok is False
+    assert failed.lines == ["the port is taken"]
+
+
+@pytest.mark.parametrize("line", ["", "compiling ...", "{", "[1]", '{"x": 1}', "7"])
+def test_other_output_is_a_line_of_the_log(line: str) -> None:
+    run = LiveRun(20.0)
+    run._take(line)
+    assert run.lines == [line] * bool(line)
+    assert run.state == "starting"
+
+
+def test_a_run_writes_nothing_beside_the_scenario_and_reads_the_files_there(
+    tmp_path: Path,
+) -> None:
+    """Another user may replace what is written there, or place links before."""
+    folder, private = tmp_path / "shared", tmp_path / "private"
+    folder.mkdir()
+    private.write_text("precious")
+    draft = open_draft("saturated_lqr").with_value("horizon_s", 0.5)
+    shutil.copy(draft.folder / "saturated_lqr.py", folder)
+    (folder / f".lab-{os.getpid()}.toml").symlink_to(private)
+    before = folder.stat().st_mtime_ns  # changes if a file is made, renamed or removed
+
+    async def run() -> LiveRun:
+        live = LiveRun(0.5)
+        await live.start(draft.text, folder, tmp_path / "runs")
+        await live.follow()
+        return live
+
+    live = asyncio.run(run())
+    assert live.state == "ended", live.lines
+    assert folder.stat().st_mtime_ns == before
+    assert private.read_text() == "precious"
+
+
+STUBBORN = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(("state", "status"), [("running", -signal.SIGKILL), ("finalising", 0)])
+def test_a_loop_that_does_not_end_is_killed_but_not_its_check(
+    state: str, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_run, "_STOP_S", 0.0)
+
+    async def end() -> int | None:
+        run = LiveRun(20.0)
+        run._process = process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", STUBBORN, stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        assert process.stdin is not None
+        assert process.stdout is not None
+        await process.stdout.readline()
+        run.state = state
+        if state == "finalising":
+            asyncio.get_running_loop().call_later(0.2, process.stdin.close)
+        await run.end()
+        return process.returncode
+
+    assert asyncio.run(end()) == status

@@ -1,0 +1,277 @@
+"""Draws, and the measures of their runs in virtual time, of one loop and of several."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from cosim.analysis.run_summary import summarise
+from cosim.record.run_record import RunRecord
+from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.virtual_time import simulate, simulate_loops
+from cosim.studies.campaign.campaign_grid import row_type
+from cosim.studies.campaign.random_draws import box_of, drawn_scenario, seeds_of
+from cosim.studies.campaign.sampled_draws import (
+    LOOPS_ROW,
+    SampledWork,
+    SharedNetworkWork,
+    in_virtual_time,
+)
+from noack.core.errors import CallerError, ExitStatus
+from noack.impairments.kinds.replay import Replay
+from noack.impairments.loss_models.lossless import NoLoss
+from noack.scenario.resolution import loop_of
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
+from noack.scenario.scenario_file import load as load_scenario
+from tests.cosim.studies.campaign.conftest import Few, Write, few_of
+from tests.oracles.link import update_link_of
+
+SHIPPED = Path(__file__).parents[4] / "scenarios"
+COARSE = ("horizon_s=4.0", "plant.rate_hz=50.0", "controller.rate_hz=50.0")
+SPREAD = "plant.initial_state_halfwidth=[0.5, 0.1, 0.1, 2.0]"
+LATE = 'network.impairments=[{kind = "delay", delay_s = 0.03}]'
+NEVER = (
+    "network.protocol=ack",
+    "network.acknowledgements.loss.model=bernoulli",
+    "network.acknowledgements.loss.probability=1.0",
+)
+
+
+def scenario(*overrides: str) -> Scenario:
+    return load_scenario(SHIPPED / "lane_following.toml", [*COARSE, SPREAD, *overrides])
+
+
+def work(*overrides: str, **changed: Any) -> SampledWork:
+    settings: dict[str, Any] = {"Q": None, "R": None, "settle": 0.5, "most_events": 1000}
+    return SampledWork(in_virtual_time(scenario(*overrides)), 7, **settings | changed)
+
+
+def record_of(one: SampledWork, draw: int) -> RunRecord:
+    return simulate(drawn_scenario(one.scenario, one.seed, draw))
+
+
+@pytest.mark.parametrize("overrides", [(), (LATE,), NEVER, ("mode=zoh",)])
+def test_a_row_agrees_with_the_summary_of_the_run(overrides: tuple[str, ...]) -> None:
+    one = work(*overrides)
+    for draw, row in enumerate(one.run(range(2))):
+        record = record_of(one, draw)
+        expected = summarise(record, ExitStatus.OK, "").to_json()
+        assert row["status"] == OK
+        assert row["transmissions"] == expected["events"]
+        assert row["deliveries"] == expected["deliveries"]
+        assert row["final_norm"] == pytest.approx(expected["final_state_norm"], rel=1e-12)
+        shortest_s = math.nan if expected["events"] < 2 else expected["inter_event_min_s"]
+        assert row["inter_event_min_s"] == pytest.approx(shortest_s, rel=1e-12, nan_ok=True)
+        norms = np.linalg.norm(record["plant_step"]["x"], axis=1)
+        last_s = record["plant_step"]["t_ns"][norms > 0.5 * norms[0]][-1] * 1e-9
+        settled_s = last_s if norms[-1] <= 0.5 * norms[0] else math.nan
+        assert row["settling_s"] == pytest.approx(settled_s, nan_ok=True)
+        # e^{0.25 t} grows from 1 to e over the horizon.
+        assert expected["sup_e_c_norm"] <= row["sup_e_c_scaled"] <= np.e * expected["sup_e_c_norm"]
+
+
+GUSTS = (
+    'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
+    ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
+)
+
+
+@pytest.mark.parametrize("overrides", [(), (GUSTS,)])
+def test_the_cost_is_the_integral_under_the_held_inputs(overrides: tuple[str, ...]) -> None:
+    """Disturbances enter the cost only through the state."""
+    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.diag([0.5, 0.25])
+    one = work("horizon_s=0.1", *overrides, Q=Q, R=R)
+    (row,) = one.run(range(1))
+    record = record_of(one, 0)
+    cost = 0.0
+    for step in record["plant_step"][:-1]:
+        d, w = (step["d"], step["w"]) if overrides else (0.0, 0.0)
+        drift = np.zeros((5, 5))
+        drift[:4, :4], drift[:4, 4] = record.loop.A, record.loop.B @ (step["u"] + d) + w
+
+        def rate(s: float, z: Any, G: Any) -> float:
+            x = (expm(G * s) @ z)[:4]
+            return float(x @ Q @ x)
+
+        of_x = partial(rate, z=np.append(step["x"], 1.0), G=drift)
+        cost += quad_vec(of_x, 0.0, 0.02, epsrel=1e-12)[0] + 0.02 * step["u"] @ R @ step["u"]
+    assert row["cost"] == pytest.approx(cost, rel=1e-10)
+
+
+def test_a_nonlinear_plant_is_drawn_and_its_cost_is_a_sum() -> None:
+    given = load_scenario(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
+    one = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
+    (row,) = one.run(range(1))
+    record = record_of(one, 0)
+    steps = record["plant_step"]
+    assert row["status"] == OK
+    assert not record.scenario.coverage.is_linear
+    of_x = (steps["x"] ** 2).sum(axis=1)
+    expected = np.trapezoid(of_x, dx=0.005) + 0.005 * (steps["u"][:-1] ** 2).sum()
+    assert row["cost"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_failed_run_has_the_status_of_its_failure() -> None:
+    growing = "model.gain=[[0, 0, 0, 0], [0, 0, 0, 0]]"
+    (row,) = work(
+        growing, "model.allow_unstable=true",
+        "horizon_s=2000.0", "plant.rate_hz=5.0", "controller.rate_hz=5.0",
+    ).run(range(1))  # fmt: skip
+    assert row["status"] == DIVERGED
+    assert 0 < row["diverged_at_s"] < 2000
+    assert np.isnan(row["cost"])
+    (row,) = work("mode=zoh", most_events=2).run(range(1))
+    assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
+
+
+AXIS = {"name": "number", "key": "loops", "values": [1, 3]}
+
+
+def shared_work(*overrides: str, **settings: Any) -> SharedNetworkWork:
+    scenario = in_virtual_time(
+        load_scenario(SHIPPED / "shared_bottleneck.toml", ["horizon_s=2.0", *overrides])
+    )
+    measured: dict[str, Any] = {"Q": None, "R": None, "settle": 0.5, "most_events": 1000}
+    return SharedNetworkWork(scenario, 7, **measured | settings)
+
+
+def test_a_row_agrees_with_the_summaries_of_the_loops() -> None:
+    one = shared_work("network.impairments=[]", judges=True)
+    rows = one.run(range(2))
+    assert rows.dtype == LOOPS_ROW
+    seeds = seeds_of(one.seed, 1)
+    shared = simulate_loops(one.scenario.model_copy(update={"seeds": seeds}))
+    loops = [summarise(record, 0, "").to_json() for record in shared.loops]
+    row = rows[1]
+    assert row["transmissions"] == sum(loop["events"] for loop in loops) != rows[0]["transmissions"]
+    assert row["deliveries"] == sum(loop["deliveries"] for loop in loops)
+    assert row["longest_loss_burst"] == max(loop["longest_loss_burst"] for loop in loops)
+    assert row["final_norm"] == pytest.approx(max(loop["final_state_norm"] for loop in loops))
+    assert 0 < row["cost"] < row["cost_worst"]
+    assert row["loops_failed"] == 0
+    assert 0 <= row["loops_claims_held"] <= 1
+
+
+def test_a_loop_that_diverges_costs_an_infinite_amount_and_is_counted() -> None:
+    own = "A = [[0.0, 1.0], [900.0, 0.0]], B = [[0.0], [1.0]]"
+    wild = f'{{ name = "wild", plant = {{ draw = "given", {own} }} }}'
+    one = shared_work(
+        "horizon_s=30", f'loops=[{{ name = "calm", count = 3 }}, {wild}]', most_events=400
+    )
+    (row,) = one.run(range(1))
+    assert row["loops_failed"] == 0.25
+    assert np.isnan(row["cost"])
+    assert np.isnan(row["loops_claims_held"])
+
+
+def test_the_number_of_loops_is_an_axis(write: Write, plan: dict[str, Any]) -> None:
+    sampled: dict[str, Any] = {"time": "sampled", "compare": None, "figures": []}
+    _, points = few_of(write(plan, axes=[AXIS], **sampled))
+    assert [point.scenario.loops[0].count for point in points] == [1, 3]
+    assert row_type(points) == LOOPS_ROW
+    assert [type(point.work) for point in points] == [SharedNetworkWork, SharedNetworkWork]
+    with pytest.raises(CallerError, match='needs time = "sampled"'):
+        few_of(write(plan, axes=[AXIS], **sampled | {"time": "continuous"}))
+    some = {"name": "some", "variants": {"one": {"mode": "zoh"}, "two": {"loops": 2}}}
+    with pytest.raises(CallerError, match="either all grid points have loops, or none has"):
+        few_of(write(plan, axes=[some], **sampled))
+
+
+def test_different_loops_keep_their_proportions(write: Write, plan: dict[str, Any]) -> None:
+    """The number of loops applies after all other settings."""
+    loops = [{"name": "a", "count": 4}, {"name": "b", "count": 2, "mode": "zoh"}]
+    sampled: dict[str, Any] = {"time": "sampled", "compare": None, "figures": []}
+
+    def axes(*numbers: int) -> list[dict[str, Any]]:
+        variants = {f"v{value}": {"loops": value} for value in numbers}
+        own = {"slow": {"loops.1.plant": {"initial_state": [2.0, 0.0]}}, "same": {"loops": loops}}
+        return [{"name": "number", "variants": variants}, {"name": "own", "variants": own}]
+
+    settings = {"loops": loops}
+    _, points = few_of(write(plan, axes=axes(3, 9), settings=settings, **sampled))
+    found = [[(one.name, one.count) for one in point.scenario.loops] for point in points[::2]]
+    assert found == [[("a", 2), ("b", 1)], [("a", 6), ("b", 3)]]
+    assert points[0].scenario.loops[1].plant == {"initial_state": [2.0, 0.0]}
+    rows = points[0].work.run(range(1))
+    assert row_type(points) == rows.dtype
+    mean = (2 * rows["cost_of_a"] + rows["cost_of_b"]) / 3
+    assert rows["cost"] == pytest.approx(mean, rel=1e-12)
+    with pytest.raises(CallerError, match="should be a multiple of 3"):
+        few_of(write(plan, axes=axes(3, 4), settings=settings, **sampled))
+
+
+def with_plant(scenario: Scenario, **changed: object) -> Scenario:
+    plant = scenario.plant.model_copy(update=changed)
+    return scenario.model_copy(update={"plant": plant})
+
+
+def test_draws_depend_neither_on_the_chunk_nor_on_the_grid_point(campaign: Few) -> None:
+    first, *others = (point.work.box for point in campaign[1])
+    whole = first.population(11, range(9))
+    parts = [(slice(3, 5), first.population(11, range(3, 5)))]
+    parts += [(slice(0, 9), box.population(11, range(9))) for box in others]
+    for place, part in parts:
+        for found, expected in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(found, expected[place])
+    assert first.population(11, range(10**8, 10**8 + 1)).x0.shape == (1, 2)
+
+
+def test_draws_are_uniform_in_the_box(campaign: Few) -> None:
+    point = campaign[1][0]
+    found = point.work.box.population(11, range(20_000))
+    centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2
+    off = found.A[:, 1, 0] - centre.A[1, 0]
+    assert np.abs(off).max() <= half
+    # The standard deviation of a mean of 20,000 is below 0.001, that of a variance below 0.0001.
+    assert abs(off.mean()) < 0.005
+    assert off.var() == pytest.approx(half**2 / 3, abs=0.0005)
+    np.testing.assert_array_equal(found.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
+    pairs = np.column_stack([off, found.A[:, 1, 1], found.x0, found.loss_seeds.astype(float)])
+    correlation = np.corrcoef(pairs.T) - np.eye(5)
+    assert np.abs(correlation).max() < 0.04  # 5.6 standard deviations
+    assert len(set(found.loss_seeds.tolist())) == 20_000
+
+
+def test_vertex_draws_are_corners_and_nominal_and_given_plants_are_constant(campaign: Few) -> None:
+    scenario = campaign[1][0].scenario
+    vertices = box_of(with_plant(scenario, draw="vertex")).population(0, range(200)).A
+    assert set(np.round(vertices[:, 1, 0], 12)) == {-0.2, 0.2}
+    nominal = box_of(with_plant(scenario, draw="nominal")).population(0, range(5)).A
+    assert (nominal == nominal[0]).all()
+    A, B = ((5.0, 1.0), (0.0, 2.0)), ((3.0,), (1.0,))
+    given = box_of(with_plant(scenario, draw="given", A=A, B=B)).population(0, range(5))
+    assert (np.array(A) == given.A).all()
+    assert (np.array(B) == given.B).all()
+
+
+def test_a_draw_of_a_campaign_can_be_run_as_a_scenario(campaign: Few) -> None:
+    plan, points = campaign
+    for point in points:
+        for draw, row in enumerate(point.work.run(range(4))):
+            alone = drawn_scenario(point.scenario, plan.seed, draw)
+            run = run_continuous(alone)
+            assert row["transmissions"] == len(run.event_s)
+            assert row["deliveries"] == run.delivered.sum()
+            end = run.at([alone.horizon_s]).x[0]
+            assert row["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
+
+
+def test_each_draw_has_its_own_window_of_a_trace() -> None:
+    scenario = load(Path(__file__).parents[4] / "scenarios/lane_following.toml")
+    steps_ns = tuple(k * 10**6 for k in range(1000))
+    one = Replay(sent_ns=steps_ns, delays_ns=steps_ns, offset_s="random")
+    network = scenario.network.model_copy(update={"loss": NoLoss(), "impairments": (one,)})
+    scenario = scenario.model_copy(update={"network": network})
+    begins_ms = [
+        update_link_of(drawn_scenario(scenario, 5, draw)).decide(0, 1, 0).release_ns // 10**6
+        for draw in range(40)
+    ]
+    assert len(set(begins_ms)) > 30
+    assert min(begins_ms) < 200 < 800 < max(begins_ms)

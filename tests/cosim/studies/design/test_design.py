@@ -1,0 +1,327 @@
+"""``noack design``: the chosen design meets the limits, and is written as a valid scenario."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from cosim.cli import app
+from cosim.simulation.continuous import run_continuous
+from cosim.simulation.exact_simulation import run_batch, setting_of
+from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.design_search import (
+    DesignLimits,
+    DesignResult,
+    design,
+    measure,
+    require_draws,
+)
+from cosim.studies.design.design_space import families_of, lqr_gain
+from noack.core.errors import CallerError
+from noack.core.linear_systems import spectral_abscissa
+from noack.scenario.named_models import lane_following
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import dumps, load
+from noack.theory.certificates.conditions import ideal_conditions
+from noack.theory.certificates.scenario_certificates import certify_box
+from tests.cosim.studies.design.conftest import LIMITS
+
+ONE = """
+name = "one"
+horizon_s = 10.0
+[model]
+A = [[1.0]]
+B = [[1.0]]
+gain = [[-3.0]]
+[plant]
+initial_state = [1.0]
+[trigger]
+beta = 0.5
+alpha_per_s = 0.25
+[network]
+mansd = 2
+loss = { model = "worst_case" }
+"""
+Design = Callable[..., Result]
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Path:
+    path = tmp_path / "one.toml"
+    path.write_text(ONE)
+    return path
+
+
+@pytest.fixture
+def run_design(tmp_path: Path) -> Design:
+    """Runs the command with few draws; its page is ``p.html``."""
+
+    def run(scenario: Path, *words: str) -> Result:
+        defaults = ("--settling", "9", "--quantile", "0.5", "--draws", "20", "--weights",
+                    "identity", "--page", str(tmp_path / "p.html"))  # fmt: skip
+        return CliRunner().invoke(app, ["design", str(scenario), *defaults, *words])
+
+    return run
+
+
+def paper_certificate(path: Path) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["certify", str(path), "--json"])
+    assert result.exit_code == 0
+    found = json.loads(result.stdout)["certificates"]
+    return [one for one in found if one["under"] == "paper"][-1]
+
+
+def test_check_and_certify_accept_the_written_scenario(
+    mass: Path, tmp_path: Path, run_design: Design
+) -> None:
+    out = tmp_path / "chosen.toml"
+    result = run_design(
+        mass, "--quantile", "0.8", "--draws", "80", "--gain", "lqr", "--R", "[2.0]",
+        "--out", str(out), "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    best = found["best"]
+    assert found["confirmed"]
+    assert found["files"] == [str(tmp_path / "p.html"), str(out)]
+    scale = float(best["gain"].rpartition(" ")[2])
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    K = lqr_gain(A, B, np.eye(2), np.array([[2.0 * scale]]))
+    np.testing.assert_array_equal(best["K"], K)
+    checked = CliRunner().invoke(app, ["check", str(out), "--json"])
+    assert checked.exit_code == 0
+    scenario = json.loads(checked.stdout)
+    assert scenario["model"]["gain"] == best["K"]
+    assert scenario["trigger"]["beta"] == best["beta"]
+    assert scenario["trigger"]["alpha_per_s"] == best["alpha_per_s"]
+    certificate = paper_certificate(out)
+    assert "box" in certificate["scope"]
+    assert certificate["constants"]["state"] == pytest.approx(best["bounds"]["state"])
+
+
+def test_a_chosen_norm_and_gain_are_certified_as_written(
+    one: Path, tmp_path: Path, run_design: Design
+) -> None:
+    out = tmp_path / "chosen.toml"
+    result = run_design(
+        one, "--settling", "4", "--quantile", "0.7", "--draws", "40", "--gain", "lqr",
+        "--weights", "chosen", "--bound", "error=0.3", "--bound", "state=2",
+        "--out", str(out), "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    best = json.loads(result.stdout)["best"]
+    assert best["weight"] == "chosen"
+    assert best["W"] == [list(row) for row in load(out).decaying.weight or ()]
+    delta = paper_certificate(out)["constants"]["delta"]
+    assert best["bounds"]["error"] == pytest.approx(delta * best["beta"] / abs(best["W"][0][0]))
+    assert best["bounds"]["error"] <= 0.3
+    assert best["bounds"]["state"] <= 2
+
+
+@pytest.mark.parametrize(
+    ("words", "table"),
+    [
+        (["--settling", "1"], True),
+        (["--settle", "1e-9"], False),  # no run settles
+        (["--set", "plant.initial_state=[1e300, 0.0]"], False),  # beyond 1e100: diverged
+    ],
+)
+def test_limits_that_cannot_be_met_give_a_page_and_one_line(
+    mass: Path, tmp_path: Path, run_design: Design, words: list[str], table: bool
+) -> None:
+    out = tmp_path / "chosen.toml"
+    result = run_design(mass, *words, "--out", str(out))
+    assert result.exit_code == 1
+    assert not out.exists()
+    assert result.stderr.startswith("noack: no design meets the limits; the closest has a settling")
+    assert result.stderr.count("\n") == 1
+    assert ("trade-off" in result.stdout) == table
+    html = (tmp_path / "p.html").read_text()
+    assert "<svg" in html
+    assert not re.findall(r"<script|<link|(?:src|href)=\"(?!#|data:)", html)
+
+
+UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "words", "expected"),
+    [
+        ("mass", ["--settling", "30"], "beyond horizon_s = 20"),
+        ("mass", ["--settling", "-1"], "--settling: must be positive"),
+        ("mass", ["--quantile", "1"], "between 0 and 1"),
+        ("mass", ["--settle", "1"], "--settle: must be between 0 and 1"),
+        ("mass", ["--under", "theory"], "--under: paper or schedule"),
+        ("mass", ["--bound", "gain=3"], "write it as state=X or error=X"),
+        ("mass", ["--bound", "state=x"], "write it as state=X or error=X"),
+        ("mass", ["--bound", "error=1", "--bound", "error=2"], "error is given twice"),
+        ("mass", ["--weights", "best"], "identity, given, chosen"),
+        ("mass", ["--weights", ""], "name one at least of identity"),
+        ("mass", ["--Q", "[1, 1]"], "for --gain lqr only"),
+        ("mass", ["--gain", "lqr", "--Q", "[1]"], "2 x 2 numbers by rows"),
+        ("mass", ["--quantile", "0.95"], "are too few for the quantile 0.95"),
+        ("mass", ["--set", "model.gain=[[1.0, 1.0]]"], "u = -K x does: give -K"),
+        ("mass", ["--set", "plant.initial_state=[0.0, 0.0]"], "initial_state: is 0"),
+        ("mass", ["--set", 'trigger={policy="absolute", delta=1.0}'], "trigger.policy"),
+        (
+            "mass",
+            ["--set", "plant.initial_state_halfwidth=[0.1, 0.1]", "--bound", "error=1"],
+            "initial_state_halfwidth",
+        ),
+        ("mass", ["--out", "no/such/folder/x.toml"], "there is no folder"),
+        ("one", ["--set", "trigger.floor=3"], "trigger.floor = 3: must be less than the largest β"),
+        ("one", ["--set", 'mode="zoh"', "--weights", "chosen"], "models that hold do not decay"),
+        ("one", UNSTABLE, "not stable; --gain lqr chooses another"),
+        ("one", [*UNSTABLE, "--weights", "chosen"], "--gain lqr chooses another"),
+        ("one", ["--set", 'network.protocol="ack"'], "network.protocol"),
+        ("one", ["--weights", "given"], "the scenario has no trigger.weight"),
+    ],
+)
+def test_mistakes_are_one_line(
+    request: pytest.FixtureRequest, run_design: Design, scenario: str, words: list[str],
+    expected: str,
+) -> None:  # fmt: skip
+    result = run_design(request.getfixturevalue(scenario), *words)
+    assert result.exit_code == 2, result.stderr
+    assert result.stderr.count("\n") == 1
+    assert expected in result.stderr
+
+
+def test_a_loop_without_a_certificate_is_reported(one: Path, run_design: Design) -> None:
+    result = run_design(
+        one, "--settling", "4", "--bound", "error=1", "--under", "schedule",
+        "--set", "plant.rate_hz=2", "--set", "controller.rate_hz=2",
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "no certified bound of sup‖e_c‖ (1 allowed)" in result.stderr
+
+
+def test_the_chosen_design_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
+    assert found.feasible
+    assert found.confirmed
+    setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
+    rows = run_batch(setting, box_of(found.scenario).population(99, range(2000)))
+    share = float(np.mean(rows["settling_s"] <= LIMITS.settling_s))
+    assert share >= LIMITS.quantile
+    # 4 standard deviations of the difference of two means
+    spread = 4 * np.hypot(found.fresh.halfwidth, 0.12) / 1.96
+    assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
+
+
+def test_the_chosen_design_is_certified_as_required(found: DesignResult, tmp_path: Path) -> None:
+    path = tmp_path / "chosen.toml"
+    path.write_text(dumps(found.scenario))
+    resolved = resolve(load(path))
+    certificate = certify_box(resolved, ideal_conditions(resolved))
+    assert certificate is not None
+    assert certificate.constants is not None
+    weight = resolved.decaying.weight
+    smallest = 1.0 if weight is None else np.linalg.svd(np.array(weight), compute_uv=False)[-1]
+    bound = certificate.constants.delta * resolved.decaying.beta / smallest
+    assert bound <= LIMITS.bounds["error"]
+    # The bound is the active limit: without it a cheaper design exists.
+    assert found.bounds is not None
+    assert found.bounds["error"] == pytest.approx(bound)
+
+
+def test_no_candidate_meets_the_limits_with_fewer_transmissions(found: DesignResult) -> None:
+    best = found.best.measured
+    assert found.best.full
+    assert best.settling_high_s <= LIMITS.settling_s
+    cheaper = [t for t in found.trials if t.measured.transmissions < best.transmissions]
+    assert len(cheaper) > 10
+    for trial in cheaper:
+        m = trial.measured
+        late = (m.settling_high_s if trial.full else m.settling_s) > LIMITS.settling_s
+        assert late or trial.bounds["error"] > LIMITS.bounds["error"], trial
+
+
+def test_screening_excludes_no_design_that_all_draws_would_choose(found: DesignResult) -> None:
+    """Every grid candidate that was only screened out is measured on all draws here."""
+    best = found.best.measured
+    population = box_of(found.scenario).population(found.seed, range(best.draws))
+    rescued = 0
+    for trial in found.trials:
+        if trial.full or trial.measured.transmissions > best.transmissions:
+            continue
+        scenario = found.space.families[trial.candidate.family].with_trigger(trial.candidate)
+        rescued += measure(scenario, LIMITS, population).settling_high_s <= LIMITS.settling_s
+    assert rescued == 0
+
+
+def test_the_trade_off_curve_contains_the_nondominated_candidates(found: DesignResult) -> None:
+    assert len(found.front) > 3
+    points = [(t.measured.transmissions, t.measured.settling_s) for t in found.front]
+    assert points == sorted(points)
+    assert sorted((s for _, s in points), reverse=True) == [s for _, s in points]
+    for trial in found.front:
+        assert trial.full
+        assert trial.bounds["error"] <= LIMITS.bounds["error"]
+    for trial in found.trials:
+        if trial.bounds.get("error", 0.0) <= LIMITS.bounds["error"]:
+            sent, settling_s = trial.measured.transmissions, trial.measured.settling_s
+            assert not any(sent < a and settling_s < b for a, b in points)
+            better = any(a <= sent and b <= settling_s for a, b in points)
+            assert better or trial in found.front or settling_s == math.inf
+
+
+def test_too_few_draws_for_a_quantile_are_refused_with_the_required_number() -> None:
+    with pytest.raises(CallerError, match="--draws: 50 are too few") as caught:
+        require_draws(50, 0.95)
+    enough = int(str(caught.value).split()[-3])
+    require_draws(enough, 0.95)
+    assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
+
+
+def test_without_randomness_every_draw_is_the_exact_run(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text(ONE)
+    families = families_of(load(path), ("identity",), None)
+    found = design(families, DesignLimits(4.0, 0.5, 0.02, {}), draws=20, seed=0)
+    assert found.confirmed
+    assert found.fresh.halfwidth == 0
+    assert found.fresh.settling_high_s == found.fresh.settling_s
+    exact = run_continuous(resolve(found.scenario))
+    assert found.fresh.transmissions == len(exact.event_s)
+    x = exact.at([found.fresh.settling_s]).x
+    assert abs(float(x[0, 0])) == pytest.approx(0.02, rel=1e-6)
+
+
+def test_the_gain_comes_from_a_solution_of_the_riccati_equation() -> None:
+    A, B, *_ = lane_following()
+    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    K = lqr_gain(A, B, Q, R)
+    closed = A + B @ K
+    assert spectral_abscissa(closed) < 0
+    # P is the cost of the closed loop by another equation; K must follow from it.
+    cost = Q + K.T @ R @ K
+    n = len(A)
+    lyapunov = np.kron(np.eye(n), closed.T) + np.kron(closed.T, np.eye(n))
+    P = np.linalg.solve(lyapunov, -cost.ravel()).reshape(n, n)
+    np.testing.assert_allclose(R @ K, -B.T @ P, rtol=1e-8, atol=1e-8)
+    residual = A.T @ P + P @ A - P @ B @ np.linalg.solve(R, B.T @ P) + Q
+    np.testing.assert_allclose(residual, 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("A", "Q", "R", "word"),
+    [
+        ([[1, 0], [0, -1]], [[1, 0], [0, 1]], 1, "stabilising"),  # B does not affect state 1
+        ([[0, 1], [0, 0]], [[-1, 0], [0, -1]], 1, "semidefinite"),
+        ([[0, 1], [0, 0]], [[1, 1], [0, 1]], 1, "symmetric"),
+        ([[0, 1], [0, 0]], [[1, 0], [0, 1]], 0, "definite"),
+    ],
+)
+def test_a_system_without_a_regulator_is_refused(
+    A: list[list[float]], Q: list[list[float]], R: float, word: str
+) -> None:
+    with pytest.raises(CallerError, match=word):
+        lqr_gain(np.array(A), np.array([[0.0], [1.0]]), np.array(Q), np.array([[R]]))

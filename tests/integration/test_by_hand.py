@@ -1,0 +1,172 @@
+"""Processes started by hand: one is missing or restarted, the coordinator dies, a key is kept."""
+
+import contextlib
+import json
+import os
+import signal
+import stat
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from cosim.live.finalize import reopen
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.join_ticket import loads
+from tests.integration import conftest as live
+
+Start = Callable[..., live.Running]
+ByHand = Callable[[str], subprocess.Popen[str]]
+RECORD = ("record", "lane_following")
+
+
+def test_a_wait_for_a_missing_process_can_be_interrupted(
+    start: Start, by_hand: ByHand, tmp_path: Path
+) -> None:
+    recording = start(command=RECORD)
+    own = psutil.Process(recording.process.pid)
+    processes = {role: by_hand(role) for role in LOOP_ROLES if role != "netem"}
+    assert recording.process.stderr is not None
+    live.wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
+    children = own.children(recursive=True)
+    recording.process.send_signal(signal.SIGINT)
+    stdout, stderr = live.ended(recording.process)
+    assert recording.process.returncode == 130
+    (line,) = stderr.splitlines()
+    assert line.startswith("noack: stopped by the user (SIGINT) (logs in ")
+    assert json.loads(stdout)["exit"]["status"] == 130
+    for role, process in processes.items():
+        _, stderr = live.ended(process)
+        assert process.returncode == 1
+        why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
+        assert why in (
+            "stopped by the user (SIGINT)",
+            "lost the connection to the run's coordinator",
+        ), stderr
+    assert psutil.wait_procs(children, timeout=live.PATIENCE_S)[1] == []
+    assert live.private_files(tmp_path) == []
+
+
+def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand) -> None:
+    """The loop reaches its horizon, and each process stores all of its rows itself."""
+    horizon_s = 24.0  # a machine that stalls for seconds does not reach it before the kill
+    recording = start(*live.AT_RATE, *live.settings(speed=4.0, horizon_s=horizon_s), command=RECORD)
+    processes = {role: by_hand(role) for role in LOOP_ROLES}
+    recording.wait_recording()
+    run_dir = (recording.runs / "latest").resolve()
+    recording.process.kill()
+    live.ended(recording.process)
+    for role, process in processes.items():
+        stdout, stderr = live.ended(process)
+        assert process.returncode == 0, stderr
+        assert stderr.splitlines()[-1] == f"noack {role}: ended: horizon"
+        assert json.loads(stdout)["ended"] == "horizon"
+    assert recording.left_behind() == []
+    outcome = reopen(run_dir)
+    assert outcome.status == 1
+    assert outcome.reason == "the launcher ended early"
+    assert outcome.summary.reached_s == horizon_s
+    assert outcome.summary.loops[0].missing_samples == 0
+    replay = outcome.summary.loops[0].replay
+    assert replay is not None
+    assert replay.bit_exact
+    steps = load_record(run_dir)["plant_step"]
+    assert np.array_equal(steps["sequence"], np.arange(horizon_s * live.RATE_HZ + 1))
+
+
+def test_a_process_may_be_restarted_by_hand(start: Start, by_hand: ByHand) -> None:
+    recording = start(
+        *live.AT_RATE,
+        *live.settings(speed=2.0, horizon_s=1000.0, recovery__rejoin_within_s=60),
+        command=("record", "lane_following"),
+    )
+    processes = {role: by_hand(role) for role in LOOP_ROLES}
+    recording.wait_started()
+    twice = by_hand("sensor")
+    assert twice.wait(live.PATIENCE_S) == 1
+    assert "another sensor is in this run already" in twice.communicate()[1]
+    processes["sensor"].send_signal(signal.SIGINT)
+    assert processes["sensor"].wait(live.PATIENCE_S) == 130
+    again = by_hand("sensor")
+    assert again.stderr is not None
+    message = "replaces a process (sensor ended early: SIGINT)"
+    assert any(message in line for line in iter(again.stderr.readline, ""))
+    processes["plant"].send_signal(signal.SIGINT)  # the run ends without the plant
+    finished = recording.finish()
+    assert finished.status == 1
+    assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
+    assert "sensor ended early: SIGINT at " in finished.stderr
+    assert "the run goes on, restart it with: noack sensor" in finished.stderr
+    (restart,) = finished.loop["restarts"]
+    assert restart["what"] == "restarted: sensor ended early: SIGINT"
+    assert finished.loop["replay"]["bit_exact"]
+    assert finished.loop["replay"]["complete"]  # on SIGINT, a process delivers all rows
+    assert finished.loop["missing_samples"] == 0
+    for process in (*processes.values(), again):
+        process.communicate(timeout=live.PATIENCE_S)
+    assert [processes[role].returncode for role in ("plant", "sensor")] == [130, 130]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    found = {}
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            if path.is_file():
+                found[str(path)] = path.read_bytes()
+    return found
+
+
+def visible_in_processes(
+    recording: live.Running, processes: list[subprocess.Popen[str]]
+) -> dict[str, bytes]:
+    """Return command lines, environments and names of the processes."""
+    launcher = psutil.Process(recording.process.pid)
+    pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]
+    paths = [
+        Path(f"/proc/{pid}/{name}")
+        for pid in (*pids, *(process.pid for process in processes))
+        for name in ("cmdline", "environ", "comm")
+    ]
+    return {str(path): path.read_bytes() for path in paths}
+
+
+def test_the_key_of_a_run_by_hand_is_visible_in_its_ticket_only(
+    start: Start, by_hand: ByHand, tmp_path: Path
+) -> None:
+    private = tmp_path / f"noack-{os.getuid()}"
+    early = [by_hand(role) for role in LOOP_ROLES[:2]]
+    recording = start(
+        *live.settings(speed=2.0, horizon_s=400.0), command=("record", "lane_following")
+    )
+    path = private / "default.json"
+    live.wait_for(path.exists)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(private.stat().st_mode) == 0o700
+    key = loads(path.read_text()).key
+    processes = early + [by_hand(role) for role in LOOP_ROLES[2:]]
+    recording.wait_recording()
+    run_dir = (recording.runs / "latest").resolve()
+    seen = visible_in_processes(recording, processes)
+    assert len(seen) == 3 * 7  # with the fork server
+    seen |= files(run_dir) | files(private)
+    del seen[str(path)]  # the ticket contains the key
+    recording.process.send_signal(signal.SIGINT)
+    finished = recording.finish()
+    assert files(private) == {}
+    seen |= files(run_dir) | {"recorder's output": finished.stderr.encode()}
+    for role, process in zip(LOOP_ROLES, processes, strict=True):
+        stdout, stderr = live.ended(process)
+        seen[f"{role}'s output"] = (stdout + stderr).encode()
+        assert process.returncode == 1
+        assert json.loads(stdout)["ended"] == "stopped by the user (SIGINT)"
+    for where, content in seen.items():
+        assert key not in content, where
+        assert key.hex().encode() not in content, where
+    assert finished.status == 130, finished.stderr
+    assert finished.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
+    live.assert_complete(finished.loop)
+    steps = load_record(finished.run_dir)["plant_step"]
+    assert np.array_equal(steps["sequence"], np.arange(len(steps)))
