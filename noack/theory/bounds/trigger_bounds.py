@@ -241,17 +241,8 @@ class TriggerBounds:
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
-        alone = [
-            bound._replace(
-                apart_s=apart_s,
-                due_s=whole.due_s,
-                forced_s=whole.forced_s,
-                unit=1.0,
-                reached=None,
-                also=(),
-            )  # fmt: skip
-            for bound in whole.every
-        ]
+        times = {"apart_s": apart_s, "due_s": whole.due_s, "forced_s": whole.forced_s}
+        alone = [one._replace(unit=1.0, reached=None, also=(), **times) for one in whole.every]
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
     def text(self) -> str:
