@@ -1,5 +1,6 @@
 """``noack certify``: its text and JSON output, and the figures quoted in the documentation."""
 
+import json
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -232,3 +233,21 @@ def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason
     assert result.exit_code == 1
     assert reason in " ".join(result.stdout.split())
     assert "largest certified value" not in result.stdout
+
+
+def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
+    """At 100 Hz the lane has no certificate in the paper's norm."""
+    slow = ["--set=plant.rate_hz=100", "--set=controller.rate_hz=100"]
+    shown = CliRunner().invoke(app, ["certify", "lane_following", *slow]).stdout
+    pasted = shown[shown.index("[trigger]\nweight = [") :].splitlines()[1:]
+    rows = "".join(line.strip() for line in pasted)
+    weighted = certificates_of(
+        load(ROOT / "scenarios/lane_following.toml",
+             ["plant.rate_hz=100", "controller.rate_hz=100", f"trigger.{rows}"])
+    )  # fmt: skip
+    assert weighted.schedule.constants is not None
+    words = ["certify", "lane_following", *slow, "--json"]
+    document = json.loads(CliRunner().invoke(app, words).stdout)
+    assert document["certificates"][2]["constants"] is None
+    chosen = document["in_chosen_norm"]["certificates"][2]["constants"]
+    assert chosen["state"] == pytest.approx(weighted.schedule.constants.state, rel=1e-3)
