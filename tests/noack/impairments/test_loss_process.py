@@ -13,6 +13,7 @@ from noack.impairments.loss_guarantee import (
     LossHistory,
 )
 from noack.impairments.loss_prediction import LossProcess, loss_process
+from noack.impairments.markov_chain import NotPredictableError
 
 P = 0.3
 INDEPENDENT = {"kind": "loss", "loss": {"model": "bernoulli", "probability": P}}
@@ -78,3 +79,8 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
         assert given <= losses.largest_probability * (1 + 1e-9)
         all_lost = probability(losses, (*past, *[True] * 4)) / probability(losses, past)
         assert all_lost <= longest * (1 + 1e-9)
+
+
+def test_losses_that_depend_on_times_are_refused() -> None:
+    with pytest.raises(NotPredictableError):
+        process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})

@@ -203,8 +203,6 @@ def test_the_networks_delay_adds_to_the_delay_of_updates(
 GAINS: dict[str, Callable[[float], float]] = {
     "proportional": lambda share: share,
     "steep": lambda share: share**9,
-    "flat": lambda share: share**0.1,
-    "offset": lambda share: 0.9 + 0.1 * share,
     "exponential": lambda share: math.exp(min(share, 500.0) - 1),
     "unknown above": lambda share: share if share < 1 else math.inf,
     "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
