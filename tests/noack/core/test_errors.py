@@ -12,11 +12,8 @@ def test_quoted_text_is_one_printable_line(text: str) -> None:
     assert printable(text) == text or not text.isprintable()
 
 
-def test_control_characters_in_an_error_are_escaped() -> None:
+def test_control_characters_are_escaped_and_each_mistake_has_a_line() -> None:
     assert str(CallerError("key = \x1b[2J\x07é\ud800")) == "key = \\x1b[2J\\x07é\\ud800"
-
-
-def test_each_mistake_has_a_line() -> None:
     assert str(CallerError("a: wrong\nb: \twrong")) == "a: wrong\nb: \\twrong"
 
 

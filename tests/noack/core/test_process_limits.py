@@ -33,8 +33,6 @@ def test_a_run_names_a_limit_that_is_too_low(tmp_path: Path, command: str) -> No
         (RuntimeError("can't start new thread"), "out of memory"),
         (OSError(errno.EMFILE, "Too many open files"), "too many open files: at most "),
         (OSError(errno.ENOSPC, "No space left on device"), None),
-        (ImportError("no module of that name"), None),
-        (RuntimeError("a defect"), None),
     ],
 )
 def test_errors_of_a_limit_are_told_from_others(error: Exception, line: str | None) -> None:

@@ -84,5 +84,3 @@ def test_tails_of_bursts_cover_every_packet_and_the_largest_probability_every_pa
 def test_losses_that_depend_on_times_are_refused() -> None:
     with pytest.raises(NotPredictableError):
         process(INDEPENDENT, {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.05})
-    with pytest.raises(NotPredictableError):
-        process({"kind": "blackout", "intervals_s": ((1.0, 2.0),)})

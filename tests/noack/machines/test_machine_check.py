@@ -32,7 +32,6 @@ WRONG: dict[str, list[tuple[str, Any, str]]] = {
         ("heap", NULL, "a process has no machines"),
         ("note_count", 257, "a process has no machines"),
         ("machine.n", 65, "a machine has not 1 to 64 states and inputs"),
-        ("machine.m", -HUGE, "a machine has not 1 to 64 states and inputs"),
         *[(f"machine.{name}_ns", value, "a machine has a phase, a horizon or a period out of range")
           for name in ("phase", "horizon", "first", "period") for value in (-1, FAR)],
         *[(f"machine.{name}", value, "a machine has numbers out of range")
@@ -98,7 +97,6 @@ WRONG: dict[str, list[tuple[str, Any, str]]] = {
         ("machine.received.entries", 2,
          "a controller has no period, or receives updates of another size"),
         ("predictions", 31, "an actuation has more than 64 entries"),
-        ("predictions", HUGE, "an actuation has more than 64 entries"),
         *[(name, NULL, "a controller has no state") for name in ("K", "x_c", "scratch", "u_r")],
         *[(name, value, "a controller has a time or a newest update out of range")
           for name, value in (("model_ns", -1), ("model_ns", HUGE), ("newest", -3))],

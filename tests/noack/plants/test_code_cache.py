@@ -1,6 +1,7 @@
 """Where compiled code is stored, and the behaviour when it cannot be stored."""
 
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,8 @@ def test_changed_sources_use_another_folder(home: Path) -> None:
 
 
 def test_compiled_code_is_cached(home: Path, folder: Path) -> None:
-    assert compiler(folder)(doubled)(21) == 42
+    with ThreadPoolExecutor() as pool:
+        assert pool.submit(compiler(folder)(doubled), 21).result() == 42
     assert list(folder.rglob("*.doubled-*.nbi"))
     assert home in folder.parents
 

@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
-from noack.plants.four_tank import FourTankSettings
 from noack.plants.plant_settings import OdeSystem, linearise
 from noack.plants.vehicle import VehicleSettings, equations, library
 from noack.scenario.named_models import single_track_lane
@@ -161,5 +160,4 @@ def test_the_equations_are_compiled_once_before_a_run(monkeypatch: pytest.Monkey
     VehicleSettings(kind="vehicle").prepare()
     VehicleSettings(kind="vehicle", model="multi_body").prepare()
     VehicleSettings(kind="vehicle", model="kinematic", parameters="truck").prepare()
-    FourTankSettings(kind="four_tank").prepare()
     assert made == ["mb", "kst"]

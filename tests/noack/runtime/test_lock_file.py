@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from noack.core import file_access
-from noack.core.errors import MachineError
+from noack.core.errors import CallerError, MachineError
 from noack.runtime import private_folder
 from noack.runtime.private_folder import open_private
 
@@ -61,3 +61,11 @@ def test_a_file_that_cannot_be_written_leaves_nothing() -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert names() == []
+
+
+def test_a_missing_runtime_directory_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "none"))
+    with pytest.raises(CallerError, match=r"none: no such folder; set XDG_RUNTIME_DIR"):
+        names()

@@ -2,6 +2,7 @@
 
 import select
 import socket
+import sys
 import threading
 import urllib.error
 import urllib.request
@@ -132,3 +133,12 @@ def test_a_wrong_address_gives_one_line(where: str, message: str) -> None:
         pass
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with (
+        pytest.raises(CallerError, match=r"pip install 'noack\[metrics\]'"),
+        metrics_server(":0", collect),
+    ):
+        pass

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from noack.core.errors import NoAnswerError
-from noack.protocol.machine_interface import Record
+from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.spool import kept_run_name
+from noack.runtime.spool import NOTICES, kept_run_name
 from noack.runtime.telemetry import (
     OwnSpool,
     ReceivedRows,
@@ -184,3 +184,15 @@ def test_what_two_runs_with_one_directory_keep_stays_apart(tmp_path: Path) -> No
     assert [kept_run_name(found) for found in (one.folder, other.folder)] == ["0001", "0002"]
     assert len(list((one.folder / "spool").glob("sensor_event.*"))) == 2
     assert len(list((other.folder / "spool").glob("sensor_event.*"))) == 1
+
+
+def test_lines_and_rows_that_come_at_once_are_published_in_numbered_batches() -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    for k in range(300):
+        buffer.notice(Notice(10 * k, "violation", f"line {k}"))
+    buffer.extend_table("one", np.zeros(BATCH, ROW))
+    buffer.flush()
+    assert sorted(batch[:3] for batch in wire.batches) == sorted(
+        [(NOTICES, 0, 256), (NOTICES, 256, 44), ("one", 0, BATCH)]
+    )

@@ -1,12 +1,10 @@
 """Settings of a link that depend on each other, or on files."""
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -16,12 +14,9 @@ from noack.impairments.kinds.delay import Delay
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_prediction import read_files
 from noack.protocol.record_tables import Fate
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import dumps, load, validate
 from tests.oracles.link import Link
 
 
@@ -122,28 +117,3 @@ def test_a_mistake_in_a_delay_file_gets_one_line(
     with pytest.raises(CallerError) as caught:
         read_delay(tmp_path, jitter_s=jitter_s, file=name)
     assert str(caught.value).startswith(f"{name}: {says}")
-
-
-@pytest.fixture
-def scenario_with_files(content: dict[str, Any], tmp_path: Path) -> Path:
-    content["network"] = {
-        "mansd": 2,
-        "loss": {"model": "trace", "file": "files/trace.txt"},
-        "impairments": [{"kind": "delay", "distribution": "empirical", "file": "files/delays.txt"}],
-    }
-    (tmp_path / "files").mkdir()
-    (tmp_path / "files/trace.txt").write_text("0011")
-    (tmp_path / "files/delays.txt").write_text("1ms\n2ms\n")
-    path = tmp_path / "some.toml"
-    path.write_text(tomli_w.dumps(content))
-    return path
-
-
-def test_a_loaded_scenario_no_longer_needs_its_files(scenario_with_files: Path) -> None:
-    scenario = load(scenario_with_files)
-    assert scenario.network.loss == ScriptedLoss(lost=(2, 3), repeat_every=4)
-    assert scenario.network.impairments == (
-        Delay(distribution="empirical", samples_s=(0.001, 0.002)),
-    )
-    for one in (scenario, resolve(scenario)):
-        assert validate(tomllib.loads(dumps(one)), "copy") == one

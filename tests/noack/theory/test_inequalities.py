@@ -6,11 +6,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow
-from noack.theory.bounds.gains import ErrorGains, PlantGains
+from noack.impairments.loss_guarantee import LongestBurst, LossesInWindow, LossWindow
+from noack.theory.bounds.gains import ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import NetworkConditions, TriggerBound
 from noack.theory.bounds.trigger_bounds import first_passage_s
 from noack.theory.certificates.inequalities import solve_inequalities
+from noack.theory.certificates.loss_accumulation import LossAccumulation
 from noack.theory.certificates.solution import solve
 from tests.oracles.lossy_loops import System
 
@@ -103,3 +104,11 @@ def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
     assert passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
     assert passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4
+
+
+def test_events_may_be_too_close_for_a_bound_of_the_losses() -> None:
+    one = np.ones((1, 1))
+    plant = PlantGains(ErrorGains(-5 * one, -6 * one, one, 0.5), 1.05 * one, one, one, 0.5)
+    found = LossAccumulation(plant, 0.0)
+    assert found.total(Output.STATE, 1e-12, [LossWindow(1, 2)]) == math.inf
+    assert found.total(Output.STATE, 0.1, [LossWindow(1, 2), LossWindow(0, 1)]) == 0

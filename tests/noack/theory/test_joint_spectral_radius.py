@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 
 from noack.core.linear_systems import Matrix
-from noack.theory.margins.exact_matrices import (
-    IntervalMatrix,
-    exactly,
-    exponential,
-    inverse,
-)
+from noack.theory.margins.exact_matrices import IntervalMatrix, exactly, exponential, inverse
 from noack.theory.margins.invariant_polytopes import InvariantPolytopes
 from noack.theory.margins.joint_spectral_radius import joint_spectral_radius
 from noack.theory.margins.switched_system import Edge, spectral_radius_bounds, strongly_connected
@@ -203,3 +198,23 @@ def test_exponentials_in_closed_form() -> None:
     assert contains(turn.interval(), exact)
     deviation = np.abs(turn.entries - exact * 2**384).max() / 2**384
     assert deviation < 1e-49
+
+
+def test_nilpotent_systems_do_not_grow() -> None:
+    shift = np.diag([1.0, 1.0], k=1)
+    found = joint_spectral_radius([edge(0, 0, shift), edge(0, 0, 2 * shift)])
+    assert found.lower == 0
+    assert found.upper < 0.01
+
+
+def test_paths_that_end_do_not_count() -> None:
+    edges = [edge(0, 0, [[0.5]]), edge(0, 1, [[100.0]]), edge(1, 2, [[100.0]])]
+    assert joint_spectral_radius(edges).upper < 0.51
+
+
+def test_one_cycle_that_forgets_or_has_one_direction() -> None:
+    nilpotent = joint_spectral_radius([edge(0, 0, np.diag([1e-3, 1e3], k=1))])
+    assert (nilpotent.lower, nilpotent.cycle) == (0, ())
+    assert 0 < nilpotent.upper < 1e-9
+    defective = joint_spectral_radius([edge(0, 0, [[0.7, 1e5, 3], [0, 0.7, 1e5], [0, 0, 0.7]])])
+    assert defective.lower <= 0.7 <= defective.upper < 0.7 * (1 + 1e-9)

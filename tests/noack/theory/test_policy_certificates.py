@@ -3,17 +3,41 @@
 ``certificate_kinds/policies.py`` has the loops without disturbances, and the broken copies.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from cosim.simulation.continuous import ContinuousLoop, TooManyEventsError, simulate_continuous
+from noack.scenario.resolution import loop_of, policy_of, resolve
+from noack.scenario.scenario_file import load
+from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.bounds.trigger_bounds import comparison_bound
+from noack.theory.certificates.certified_bounds import known_state_bounds
+from noack.theory.certificates.conditions import allowed_conditions
 from noack.theory.certificates.scenario_certificates import certify
-from tests.noack.theory.certificate_kinds.policies import POLICY_KINDS, exceeded_by, policy_case
+from tests.noack.theory.certificate_kinds.policies import (
+    INSTANT,
+    POLICY_KINDS,
+    exceeded_by,
+    policy_case,
+)
 from tests.noack.theory.disturbed_loops import DisturbedLoop, signals
-from tests.oracles.lossy_loops import SEARCH, STEPS, System, networks, seeds, simulate, systems
+from tests.oracles.lossy_loops import (
+    ROUNDING,
+    SEARCH,
+    STEPS,
+    System,
+    networks,
+    seeds,
+    simulate,
+    systems,
+)
 from tests.trigger_rules import quadratic_rule
+
+SCENARIO = Path(__file__).parents[3] / "scenarios" / "double_integrator.toml"
 
 
 @pytest.mark.parametrize("kind", POLICY_KINDS)
@@ -56,3 +80,56 @@ def test_no_e_s_at_which_a_quadratic_rule_is_silent_exceeds_the_bound(seed: int,
         bound += sum(float(np.linalg.norm(S @ x)) for S in bounded.shares)
         for root in roots[np.isreal(roots)].real:
             assert np.linalg.norm(W @ (root * direction)) <= bound
+
+
+@pytest.mark.parametrize(("interval_s", "decays"), [(0.02, True), (1.0, False)])
+def test_a_short_deadline_adds_decay_to_a_constant_threshold(
+    interval_s: float, *, decays: bool
+) -> None:
+    rule = '{policy="absolute", delta=0.01}'
+    found = []
+    for trigger in (rule, f'{{policy="deadline", interval_s={interval_s}, rule={rule}}}'):
+        resolved = resolve(load(SCENARIO, [f"trigger={trigger}"]))
+        found.append(certify(resolved, allowed_conditions(resolved)))
+        assert found[-1].unit == ""  # the errors' constants are absolute
+    t_s = np.array([0.0, 1.0, 3.0, 10.0, 1e3])
+    alone, short = (one.state(t_s) for one in found)
+    assert (short <= alone * ROUNDING).all()
+    assert short[-1] < 1e-100 if decays else short[-1] == pytest.approx(alone[-1])
+    known = known_state_bounds(resolved, found[-1])
+    assert known is not None
+    missing = np.zeros(len(t_s), np.int64)
+    for bound in (known.state_deviation(t_s, t_s, missing), known.controller_error(t_s, missing)):
+        assert bound[-1] < 1e-100 if decays else bound[-1] > 0.0
+
+
+@pytest.mark.parametrize("kind", sorted(POLICY_KINDS.keys() - {"lyapunov"}))
+@settings(SEARCH, max_examples=3)
+@given(systems(**INSTANT), seeds)
+def test_no_bound_of_a_policy_is_exceeded_in_continuous_time(
+    kind: str, system: System, seed: int
+) -> None:
+    resolved, _, system = policy_case(kind, system, seed)
+    certificate = certify(resolved, NetworkConditions(system.mansd))
+    if certificate.constants is None:
+        return
+    loop = ContinuousLoop(loop_of(resolved), policy_of(resolved))
+    horizon_s = 6 / float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
+    for delivered in networks(seed, system)[0][:3].tolist():  # most lost, none, at random
+        try:
+            run = simulate_continuous(
+                loop, horizon_s=horizon_s, delivered=delivered, known_start=True,
+                max_events=len(delivered),
+            )  # fmt: skip
+        except TooManyEventsError:
+            continue
+        samples = run.at(np.linspace(0.0, run.reached_s, 200))
+        slack = (ROUNDING - 1) * certificate.state(samples.t_s)
+        for seen, bound in (
+            (run.system.norms(samples.e_s), certificate.sensor_error(samples.t_s)),
+            (run.system.norms(samples.e_c), certificate.controller_error(samples.t_s)),
+            (np.linalg.norm(samples.x, axis=1), certificate.state(samples.t_s)),
+        ):
+            assert (seen <= ROUNDING * bound + slack).all()
+        least_s = certificate.inter_event_s or 0.0
+        assert np.diff(run.event_s).min(initial=np.inf) >= least_s / ROUNDING - 1e-9

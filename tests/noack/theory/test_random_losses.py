@@ -96,22 +96,3 @@ def test_almost_all_runs_of_a_scalar_grow_as_the_mean_of_the_logarithm() -> None
     found = sure_growth(between, p, between[-1], np.array([[lost]]))
     assert found == pytest.approx(exact, rel=1e-6)
     assert exact < 1 < mean_square_growth([(between[0], np.array([[lost]]))], independent(p))
-
-
-@pytest.mark.parametrize("listed", [1, 3, 40])
-def test_bursts_that_are_not_listed_are_bounded(listed: int) -> None:
-    """They are likely here: of runs of random loops, and of a scalar, none grows faster."""
-    rng, p = np.random.default_rng(listed), 0.5
-    between = [np.array([[0.2 * 2.0**burst]]) for burst in range(listed)]
-    assert sure_growth(between, p, between[-1], np.array([[2.0]])) >= (0.2 * 2.0) ** 0.5
-    for _ in range(4):
-        delivered, lost = rng.normal(size=(2, 3, 3))
-        delivered[:, 1:] = 0.0  # z is the first entry: what follows a delivery depends on it alone
-        states = [np.linalg.matrix_power(lost, burst) @ delivered[:, :1] for burst in range(listed)]
-        bound = sure_growth([state[:1] for state in states], p, states[-1], lost)
-        z, total, periods = np.ones(3), 0.0, 4000
-        for is_lost in (rng.uniform(size=periods) < p).tolist():
-            z = (lost if is_lost else delivered) @ z
-            size = float(np.linalg.norm(z))
-            z, total = z / size, total + np.log(size)
-        assert np.exp(total / periods) <= bound * 1.03  # of 4,000 periods

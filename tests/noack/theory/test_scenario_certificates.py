@@ -4,6 +4,7 @@ tests/cosim/analysis/claims compares ``nominal_conditions`` with the machines.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,23 @@ from hypothesis import strategies as st
 from noack.core.linear_systems import spectral_abscissa
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario, loops_of
-from noack.scenario.scenario_file import load
+from noack.scenario.scenario_file import load, validate
 from noack.theory.bounds.terms import Constants, NetworkConditions
-from noack.theory.certificates.assumptions import AssumptionStatus
+from noack.theory.certificates.assumptions import AssumptionStatus, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
     allowed_conditions,
     ideal_conditions,
+    nominal_conditions,
 )
-from noack.theory.certificates.scenario_certificates import box, certify, own_plant
+from noack.theory.certificates.scenario_certificates import (
+    MOST_S,
+    box,
+    certify,
+    certify_box,
+    largest,
+    own_plant,
+)
 from noack.theory.certificates.solution import completed
 from tests.noack.theory.certificate_kinds.policies import exceeded_by, scenario_with
 from tests.oracles.lossy_loops import (
@@ -114,6 +123,10 @@ def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
     assert found.constants is None
     assert "grows" in str(found.void)
     assert found.inter_event_s is None
+    observed = shipped("pendulum_observed", "plant.uncertainty_A=[[0, 0], [0, 0.1]]")
+    boxed = certify_box(observed, allowed_conditions(observed))
+    assert boxed is not None
+    assert "for one plant only, not for a box" in (boxed.void or "")
     for envelope in (found.sensor_error, found.controller_error, found.state):
         assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
     assert (found.assumptions[-2].what, found.assumptions[-2].verdict) == (
@@ -154,19 +167,63 @@ def test_certificates_that_are_computed_together_are_those_of_each_loop(
     found = completed([scope.search(conditions) for scope, conditions in scopes])
     assert any(one.constants is not None for one in found)
     for together, (scope, conditions) in zip(found, scopes, strict=True):
-        assert_equal_to_rounding(together.to_json(), scope.certificate(conditions).to_json())
+        # Sums over grids that end at different times are rounded differently.
+        alone = leaves(scope.certificate(conditions).to_json())
+        for one, other in zip(leaves(together.to_json()), alone, strict=True):
+            is_real = isinstance(other, float)
+            assert one == (pytest.approx(other, rel=1e-12, abs=0.0) if is_real else other)
 
 
-def assert_equal_to_rounding(found: Any, expected: Any) -> None:
-    """Sums over grids that end at different times are rounded differently."""
-    if isinstance(expected, dict):
-        assert found.keys() == expected.keys()
-        for key, value in expected.items():
-            assert_equal_to_rounding(found[key], value)
-    elif isinstance(expected, list | tuple):
-        for one, other in zip(found, expected, strict=True):
-            assert_equal_to_rounding(one, other)
-    elif isinstance(expected, float):
-        assert found == pytest.approx(expected, rel=1e-12, abs=0.0)
-    else:
-        assert found == expected
+def leaves(value: Any) -> list[Any]:
+    """The entries of tables and lists within each other, in one list."""
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    return [x for one in value for x in leaves(one)] if isinstance(value, list | tuple) else [value]
+
+
+@pytest.mark.parametrize("late_periods", [0, 2])
+def test_the_networks_delay_adds_to_the_delay_of_updates(
+    content: dict[str, Any], late_periods: int
+) -> None:
+    at_once = nominal_conditions(resolve(validate(content, "here")), late_periods)
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02, "jitter_s": 0.01}]
+    resolved = resolve(validate(content, "here"))
+    delayed = nominal_conditions(resolved, late_periods)
+    step_s, tick_s = (
+        resolved.timing.plant_period_ns * 1e-9,
+        resolved.timing.controller_period_ns * 1e-9,
+    )
+    assert delayed.delay_s - at_once.delay_s == pytest.approx(0.03, abs=step_s + tick_s)
+    assert delayed.delay_s >= 0.03 + late_periods * step_s
+    # The input does not pass through this network.
+    assert delayed.hold_s == at_once.hold_s
+    assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
+
+
+GAINS: dict[str, Callable[[float], float]] = {
+    "proportional": lambda share: share,
+    "steep": lambda share: share**9,
+    "exponential": lambda share: math.exp(min(share, 500.0) - 1),
+    "unknown above": lambda share: share if share < 1 else math.inf,
+    "in steps": lambda share: 0.3 + 0.8 * math.floor(share),
+    "without a gain": lambda share: 0.0 if share < 1 else 5.0,
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+@pytest.mark.parametrize("limit_s", [3e-6, 2e-3, 0.04, 3.0])
+@pytest.mark.parametrize("usual_s", [0.0, 2e-3, 1.0])
+def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s: float) -> None:
+    tried: list[float] = []
+
+    def gain(value_s: float) -> float:
+        tried.append(value_s)
+        return GAINS[name](value_s / limit_s)
+
+    assert (1 - 1.1e-3) * limit_s <= largest(gain, usual_s) < limit_s
+    assert len(tried) < 40
+
+
+def test_all_times_or_none_may_have_a_certificate() -> None:
+    assert largest(lambda value_s: 0.5, 0.01) == MOST_S
+    assert largest(lambda value_s: math.inf, 0.01) == 0.0

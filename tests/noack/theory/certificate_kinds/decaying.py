@@ -79,13 +79,6 @@ class OnlyTheFirstMoment(ErrorGains):
         return events * self.now(output)
 
 
-class OnlyTheNewest(ErrorGains):
-    """Counts one missing event, whatever their number."""
-
-    def missing(self, output: Output, events: int, spacing_s: float) -> float:
-        return super().missing(output, min(events, 1), spacing_s)
-
-
 class ConstantThreshold(ErrorGains):
     """Ignores that an old error was bounded by an earlier, larger threshold."""
 
@@ -126,9 +119,6 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     "only the first moment": (
         with_gains(OnlyTheFirstMoment, PlantGains),
         {"spread": 10.0, "n": 2, "m": 1, "mansd": 1, "alpha_share": 0.8, **EVENTFUL},
-    ),
-    "only the newest missing event": (
-        with_gains(OnlyTheNewest, PlantGains), {"mansd": 6, **INSTANT},
     ),
     "constant threshold": (
         with_gains(ConstantThreshold, PlantGains),
