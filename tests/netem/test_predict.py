@@ -192,6 +192,7 @@ def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> N
     ("words", "message"),
     [
         ("loss 81% keep mansd 4", "impossible with this guarantee, which allows at most 80%"),
+        ("loss 41% keep mansd 2 recover 3", "with this guarantee, which allows at most 40%"),
         ("loss 10% keep loss 20%", "impossible, the other impairments lose 20% already"),
         ("loss 10% keep loss 10% keep", "only one loss of a direction can be kept"),
         ("loss 10% keep blackout 1s-2s", "cannot be predicted: losses in a blackout"),
