@@ -137,8 +137,8 @@ def test_every_word_is_in_the_help_and_has_an_example() -> None:
 
 MUCH = (
     "loss 5% 50% delay 10ms 11ms 5% delay 1ms 1ms distribution normal lossrel 50% reorder 5% "
-    "blackout 1s-2s loss gemodel 1% 10% corrupt 1% duplicate 1% rate 1mbit codel mansd 3 first "
-    "limit 7"
+    "blackout 1s-2s loss gemodel 1% 10% 70% 0.1% corrupt 1% duplicate 1% rate 1mbit codel mansd 3 "
+    "first limit 7"
 )
 
 
