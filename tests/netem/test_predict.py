@@ -37,6 +37,7 @@ EXACT = {
     "loss script 0,1,2,7,8,9 every 10 mansd 4": 5 / 10,  # six losses, across the end
     "loss script none every 10": 0.0,
     "loss periodic 1/2 loss periodic 1/3": 4 / 6,
+    "loss 0% 50% atmost 3 in 11": 0.0,
     "loss 100% atmost 3 in 10 mansd 2": 3 / 10,
     "loss worst mansd 2 recover 3": 2 / 5,
     "loss periodic 1/2 atmost 1 in 3": 1 / 4,  # only every other loss
@@ -192,6 +193,7 @@ def test_what_another_process_found_is_not_computed_again(monkeypatch: Any) -> N
     ("words", "message"),
     [
         ("loss 81% keep mansd 4", "impossible with this guarantee, which allows at most 80%"),
+        ("loss 41% keep mansd 2 recover 3", "with this guarantee, which allows at most 40%"),
         ("loss 10% keep loss 20%", "impossible, the other impairments lose 20% already"),
         ("loss 10% keep loss 10% keep", "only one loss of a direction can be kept"),
         ("loss 10% keep blackout 1s-2s", "cannot be predicted: losses in a blackout"),

@@ -137,7 +137,7 @@ def test_events_of_any_numbers_are_refused_or_written(
 
 
 def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
-    section = PcapngSection(INTERFACES)
+    section = PcapngSection((INTERFACES[0], ("link0 server", "")))
     data = section.header()
     data += bytes(section.packets(*batch({}, {"interface": 1})))
     section.miss(np.array([0, 2**33 + 5]))

@@ -137,7 +137,8 @@ def test_every_word_is_in_the_help_and_has_an_example() -> None:
 
 MUCH = (
     "loss 5% 50% delay 10ms 11ms 5% delay 1ms 1ms distribution normal lossrel 50% reorder 5% "
-    "blackout 1s-2s corrupt 1% duplicate 1% rate 1mbit codel mansd 3 first limit 7"
+    "blackout 1s-2s loss gemodel 1% 10% 70% 0.1% corrupt 1% duplicate 1% rate 1mbit codel mansd 3 "
+    "first limit 7"
 )
 
 
@@ -202,7 +203,7 @@ REVERSE = "reverse, from the server to clients"
         (f"{MUCH} --seed 9 --listen [::1]:7 --to 192.0.2.1:53",
          [f"{FORWARD}, in this order", f"{REVERSE}: no impairment"]),
         (f"--reverse {MUCH}", [f"{FORWARD}: no impairment", f"{REVERSE}, in this order"]),
-        ("loss 5% --both --idle 5s", ["both directions, each by itself, in this order"]),
+        ("rate 1mbit --both --idle 5s", ["both directions, each by itself, in this order"]),
         ("--one-way delay 0 samples 1ms,2ms",
          [f"{FORWARD}, in this order", "reverse: not relayed; the server's answers are discarded"]),
     ],

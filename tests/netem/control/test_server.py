@@ -25,7 +25,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
 from tests.netem.conftest import Emulate
 from tests.netem.control import relays
-from tests.netem.control.relays import FakeRelay
+from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal
 from tests.netem.engine.relays import endpoints
 from tests.netem.fates.links import spec_of
 
@@ -241,6 +241,20 @@ def test_watch_fails_when_the_emulator_ends(
     monkeypatch.setattr(Screen, "show", lambda *_: emulator.__exit__())
     assert run("watch lab") == ExitStatus.FAILED
     assert capsys.readouterr().err == "noack netem watch: emulator 'lab' has ended\n"
+
+
+@pytest.mark.usefixtures("server")
+def test_watch_redraws_on_a_terminal_until_q(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    relay.counters["up", "forward"].received = 7
+    with terminal(monkeypatch) as user:
+        with ThreadPoolExecutor() as threads:
+            drawn = threads.submit(press_q, user, "q ends", "→ up")
+            assert run("watch") == ExitStatus.OK
+        assert "\x1b[?1049l" not in drawn.result()
+        # The last screen stays visible.
+        read_until(user, lambda text: "╯" in text.partition("\x1b[?1049l")[2])
 
 
 def test_a_cap_set_at_runtime_is_kept(emulate: Emulate, capsys: pytest.CaptureFixture[str]) -> None:

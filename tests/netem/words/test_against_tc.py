@@ -138,6 +138,8 @@ def test_each_setting_is_in_the_command_or_named(settings: LinkSettings) -> None
         ("loss 5% 10% delay 1ms blackout 1s-2s", "loss random 5% 10% delay 1ms",
          "blackout 1s-2s (blackouts)", "its correlation changes the probability"),
         ("delay 1ms 1ms loss 5%", "delay 1ms 1ms loss random 5%", "", "its order is fixed"),
+        ("delay 1ms 1ms distribution pareto", "delay 1ms 1ms distribution pareto", "",
+         "its table of the Pareto distribution"),
         ("rate 1mbit reorder 5%", "rate 1mbit -14",
          "reorder 5% (reordering without a delay before it)", "its queue is the limit"),
         (f"loss script {','.join(map(str, range(50)))} delay 1ms", "delay 1ms",

@@ -240,7 +240,11 @@ CONTRADICTIONS = [
     (loss("four_state", p13=0.6, p31=0.1, p14=0.6), "p13"),
     (loss("gilbert_elliott", mean_loss=0.1, mean_burst=2.0, state="link"), "step_s"),
     (loss("gilbert_elliott", mean_loss=0.1, mean_burst=2.0, loss_in_bad=0.5), "mean_loss"),
+    (loss("gilbert_elliott", mean_loss=0.1, mean_burst=2.0, step_s=0.1), "step_s"),
+    (chain(0.1, 0.1, mean_loss=0.1), "mean_loss"),
+    (loss("gilbert_elliott", good_to_bad=0.1), "good_to_bad"),
     (loss("periodic", period=2, burst=3), "burst"),
+    (one("blackout", intervals_s=[[0.0, 2.0]], every_s=1.0), "every_s"),
 ]
 
 
