@@ -178,17 +178,6 @@ def test_every_listed_parameter_can_be_changed(loops: int) -> None:
         requested(requests_of(entry), {"plant.rate_hz": 100.0})
 
 
-def test_each_entry_of_the_loops_has_its_own_values() -> None:
-    requests = requests_of('{ name = "p", count = 3 }, { name = "q", trigger = { beta = 0.07 } }')
-    before = requested(requests, {})
-    assert before["loops"]["q"]["trigger.beta"] == 0.07
-    assert before["loops"]["p"] == before["runtime_parameters"]
-    assert before["changed_loops"] == ()
-    after = requested(requests, {"trigger.beta": 0.07})
-    assert after["changed_loops"] == ("p",)
-    assert after["loops"]["p"] == after["loops"]["q"]
-
-
 def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
     """It is valid now and with the last settings, but not with the first of those scheduled."""
     change = 'changes=[{ at_s = 8.0, set = { "network.mansd" = 2 } }]'

@@ -1,4 +1,4 @@
-"""Simulated runs: violations, long runs, and a controller that stands still."""
+"""Simulated runs: violations, long runs, a controller that stands still, acknowledgements."""
 
 from functools import cache
 from pathlib import Path
@@ -9,11 +9,9 @@ import pytest
 from cosim.analysis.certificates import Certificates
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.fidelity import IncomparableError, live_run
-from cosim.analysis.loop_statistics import from_controller, unintended_losses
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.summary_model import ClaimVerdict
-from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
@@ -30,7 +28,6 @@ from noack.protocol.record_tables import (
     UPDATES,
     Fate,
 )
-from noack.protocol.wire_format import Flow
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load, validate
@@ -135,7 +132,7 @@ def test_the_table_in_the_documentation_is_the_simulated_one() -> None:
     assert held == f"{at_the_end(name, mode, 'hold', lasts_s):.2g}"
 
 
-# --- a controller that sends over the network: acknowledgements (the baseline) --------------------
+# --- acknowledgements (the baseline) --------------------------------------------------------------
 
 
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=6")
@@ -173,13 +170,6 @@ def test_each_direction_has_its_own_random_stream() -> None:
     assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
 
 
-def test_the_cap_of_the_reverse_direction_holds() -> None:
-    back = 'network.acknowledgements={mansd=2, loss={model="worst_case"}}'
-    found = fates(simulate(acknowledged(back)), ACKNOWLEDGEMENTS)
-    assert len(found) >= 6
-    assert [Fate(fate).effective for fate in found] == [k % 3 == 2 for k in range(len(found))]
-
-
 def test_the_summary_counts_acknowledgements() -> None:
     record = run_of()
     summary = summarise(record, 0, "horizon").to_json()
@@ -208,41 +198,3 @@ def test_the_baseline_has_no_claims() -> None:
         plain("network.acknowledgements.timeout_s=0.1")
     back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
     assert not plain(*back).protocol.acknowledges
-
-
-# --- actuations over the network ------------------------------------------------------------------
-
-
-MESSY = """{mansd=2, loss={model="bernoulli", probability=0.4}, impairments=[
- {kind="delay", delay_s=0.01, jitter_s=0.02}, {kind="duplicate", probability=0.3},
- {kind="corrupt", probability=0.1}]}""".replace("\n", "")
-
-
-@pytest.fixture(scope="module")
-def messy() -> RunRecord:
-    return simulate(
-        resolve(
-            load(
-                SCENARIOS / "lane_following.toml",
-                [
-                    "plant.rate_hz=100", "controller.rate_hz=50", "horizon_s=6",
-                    f"network.actuation={MESSY}", "controller.predictions=4",
-                    'plant.watchdog.policy="model"', 'network.impairments=[{kind="delay", '
-                    "delay_s=0.01, jitter_s=0.02}]", "trigger.beta=0.05",
-                    "changes=[{at_s=2, set={'network.loss.probability'=0.3}}]",
-                ],
-            )
-        )
-    )  # fmt: skip
-
-
-def test_each_direction_has_its_own_losses_and_guarantee(messy: RunRecord) -> None:
-    updates, actuations = (packet_outcomes(messy, one) for one in messy.scenario.network.flows)
-    assert actuations.longest_loss_burst() == 2
-    assert updates.longest_loss_burst() in (3, 4)
-    part = from_controller(messy, Flow.ACTUATION)
-    assert part is not None
-    assert part.sent == len(actuations.lost) == 300
-    assert part.lost == actuations.lost.sum() > 90
-    assert set(messy[NETEM_PACKET]["flow"].tolist()) == {0, 1}
-    assert sum(unintended_losses(messy).values()) == 0
