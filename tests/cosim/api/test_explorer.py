@@ -112,3 +112,8 @@ def test_a_loop_that_is_unstable_says_why_and_is_drawn() -> None:
     assert len(explorer.figure("V").axes) == len(explorer.figure(0).axes) == 4
     with pytest.raises(noack.NoackError, match="no such state; there are V, r, psi, Y_g"):
         explorer.figure("z")
+    assert noack.explore("lane_vehicle", {"horizon_s": 1.0}).ensemble is None
+    area = noack.explore("lane_following", {"trigger": {"policy": "send_on_area", "delta_s": 0.02}})
+    assert "all errors stay bounded" in area.certificate.reason
+    assert area.run.threshold is None
+    assert area.figure().axes

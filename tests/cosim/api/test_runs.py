@@ -6,8 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -114,17 +114,8 @@ def test_an_interrupted_live_run_is_returned() -> None:
 
 
 def test_a_live_run_needs_the_main_thread(scenario: noack.Scenario) -> None:
-    caught: list[noack.NoackError] = []
-
-    def start() -> None:
-        with pytest.raises(noack.NoackError, match="main thread") as error:
-            noack.run(scenario)
-        caught.append(error.value)
-
-    thread = threading.Thread(target=start)
-    thread.start()
-    thread.join()
-    assert caught
+    with ThreadPoolExecutor() as pool, pytest.raises(noack.NoackError, match="main thread"):
+        pool.submit(noack.run, scenario).result()
 
 
 def test_a_table_is_the_file_with_a_column_of_seconds_first(simulated: noack.Run) -> None:

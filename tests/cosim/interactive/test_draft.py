@@ -179,6 +179,9 @@ def test_another_kind_keeps_what_both_kinds_have() -> None:
         _ = python.scenario
     assert by_field(form_of(python), caught.value.mistakes)["controller.name"]
     assert filled(python, choice, "").value("controller") is None
+    policy = field("trigger.policy")
+    for kind in policy.options:
+        assert filled(draft, policy, kind).value("trigger.policy") in (kind, None)
 
 
 def test_the_scenarios_of_a_folder_are_offered(tmp_path: Path) -> None:
