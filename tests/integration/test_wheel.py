@@ -149,6 +149,9 @@ def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> No
     assert run["exit"]["status"] == 0
     assert run["loops"][0]["replay"]["bit_exact"]
     assert (noack.folder / "runs" / "latest" / "report.html").stat().st_size > 10_000
+    view = noack("view")
+    assert (view.returncode, view.stderr.count("\n")) == (2, 1)
+    assert "pip install 'noack[viewer]'" in view.stderr
     assert noack("netem", "--explain", "loss", "5%").returncode == 0
     doctor = json.loads(noack("doctor", *EPHEMERAL, "--seconds", "0.1", "--json").stdout)
     assert doctor["measured"]["extras"] == dict.fromkeys(EXTRAS, False)
