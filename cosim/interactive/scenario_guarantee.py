@@ -104,10 +104,13 @@ def _reason(certificate: ScenarioCertificate) -> str:
     found = certificate.constants
     if found is None:
         return certificate.void or "no bounds were found"
-    if found.rate_per_s > 0:
-        rate = number(found.rate_per_s)
-        return f"every loss pattern allowed by M: all errors decay at the rate {rate} /s"
-    return "every loss pattern allowed by M: all errors stay bounded"
+    patterns = "every loss pattern allowed by M"
+    if found.rate_per_s == 0:
+        return f"{patterns}: all errors stay bounded"
+    rate = f"decay at the rate {number(found.rate_per_s)} /s"
+    if certificate.persistent_constants is not None:
+        return f"{patterns}: all errors stay bounded; what the start causes {rate}"
+    return f"{patterns}: all errors {rate}"
 
 
 def margin_of(scenario: Scenario) -> Margin:

@@ -66,7 +66,9 @@ class LivePanel:
             self._text = ui.label().props("role=status")
             self._bar = ui.linear_progress(0.0, show_value=False).props("aria-label=progress")
             self._verdict = ui.column().classes("w-full")
-            self._log = ui.log(max_lines=MOST_LINES).classes("w-full h-40 lab-log")
+            self._log = (
+                ui.log(max_lines=MOST_LINES).classes("w-full h-40 lab-log").props("tabindex=0")
+            )
             self._frame = ui.element("div").classes("w-full")
         self._state.set_visibility(False)
         self._stop.disable()

@@ -142,6 +142,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     assert lines[0].startswith("completed 4 s: stable, ‖x‖ fell from ")
     assert lines[1].startswith("guarantee ")
     assert " transmissions (ideal loop: " in lines[2]
+    assert violations(page) == []
     (run,) = [path for path in (folder / "runs").iterdir() if not path.is_symlink()]
     report = page.js("[...document.links].find(e => e.innerText.startsWith('report')).href")
     assert report == f"{address.partition('?')[0]}report/{run.name}"
