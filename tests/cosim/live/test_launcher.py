@@ -14,7 +14,7 @@ from cosim.live.launcher import WaitLimit, _Run, launch, require_disk_space, spo
 from cosim.live.run_watcher import Watcher
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus, MachineError
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import RECORDER, ROLES
 from noack.runtime.command_line import Signals
 from noack.runtime.join_ticket import new_ticket, published
 from noack.scenario.resolution import resolve
@@ -161,6 +161,23 @@ def test_a_restart_that_fails_ends_the_run_with_both_reasons(
     assert policy.check() is None
     children.exit("sensor", 2)
     assert policy.check() == (ExitStatus.CALLER, f"{KILLED}; restarted, sensor: no room")
+
+
+@pytest.mark.parametrize(
+    ("running", "lost", "late"),
+    [
+        (("plant", RECORDER), (), "no report from plant"),
+        ((), (RECORDER,), "no report from recorder"),  # it sorts a long record
+        ((), (), f"{', '.join(ROLES)} reported the end, but did not exit"),
+    ],
+)
+def test_a_run_that_does_not_end_names_the_late_process(
+    case: Case, running: tuple[str, ...], lost: tuple[str, ...], late: str
+) -> None:
+    coordinator = FakeCoordinator(2.0, **dict.fromkeys(lost, "stopped responding"))
+    coordinator._running = running
+    reason = case.run(case.children(None), coordinator)._overdue()
+    assert reason.startswith(f"the run did not end at its horizon: {late}, too slow or stopped; ")
 
 
 class Ending(FakeCoordinator):

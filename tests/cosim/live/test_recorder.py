@@ -1,7 +1,9 @@
 """The recorder: invalid telemetry, restarts, full disks, and claims that become void in the run."""
 
+import errno
 import io
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from cosim.analysis.run_summary import summarise
 from cosim.live import recorder
 from cosim.live.progress import progress_line
 from cosim.live.recorder import Recorder
+from cosim.output.viewer.recording import ViewError
 from cosim.record.record_source import with_loop
 from cosim.record.run_directory import SCENARIO_FILE
 from cosim.record.run_record import RunRecord, load_record
@@ -214,6 +217,23 @@ def test_a_deleted_spool_file_is_reported(run: Run) -> None:
         run.recorder.acknowledge()
     run.recorder.finish()
     assert "was deleted or moved" in str(run.recorder.lost)
+
+
+def test_a_log_on_a_full_disk_does_not_stop_the_record(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The view fails first; reporting the failure must not raise another error."""
+
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("sys.stderr", Full())
+        run.recorder.give_up_view(ViewError("no space left"))
+        run.send("junk", 0, b"", "plant")
+    run.rows(PLANT_STEP, 3)
+    assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1
 
 
 # --- claims ---------------------------------------------------------------------------------------

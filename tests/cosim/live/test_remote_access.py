@@ -5,8 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from cosim.live.remote_access import ConnectionFloodWatch, listen_address, listening_for
+from cosim.live.remote_access import (
+    ConnectionFloodWatch,
+    listen_address,
+    listening_for,
+    with_clocks,
+)
 from noack.core.errors import CallerError
+from noack.scenario.run_sections import ClocksSection
+from noack.scenario.scenario_file import load
 
 ROBOT = '[controller]\nssh = "robot"\n'
 UNREACHABLE = "not an address at which other hosts can reach this one"
@@ -43,6 +50,13 @@ def test_an_address_may_lack_its_port(text: str, address: tuple[str, int]) -> No
 def test_an_address_that_others_cannot_reach_is_refused(text: str, reason: str) -> None:
     with pytest.raises(CallerError, match=reason):
         listen_address(text)
+
+
+def test_one_loop_records_the_bounds_of_its_clocks() -> None:
+    one = load(Path("scenarios/lane_following.toml"))
+    assert with_clocks(one).clocks == ClocksSection()
+    strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
+    assert with_clocks(strict) is strict
 
 
 def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,13 +12,15 @@ import rerun.chunk
 from typer.testing import CliRunner, Result
 
 from cosim.analysis.network_summary import in_flight
-from cosim.analysis.summary_model import read_summary
+from cosim.analysis.summary_model import ReplayPart, read_summary
 from cosim.cli import app
+from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
-from cosim.record.run_record import RecordedRun, load_record
+from cosim.record.run_directory import RunEnding, write_environment
+from cosim.record.run_record import RecordedRun, RunRecord, load_record
 from cosim.simulation.virtual_time import Progress, simulate
-from noack.core.errors import CallerError, MachineError
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.number_format import number as written
 from noack.protocol.record_tables import NETEM_PACKET, tables
 from noack.scenario.resolution import network_tables, resolve
@@ -44,6 +47,22 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
     return (folder / "latest").resolve()
+
+
+def test_a_live_run_in_which_no_loop_sent_anything_has_not_failed(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(run_dir, again)
+    write_environment(again, "live")
+
+    def replayed(record: RunRecord, *_: object) -> ReplayPart:
+        return ReplayPart(bit_exact=None if record.is_network else True)
+
+    monkeypatch.setattr("cosim.live.finalize._replay", replayed)
+    summary = finalize(RunEnding(again, 0, ExitStatus.OK, "horizon"), report=False).summary
+    assert summary.network.replay == ReplayPart(bit_exact=None)
+    assert summary.exit.status == ExitStatus.OK
 
 
 def test_the_summary_adds_up(run_dir: Path) -> None:
