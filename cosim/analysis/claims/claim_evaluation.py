@@ -455,9 +455,11 @@ def _part_of(
             _begin(table, rows, sequence)
         return rows
 
-    batches = record.source.batches(SENSOR_MEASUREMENT)
-    first = next(filter(len, (derive(SENSOR_MEASUREMENT, rows) for rows in batches)), None)
-    x_0 = np.array(scenario.plant.initial_state) - x_r if first is None else first["x"][0]
+    x_0 = np.array(scenario.plant.initial_state) - x_r
+    if sequence is not None:  # the part begins with the state that the event transmitted
+        batches = record.source.batches(SENSOR_MEASUREMENT)
+        found = filter(len, (derive(SENSOR_MEASUREMENT, rows) for rows in batches))
+        x_0 = next((rows["x"][0] for rows in found), x_0)
     scenario = about_setpoint(scenario)
     update = {
         "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),

@@ -16,7 +16,7 @@ from noack.disturbances.step import StepDisturbance
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.scenario.resolution import loop_of, setpoint_of
+from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
 
@@ -163,6 +163,9 @@ def void_at_setpoint(resolved: Scenario) -> Mapping[str, str]:
         why = "at a set-point the error of the observer's first estimate is not known"
         return {OWN_PLANT: why, BOX: why}
     x_r, u_r = setpoint
+    if x_r.any() and policy_of(resolved).depends_on_state:
+        why = "the trigger compares with x, and not with its distance from the set-point"
+        return {OWN_PLANT: why, BOX: why}
     half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
     moved = np.zeros(len(x_r)) if half_A is None else np.array(half_A) @ np.abs(x_r)
     moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
