@@ -182,7 +182,6 @@ ADVANCE = """
         (DERIVATIVE, "z[0] = 7.0", "read-only"),
         (DERIVATIVE, "return [z[1] + 1e-3j, 0.0]",
          "TypeError: derivative(t_s, z, u) is not of real numbers"),
-        (ADVANCE, 'raise KeyError("wind")', "KeyError: 'wind' (mine.py, line 8)"),
         (ADVANCE, "self.x = [1.0, 2.0, 3.0]", "x has shape (3,), expected (2,)"),
     ],
 )  # fmt: skip

@@ -151,7 +151,6 @@ def control_object(**attributes: Any) -> Any:
 def systems() -> dict[str, Any]:
     return {
         "two": (A, B),
-        "four": (A, B, C, D),
         "scipy": signal.StateSpace(A, B, C, D),
         "default names": control_object(dt=0, state_labels=["x[0]", "x[1]"], input_labels=["u[0]"]),
     }

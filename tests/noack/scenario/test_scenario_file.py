@@ -146,7 +146,6 @@ def test_an_error_in_a_setting_is_not_attributed_to_the_file(
         ),
         ("loss = { model = 'a', model = 'b' }", "line 1: loss.model is defined twice"),
         ("x = [{ a = 1 },\n{ b = 1, b.c = 2 }]", "line 1: x is a table with a key twice"),
-        ("[plant\n", "line 1"),
     ],
 )
 def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: Path) -> None:

@@ -59,7 +59,6 @@ def test_shipped_scenarios_are_valid(validator: Any, path: Path) -> None:
         "trigger.bta=1",
         'network.loss={model="bernoulli"}',
         'network.loss={model="lossless",probability=0.5}',
-        "ports={plant=70000}",
     ],
 )
 def test_the_schema_refuses_mistakes(
