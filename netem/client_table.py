@@ -57,7 +57,7 @@ class LinkWarnings:
         """Whether an errno means that no file descriptor is left; if so, refuse further clients."""
         if error not in (errno.EMFILE, errno.ENFILE):
             return False
-        self._full = True
+        self._full = clients > 0  # the end of one makes place
         self._report(
             f"no file descriptors are left for more than {clients} clients; raise the limit "
             "(ulimit -n)"

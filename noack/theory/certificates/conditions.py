@@ -19,6 +19,7 @@ from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of, policy_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
+from noack.trigger.trigger_rule import TriggerRule
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -163,7 +164,8 @@ def void_at_setpoint(resolved: Scenario) -> Mapping[str, str]:
         why = "at a set-point the error of the observer's first estimate is not known"
         return {OWN_PLANT: why, BOX: why}
     x_r, u_r = setpoint
-    if x_r.any() and policy_of(resolved).depends_on_state:
+    policy = policy_of(resolved)
+    if x_r.any() and isinstance(policy, TriggerRule) and policy.depends_on_state:
         why = "the trigger compares with x, and not with its distance from the set-point"
         return {OWN_PLANT: why, BOX: why}
     half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
