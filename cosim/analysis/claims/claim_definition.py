@@ -8,12 +8,8 @@ import numpy as np
 
 from cosim.analysis.claims.observed_conditions import Reals, VoidFrom, earliest
 from cosim.analysis.claims.run_evidence import RunEvidence, Samples
-from noack.core.linear_systems import row_norms
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
-
-ROUNDING = 1e-9
-"""Relative rounding error of an exact computation over a run of 10,000 steps."""
 
 
 class Envelope(NamedTuple):
@@ -106,7 +102,7 @@ def controller_error_bound(
     """Return a bound of ‖e_c‖_W at the measurements, (k,); it is void from a record's first gap."""
     here = samples.in_common
     # Allow for the rounding of x, which matters for a bound of that size.
-    slack = ROUNDING * row_norms(samples.joined.x[here])
+    slack = run.rounding(samples.joined.x[here])
     shares = upper_shares(samples.joined.e_c_norm[here], values[here] + slack)
     return Bound(formula, samples.t_s[here], shares, earliest([void, run.first_gap]), constant)
 

@@ -27,7 +27,6 @@ import numpy as np
 
 from cosim.analysis.claims import catalogue
 from cosim.analysis.claims.claim_definition import (
-    ROUNDING,
     Bound,
     CertifiedClaim,
     ClaimDefinition,
@@ -36,6 +35,7 @@ from cosim.analysis.claims.claim_definition import (
 )
 from cosim.analysis.claims.observed_conditions import AssumptionViolation, VoidFrom
 from cosim.analysis.claims.run_evidence import (
+    ROUNDING,
     RunEvidence,
     RunPart,
     Samples,
@@ -308,7 +308,8 @@ class RunClaims:
         own = record
         if self._setpoint is not None:
             own, certificates = _part_of(record, record.scenario, 0, None), None
-        part = RunPart(record, 0.0, _seconds(first_ns), None, void, certificates)
+        offset = _offset(record.scenario)
+        part = RunPart(record, 0.0, _seconds(first_ns), None, void, certificates, offset)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
@@ -395,8 +396,15 @@ class RunClaims:
             _seconds(until_ns) - origin_ns / NS_PER_S,
             _start_error(own, ClaimEvaluation(own).started_s),
             void_at_setpoint(made.scenario),
+            offset=_offset(made.scenario),
         )
         return ClaimEvaluation(own, part)
+
+
+def _offset(scenario: Scenario) -> float:
+    """Return ‖x_r‖ of the set-point of a scenario."""
+    setpoint = setpoint_of(scenario)
+    return 0.0 if setpoint is None else float(np.linalg.norm(setpoint[0]))
 
 
 def certify_late(claims: Sequence[RunClaims]) -> None:

@@ -43,7 +43,7 @@ from cosim.record.align import (
     identity_residual,
 )
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, Propagator, spectral_abscissa
+from noack.core.linear_systems import Matrix, Propagator, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.scenario import Scenario
@@ -65,6 +65,8 @@ from noack.theory.paper import Interval, Theorem2, longest_interval_s, theorem_1
 LateSchedules = Generator[
     NetworkConditions, Sequence[ScenarioCertificate], Sequence[ScenarioCertificate] | None
 ]
+ROUNDING = 1e-9
+"""Relative rounding error of an exact computation over a run of 10,000 steps."""
 _LONG_S = 1e300  # finite: the delay of an input that never arrived is infinite
 _ANY = NetworkConditions(sys.maxsize, _LONG_S, _LONG_S, _LONG_S, _LONG_S, _LONG_S)
 
@@ -85,6 +87,8 @@ class RunPart(NamedTuple):
     """By scope: why there is no certificate."""
     certificates: Sequence[ScenarioCertificate] | None = None
     """Those of the part's scenario, if they are known."""
+    offset: float = 0.0
+    """‖x_r‖ of the set-point: the part's x is x − x_r, and has the rounding errors of x."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,10 @@ class RunEvidence:
             true_x = joined.x if part.true_x is None else part.true_x
             since = follower.take(rows, joined)
             yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
+
+    def rounding(self, x: Reals) -> Reals:
+        """Return the rounding error of states of the part, x (k, n), (k,)."""
+        return np.asarray(ROUNDING * (row_norms(x) + self.part.offset))
 
     @cached_property
     def facts(self) -> SampleFacts:

@@ -7,7 +7,6 @@ of the certificate's conditions on.
 import numpy as np
 
 from cosim.analysis.claims.claim_definition import (
-    ROUNDING,
     Bound,
     Envelope,
     Findings,
@@ -16,7 +15,7 @@ from cosim.analysis.claims.claim_definition import (
     least_inter_event_time,
     upper_shares,
 )
-from cosim.analysis.claims.run_evidence import RunEvidence, Samples
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import row_norms
 from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
@@ -86,7 +85,7 @@ def sensor_error(
 ) -> Findings:
     """‖e_s‖_W before each reset."""
     formula = envelope_formula("‖e_s‖", certificate, "overshoot")
-    slack = ROUNDING * row_norms(samples.joined.x)
+    slack = run.rounding(samples.joined.x)
     shares = upper_shares(samples.joined.e_s_norm, certificate.sensor_error(samples.t_s) + slack)
     void = run.violation_of(certificate)
     return Findings(Bound(formula, samples.t_s, shares, void, constants.overshoot))
@@ -99,7 +98,8 @@ def state(
     """‖x‖ over time."""
     formula = envelope_formula("‖x‖", certificate, "state")
     here, values = samples.with_x, certificate.state(samples.t_s)
-    shares = upper_shares(row_norms(samples.true_x[here]), values[here])
+    slack = ROUNDING * run.part.offset
+    shares = upper_shares(row_norms(samples.true_x[here]), values[here] + slack)
     void = run.violation_of(certificate)
     return Findings(
         Bound(formula, samples.t_s[here], shares, void, constants.state),
@@ -119,7 +119,7 @@ def state_from_events(
     predicted = row_norms(since.predicted)
     here = samples.with_x & ~np.isnan(since.age_s)
     deviation = row_norms(samples.true_x[here] - since.predicted[here])
-    shares = upper_shares(deviation, most[here] + ROUNDING * predicted[here])
+    shares = upper_shares(deviation, most[here] + run.rounding(since.predicted[here]))
     formula = "‖x − e^((A+BK)(t−t_k)) x(t_k)‖ ≤ ∫‖e^((A+BK)s) B‖ ‖u − Kx‖ds, since the event t_k"
     values = np.fmin(predicted + most, certificate.state(t_s))
     return Findings(

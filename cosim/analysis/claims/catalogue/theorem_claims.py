@@ -15,7 +15,7 @@ from cosim.analysis.claims.claim_definition import (
     least_inter_event_time,
     upper_shares,
 )
-from cosim.analysis.claims.run_evidence import RunEvidence, Samples
+from cosim.analysis.claims.run_evidence import ROUNDING, RunEvidence, Samples
 from noack.core.linear_systems import row_norms, transition
 
 _LEAST_MARGIN, _LARGEST_MARGIN = 1e-9, 1e-6
@@ -47,7 +47,7 @@ def i1_model_difference(run: RunEvidence, samples: Samples) -> Findings:
     here, margin = samples.in_common, _margin(run)
     residual = samples.residual[here]
     # Use the larger model state, since a missed update may have moved x_c far from x_s.
-    scale = max(run.facts.largest_state, float(np.finfo(float).tiny))
+    scale = max(run.facts.largest_state + run.part.offset, float(np.finfo(float).tiny))
     formula = "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), relative residual ≤ {:.0e}"
     shares = residual / (margin * scale)
     return Findings(Bound(formula, samples.t_s[here], shares, run.first_gap, margin))
@@ -123,6 +123,7 @@ def theorem_2_state(run: RunEvidence, samples: Samples) -> Findings:
     envelope = Envelope("Theorem 2 (eq:normXt)", "x", samples.t_s, values, "printed")
     if not run.record.scenario.coverage.knows_state:
         return Findings(None, envelope)
-    shares = upper_shares(row_norms(samples.joined.x), values)
+    slack = ROUNDING * run.part.offset
+    shares = upper_shares(row_norms(samples.joined.x), values + slack)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
     return Findings(Bound(formula, samples.t_s, shares, run.paper_violation), envelope)
