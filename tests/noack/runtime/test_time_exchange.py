@@ -19,12 +19,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.hosts import DrivenClocks
-from noack.core.clock import NS_PER_S, ClockOffset
+from noack.core.clock import NS_PER_S, ClockOffset, RunClock
 from noack.core.errors import CallerError, PeerError
+from noack.protocol.machine_interface import BEGINNING, Notice, Record
+from noack.protocol.record_tables import LOST_NS
 from noack.protocol.wire_format import Rejection
 from noack.runtime.address import Address
 from noack.runtime.host_clocks.reference_clock import (
+    FOUND,
+    LOST,
     LOST_AFTER_NS,
+    ClockRecord,
     ClockReport,
     ReferenceClock,
     reference_clock,
@@ -327,3 +332,51 @@ def test_a_process_with_another_clock_needs_a_reference(content: dict[str, Any])
     assert reference_clock(ticket) is None
     with pytest.raises(PeerError, match="answers no requests for the time"):
         reference_clock(ticket.model_copy(update={"clock": "another"}))
+
+
+class Scripted(ReferenceClock):
+    """A reference whose reports are given."""
+
+    def __init__(self, reports: list[ClockReport]) -> None:
+        self.reports = reports
+
+    def poll(self) -> ClockReport:
+        return self.reports.pop(0)
+
+
+def test_rows_and_lines_of_the_log() -> None:
+    ms = 10**6
+    reports = [
+        ClockReport(0, 50 * ms, 7, 3000, 10),
+        ClockReport(50 * ms, 100 * ms, 8, None, 10, "no answer"),
+        ClockReport(100 * ms, 150 * ms, 8, None, 10, "no answer"),
+        ClockReport(10 * ms, 200 * ms, 9, None, 12, "a contradiction"),
+        ClockReport(200 * ms, 250 * ms, 9, 4000, 13),
+    ]
+    clock = RunClock(0, 2.0, lambda: 0)
+    record = ClockRecord("sensor", BEGINNING, clock, Scripted(reports), has_table=True)
+    outputs = [record.news(2 * one.now_ns) for one in list(reports)]
+    rows = [one for each in outputs for one in each if isinstance(one, Record)]
+    assert [one.table for one in rows] == ["sensor_clock"] * 5
+    assert [one.row for one in rows] == [
+        (0, 10, 0, 100 * ms, 50 * ms, 7, 3000),
+        (1, 10, 100 * ms, 200 * ms, 100 * ms, 8, LOST_NS),
+        (2, 10, 200 * ms, 300 * ms, 150 * ms, 8, LOST_NS),
+        (3, 12, 20 * ms, 400 * ms, 200 * ms, 9, LOST_NS),
+        (4, 13, 400 * ms, 500 * ms, 250 * ms, 9, 4000),
+    ]
+    lines = [one for each in outputs for one in each if isinstance(one, Notice)]
+    assert [(one.t_ns, one.level) for one in lines] == [
+        (200 * ms, LOST), (400 * ms, LOST), (500 * ms, FOUND)
+    ]  # fmt: skip
+    assert lines[1].text == "the bound of its clock's error is lost: a contradiction"
+
+
+def test_the_coordinators_own_clock_has_no_error() -> None:
+    record = ClockRecord("plant", BEGINNING, RunClock(time.monotonic_ns()), None, has_table=True)
+    for number in range(3):
+        (one,) = record.news(0)
+        assert isinstance(one, Record)
+        assert one.row[0] == number
+        assert one.row[-2:] == (0, 0)
+    assert record.summary() == {}
