@@ -70,7 +70,7 @@ def test_a_machine_without_limits_is_good() -> None:
     ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, FindingStatus.LIMITED),
     ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, FindingStatus.LIMITED),
     ("viewer", {"display": False}, FindingStatus.LIMITED),
-    ("viewer", {"viewer": None}, FindingStatus.BAD),
+    ("viewer", {"viewer": None}, FindingStatus.LIMITED),
     ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),
     ("versions", {"versions": {"python": "3.12.1", "noack": None}}, FindingStatus.LIMITED),
 ])  # fmt: skip
