@@ -51,6 +51,7 @@ LINES = {
     "controller_node": 390,
     "benchmarks": 4610,
     "native": 9555,
+    "tests": 44975,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 
