@@ -304,12 +304,15 @@ class RunClaims:
         record = self._judged
         changes = [made for made in changes_of(record) if made.touches_claims]
         first_ns = changes[0].first_ns if changes else NEVER_NS
-        void, certificates = void_at_setpoint(record.scenario), self.certificates
-        own = record
+        void = void_at_setpoint(record.scenario, knows_start=True)
+        own, certificates, start_error = record, self.certificates, None
         if self._setpoint is not None:
             own, certificates = _part_of(record, record.scenario, 0, None), None
+            if self._setpoint[1].any():  # the input is 0 at first, and not u_r
+                start_error = _start_error(own, ClaimEvaluation(own).started_s)
         offset = _offset(record.scenario)
-        part = RunPart(record, 0.0, _seconds(first_ns), None, void, certificates, offset)
+        until_s = _seconds(first_ns)
+        part = RunPart(record, 0.0, until_s, start_error, void, certificates, offset)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
             until_ns = NEVER_NS if after is None else after.first_ns
@@ -395,7 +398,7 @@ class RunClaims:
             origin_ns / NS_PER_S,
             _seconds(until_ns) - origin_ns / NS_PER_S,
             _start_error(own, ClaimEvaluation(own).started_s),
-            void_at_setpoint(made.scenario),
+            void_at_setpoint(made.scenario, knows_start=True),
             offset=_offset(made.scenario),
         )
         return ClaimEvaluation(own, part)

@@ -155,8 +155,12 @@ def constant_disturbance(resolved: Scenario) -> Vector:
     return w if float(np.abs(w).max()) > _AT_REST * largest else np.zeros(loop.n)
 
 
-def void_at_setpoint(resolved: Scenario) -> Mapping[str, str]:
-    """Return by scope why there is no certificate at the set-point of a linear plant."""
+def void_at_setpoint(resolved: Scenario, *, knows_start: bool = False) -> Mapping[str, str]:
+    """Return by scope why there is no certificate at the set-point of a linear plant.
+
+    Until the first input arrives, the input is 0, and not u_r; ``knows_start``: the certificate is
+    for an error of that size (``start_error``), which a run shows.
+    """
     setpoint = setpoint_of(resolved)
     if setpoint is None or not resolved.coverage.is_linear:
         return {}
@@ -167,6 +171,9 @@ def void_at_setpoint(resolved: Scenario) -> Mapping[str, str]:
     policy = policy_of(resolved)
     if x_r.any() and isinstance(policy, TriggerRule) and policy.depends_on_state:
         why = "the trigger compares with x, and not with its distance from the set-point"
+        return {OWN_PLANT: why, BOX: why}
+    if u_r.any() and not knows_start:
+        why = "the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
         return {OWN_PLANT: why, BOX: why}
     half_A, half_B = resolved.plant.uncertainty_A, resolved.plant.uncertainty_B
     moved = np.zeros(len(x_r)) if half_A is None else np.array(half_A) @ np.abs(x_r)

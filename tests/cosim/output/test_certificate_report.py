@@ -157,19 +157,25 @@ def test_a_plant_outside_its_box_is_named() -> None:
 
 
 def test_a_set_point_is_certified_in_its_own_coordinates() -> None:
-    """The lane rests at any lateral position; the pendulum does not rest where its model does."""
+    """The lane rests at any lateral position; a drawn plant does not rest where its model does."""
     moved = Certificates(scenario("lane_following", "controller.setpoint=[0.0, 0.0, 0.0, 3.0]"), 2)
     zero = scenario("lane_following", "plant.initial_state=[0.5, 0.0, 0.1, 0.0]")
     assert constants(moved.schedule) == constants(Certificates(zero, 2).schedule)
     assert moved.to_json()["setpoint"] == (0.0, 0.0, 0.0, 3.0)
-    tilted = Certificates(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
+    settings = (
+        "controller.setpoint=[0.1, 0.0]",
+        "plant.A=[[0.0, 1.0], [0.2, 0.1]]",
+        "plant.B=[[0.0], [1.0]]",
+        'plant.draw="given"',
+    )
+    tilted = Certificates(scenario("double_integrator", *settings), 2)
     loop = loop_of(tilted.scenario)
     x_r, H_of_plant = np.array([0.1, 0.0]), loop.A + loop.B @ loop.K
-    given = loop_of(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"))
-    assert given.setpoint_input is not None
-    rest = -np.linalg.solve(H_of_plant, loop.A @ x_r + loop.B @ given.setpoint_input)
+    rest = -np.linalg.solve(H_of_plant, loop.A @ x_r)
     persistent = tilted.paper.state(np.array([1e3]))[0]
     assert 0 < np.linalg.norm(rest) < persistent < 30 * np.linalg.norm(rest)
+    with pytest.raises(CallerError, match="the input is 0 until the first one arrives"):
+        Certificates(scenario("unstable_pendulum", "controller.setpoint=[0.1, 0.0]"), 2)
 
 
 P = 0.05
