@@ -47,8 +47,15 @@ def print_certificates(
     print_unlimited(console, found.unlimited, found.unpredictable)
     for sentence in (*_in_words(found), *_stability_in_words(found)):
         console.print(sentence, markup=False, highlight=False)
-    if found.weight is not None:
+    exists = found.schedule.constants is not None
+    if found.weight is not None and exists:
         _print_weight(console, found.weight)
+    if not exists and chosen is None:
+        console.print(
+            "[yellow]no certificate for the schedule[/], in no norm that was tried: raise "
+            "plant.rate_hz and controller.rate_hz, or lower network.mansd, the network's delay or "
+            "certificate.late_periods; noack adversary shows what losses can do to the loop"
+        )
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
         console.print(terminal_table(next(certificate_tables(chosen))))
@@ -58,7 +65,7 @@ def print_certificates(
 def _print_weight(console: Console, weight: Matrix) -> None:
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
     console.print(
-        f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
+        f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",
         markup=False, highlight=False, soft_wrap=True,
     )  # fmt: skip
 

@@ -324,7 +324,8 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     rows = []
     for name, words in _SCHEDULE.items():
         times_s = (getattr(part, name) if part else None for part in (allowed, observed, covered))
-        rows.append((words, *(NONE if one is None else duration(one) for one in times_s)))
+        # After a change a certificate needs no first input: it is 0 there.
+        rows.append((words, *(duration(one) if one else NONE for one in times_s)))
     caption = "largest times: allowed by the scenario, observed, covered by the certificates used"
     yield ResultTable("schedule", caption, ("", "allowed", "observed", "certified"), rows)
 

@@ -173,24 +173,44 @@ def guarantee_of(loop: LoopSummary) -> Guarantee:
         why = next((claim.why for claim in loop.claims if claim.verdict == "void"), "")
         return Guarantee(DOUBTFUL, 0.0, why or "no certificate covers this loop")
     void = [claim for claim in loop.claims if claim.verdict == "void"]
-    late = [one.what for one in loop.assumption_violations if one.cause in SCHEDULE]
-    covered = (
-        f"certificate recomputed for its lateness: {late[0]}" if late and loop.certified_for else ""
-    )
+    late, covered = _lateness(loop), ""
+    if late and _covers_lateness(loop):
+        covered = f"certificate recomputed for the lateness of this run: {late[0]}"
     if not void:
         return Guarantee(GOOD, 0.0, covered)
+    # Each part of the run between changes of settings needs a certificate that held.
+    parts = {claim.from_s for claim in certified if claim.verdict == "held"}
+    rest = [claim for claim in void if claim in certified and claim.from_s not in parts]
+    # A certificate that covered a part for some time says more than one that does not exist.
+    concerned = [claim for claim in rest if claim.bound != "none"] or rest or void
     since_s, why = min(
         (claim.since_s or 0.0, ("no certificate: " if claim.bound == "none" else "") + claim.why)
-        for claim in void
+        for claim in concerned
     )
     if why.endswith(BEYOND_CERTIFICATE):
         why = f"at worst {why}"
     elif late and late[0] == why and not loop.missing_samples:
         why = f"at worst {why}; no certificate covers that"
-    if any(claim.verdict == "held" for claim in certified):
+    if parts and not rest:
         unchecked = f"{len(void)} {'claim' if len(void) == 1 else 'claims'} not checkable: {why}"
         return Guarantee(GOOD, 0.0, "; ".join(filter(None, (covered, unchecked))))
     return Guarantee(DOUBTFUL, since_s, why)
+
+
+def _lateness(loop: LoopSummary) -> list[str]:
+    """Return how the loop was later than its scenario allows."""
+    return [one.what for one in loop.assumption_violations if one.cause in SCHEDULE]
+
+
+def _is_late(loop: LoopSummary, claim: Claim) -> bool:
+    """Whether a claim is void because the loop was too late for it."""
+    return claim.why in _lateness(loop) or claim.why.endswith(BEYOND_CERTIFICATE)
+
+
+def _covers_lateness(loop: LoopSummary) -> bool:
+    """Whether certificates of its lateness cover the whole run."""
+    void = [claim for claim in loop.claims if claim.verdict == "void"]
+    return loop.certified_for is not None and not any(_is_late(loop, one) for one in void)
 
 
 def _guarantee_line(loops: Sequence[LoopSummary]) -> VerdictLine:
@@ -240,7 +260,7 @@ def remarks(summary: RunSummary) -> Iterator[Remark]:
     violations = [
         one
         for one in loop.assumption_violations
-        if one.what not in stated and not (loop.certified_for and one.cause in SCHEDULE)
+        if one.what not in stated and not (one.cause in SCHEDULE and _covers_lateness(loop))
     ]
     for one in violations[:_MOST_VIOLATIONS]:
         where = f"t = {one.t_s:.3f} s (reported by {one.process})"
@@ -286,17 +306,15 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
         else:
             yield f"{lost} (kernel): {where}"
     for restart in loop.restarts:
-        yield f"{restart.process} was restarted, {away(restart)}; claims are void from then on"
+        void = any(claim.verdict == "void" for claim in loop.claims)
+        consequence = "; claims are void from then on" if void else ""
+        yield f"{restart.process} was restarted, {away(restart)}{consequence}"
     for role, reasons in loop.rejected_datagrams.items():
         counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
         yield f"{role} rejected datagrams: {counts}"
     if guarantee_of(loop).why.startswith("no certificate: the loop gain"):
         yield "no bound is certified: noack certify looks for a norm with which there are some"
-    late = {one.what for one in loop.assumption_violations if one.cause in SCHEDULE}
-    unchecked = any(
-        claim.verdict == "void" and (claim.why in late or claim.why.endswith(BEYOND_CERTIFICATE))
-        for claim in loop.claims
-    )
+    unchecked = any(claim.verdict == "void" and _is_late(loop, claim) for claim in loop.claims)
     if unchecked and not loop.missing_samples and summary.kind == "live" and not loop.restarts:
         what = "A host or the network between hosts" if _has_clocks(loop) else "This machine"
         yield (
@@ -497,7 +515,8 @@ def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
     if report.is_file():
         yield f"report         {report}"
     shown = run_dir / RECORDING_FILE if loop is None else f"{run_dir}{of_loop}"
-    yield f"view           {_program()} view {shown}"
+    if (run_dir / RECORDING_FILE).is_file():
+        yield f"view           {_program()} view {shown}"
 
 
 def _program() -> str:

@@ -118,6 +118,7 @@ def least_inter_event_time(
     """Return a lower bound of the inter-event time, and the same as a line over the run."""
     t_s, passed_s = samples.inter_event_s
     formula = "t_(i+1) − t_i ≥ {:.4g} s"
+    void = earliest([void, run.lost_in_rounding])
     bound = Bound(formula, t_s, least_s / passed_s, void, least_s, is_lower=True)
     ends_s = np.array([0.0, run.record.scenario.horizon_s])
     return Findings(bound, Envelope(label, "inter_event", ends_s, np.full(2, least_s), kind))

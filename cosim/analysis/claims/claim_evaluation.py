@@ -311,7 +311,7 @@ class RunClaims:
             if self._setpoint[1].any():  # the input is 0 at first, and not u_r
                 start_error = _start_error(own, ClaimEvaluation(own).started_s)
         offset = _offset(record.scenario)
-        until_s = _seconds(first_ns)
+        until_s = _until_s(first_ns, 0)
         part = RunPart(record, 0.0, until_s, start_error, void, certificates, offset)
         found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=False):
@@ -361,7 +361,7 @@ class RunClaims:
                     update={
                         "since_s": None if claim.since_s is None else claim.since_s + from_s,
                         "from_s": from_s,
-                        "until_s": from_s + until_s if math.isfinite(until_s) else None,
+                        "until_s": round(from_s + until_s, 9) if math.isfinite(until_s) else None,
                     }
                 )
                 for claim in one.judge()
@@ -396,7 +396,7 @@ class RunClaims:
         part = RunPart(
             record,
             origin_ns / NS_PER_S,
-            _seconds(until_ns) - origin_ns / NS_PER_S,
+            _until_s(until_ns, origin_ns),
             _start_error(own, ClaimEvaluation(own).started_s),
             void_at_setpoint(made.scenario, knows_start=True),
             offset=_offset(made.scenario),
@@ -431,8 +431,9 @@ def _nothing_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
     return void_claim("claims after a change", "claims", at_s, why, until_s)
 
 
-def _seconds(t_ns: int) -> float:
-    return math.inf if t_ns == NEVER_NS else t_ns / NS_PER_S
+def _until_s(until_ns: int, origin_ns: int) -> float:
+    """Return the end of a part in its own time, computed as the times of its samples are."""
+    return math.inf if until_ns == NEVER_NS else (until_ns - origin_ns) * 1e-9
 
 
 def _until(envelope: Envelope, until_s: float) -> Envelope:
@@ -467,9 +468,10 @@ def _part_of(
         return rows
 
     x_0 = np.array(scenario.plant.initial_state) - x_r
-    if sequence is not None:  # the part begins with the state that the event transmitted
-        batches = record.source.batches(SENSOR_MEASUREMENT)
-        found = filter(len, (derive(SENSOR_MEASUREMENT, rows) for rows in batches))
+    if sequence is not None:
+        # The part begins with the plant's state at the event, which noise may hide from the sensor.
+        table = SENSOR_MEASUREMENT if scenario.coverage.knows_state else PLANT_STEP
+        found = filter(len, (derive(table, rows) for rows in record.source.batches(table)))
         x_0 = next((rows["x"][0] for rows in found), x_0)
     scenario = about_setpoint(scenario)
     update = {
@@ -521,7 +523,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
         if ended < len(steps):
             break
         last = steps[-1:]
-    return largest
+    return max(largest, float(np.finfo(float).tiny))  # 0 would be that of a run from its start
 
 
 def _input_error(own: RunRecord, steps: Rows, alpha_per_s: float) -> float:

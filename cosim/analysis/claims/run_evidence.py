@@ -18,6 +18,7 @@ from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
     BEYOND_CERTIFICATE,
     CLOCK_CAUSES,
+    SCHEDULE,
     AssumptionViolation,
     ObservedConditions,
     Reals,
@@ -146,6 +147,17 @@ class RunEvidence:
             true_x = joined.x if part.true_x is None else part.true_x
             since = follower.take(rows, joined)
             yield Samples(joined, common, tuple(both), residual, true_x, passed, since)
+
+    @cached_property
+    def lost_in_rounding(self) -> VoidFrom | None:
+        """When the threshold falls below the rounding of x at a set-point: events are chance."""
+        for part in aligned_parts(self.record) if self.part.offset else ():
+            joined = part.aligned
+            below = np.flatnonzero(joined.threshold < self.rounding(joined.x))
+            if len(below):
+                why = "the threshold is below the rounding error of x at the set-point"
+                return VoidFrom(float(joined.t_ns[below[0]]) * 1e-9, why)
+        return None
 
     def rounding(self, x: Reals) -> Reals:
         """Return the rounding error of states of the part, x (k, n), (k,)."""
@@ -301,10 +313,11 @@ class RunEvidence:
         """Return the time at which the run first violated the conditions of a certificate."""
         known, conditions = self._violations, certificate.conditions
         if id(certificate) not in known:
-            found = self.observed.first_violation(conditions)
-            if found is not None and conditions == self.certified_for:
-                found = found._replace(why=found.why.replace(" s allowed", BEYOND_CERTIFICATE))
-            known[id(certificate)] = found
+            first = min(self.observed.violations(conditions), default=None)
+            why = "" if first is None else first.text
+            if first is not None and first.cause in SCHEDULE and conditions == self.certified_for:
+                why = why.replace(" s allowed", BEYOND_CERTIFICATE)
+            known[id(certificate)] = None if first is None else VoidFrom(first.t_s, why)
         return known[id(certificate)]
 
     def missing_events(self, samples: Samples, bounds: KnownStateBounds) -> NDArray[np.int64]:

@@ -37,7 +37,7 @@ def certify(
     If there are none for the given norm, those of a norm that noack chooses follow, with the lines
     for the scenario file.
 
-    Exit status 1: nothing can be certified.
+    Exit status 1: nothing can be certified, not even under the paper's conditions.
 
     Options:
         weight: Norm of the trigger: `given` in the scenario, `identity`, or `chosen` by noack.

@@ -245,7 +245,7 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
     """At 100 Hz the lane has no certificate in the paper's norm."""
     slow = ["--set=plant.rate_hz=100", "--set=controller.rate_hz=100"]
     shown = CliRunner().invoke(app, ["certify", "lane_following", *slow]).stdout
-    pasted = shown[shown.index("[trigger]\nweight = [") :].splitlines()[1:]
+    pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)
     weighted = certificates_of(
         load(ROOT / "scenarios/lane_following.toml",

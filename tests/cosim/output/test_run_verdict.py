@@ -20,6 +20,7 @@ from tests.cosim.summaries import with_values
 RED, RED_STYLE = "\x1b[1;31m", "bold red"
 LOST = {"t_s": 2.5, "process": "controller", "cause": "dropouts", "what": "MANSD violated: 6 lost"}
 LATE = {"t_s": 1.0, "process": "recorder", "cause": "hold", "what": "an input was old"}
+LATER = "an input was 0.5 s old, 0.1 s certified"
 COVERED = {"sampling_s": 0.002, "delay_s": 0.006, "hold_s": 0.02, "start_s": 0.006}
 
 
@@ -68,8 +69,13 @@ def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
          "guarantee kept: 1 claim held, none violated; 1 claim not checkable: no certificate: "
          "gain 2", "green"),
         ([claim("held")], {"assumption_violations": [LATE], "certified_for": COVERED},
-         "guarantee kept: 1 claim held, none violated; certificate recomputed for its lateness: "
-         "an input was old", "green"),
+         "guarantee kept: 1 claim held, none violated; certificate recomputed for the lateness of "
+         "this run: an input was old", "green"),
+        ([claim("held"), claim("void", "old") | {"from_s": 2.0, "since_s": 3.0}], {},
+         "guarantee kept until 3.000 s, then not checkable: old", "yellow"),
+        ([claim("void", LATER), claim("void", "box") | {"bound": "none", "since_s": 0.0}],
+         {"assumption_violations": [LATE], "certified_for": COVERED},
+         f"guarantee kept until 1.000 s, then not checkable: at worst {LATER}", "yellow"),
         ([claim("held") | {"source": "(I1)"}], {},
          "guarantee not checkable: no certificate covers this loop", "yellow"),
         ([], {}, "guarantee not checkable: no certificate covers this loop", "yellow"),

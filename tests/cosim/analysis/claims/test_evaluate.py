@@ -17,6 +17,7 @@ from cosim.analysis.claims.run_evidence import trajectory_delta
 from cosim.analysis.summary_model import Claim, ClaimVerdict
 from cosim.record.align import AlignedRun, align_tables
 from cosim.record.run_record import RunRecord
+from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -28,7 +29,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import validate
+from noack.scenario.scenario_file import load, validate
 from tests.cosim.analysis.claims.conftest import MS, Make, event_s, without
 from tests.cosim.record.changed_records import changed
 from tests.oracles.random_scenarios import POLICIES, random_scenario
@@ -169,6 +170,27 @@ def test_no_random_run_violates_a_claim(policy: str) -> None:
         judged.update(claim.verdict for claim in RunClaims(record).judge())
     assert judged[VIOLATED] == 0
     assert judged[HELD] > 3
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("double_integrator", ['trigger={policy="relative", sigma=0.05}', "network.mansd=0"]),
+        ("double_integrator", ["plant.measurement.noise_bound=[0.01, 0.01]",
+                               'network.initial_sync="known_state"']),
+        ("double_integrator", ["plant.initial_state=[3.0, 1e-9]"]),
+        ("double_integrator", ["trigger.floor=0.0", "horizon_s=150"]),
+        ("unstable_pendulum", []),
+    ],
+)  # fmt: skip
+def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> None:
+    """Rounding is that of x; until the first input, u is 0 and not u_r."""
+    x_r = 3.0 if name == "double_integrator" else 0.1
+    settings = [f"controller.setpoint=[{x_r}, 0.0]", *settings]
+    record = simulate(resolve(load(find_shipped(name, "scenarios"), settings)))
+    verdicts = {claim.verdict for claim in RunClaims(record).judge()}
+    assert VIOLATED not in verdicts
+    assert HELD in verdicts
 
 
 # --- claims that cannot be judged -----------------------------------------------------------------
