@@ -30,7 +30,7 @@ LINES = {
     "noack/protocol": 840,
     "noack/runtime": 5105,
     "noack/settings": 485,
-    "noack/theory": 8340,
+    "noack/theory": 8345,
     "noack/traces": 1335,
     "noack/trigger": 1070,
     "netem": 5580,
@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 390,
     "benchmarks": 4610,
     "native": 9555,
-    "tests": 45010,
+    "tests": 45045,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

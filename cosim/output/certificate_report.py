@@ -52,7 +52,7 @@ def print_certificates(
         _print_weight(console, found.weight)
     if not exists and chosen is None:
         console.print(
-            "[yellow]no certificate for the schedule[/], in no norm that was tried: raise "
+            "[yellow]no certificate for the schedule[/], nor in another norm: raise "
             "plant.rate_hz and controller.rate_hz, or lower network.mansd, the network's delay or "
             "certificate.late_periods; noack adversary shows what losses can do to the loop"
         )

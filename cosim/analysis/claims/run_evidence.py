@@ -153,7 +153,8 @@ class RunEvidence:
         """When the threshold falls below the rounding of x at a set-point: events are chance."""
         for part in aligned_parts(self.record) if self.part.offset else ():
             joined = part.aligned
-            below = np.flatnonzero(joined.threshold < self.rounding(joined.x))
+            compared = joined.threshold > 0  # a periodic trigger compares nothing
+            below = np.flatnonzero(compared & (joined.threshold < self.rounding(joined.x)))
             if len(below):
                 why = "the threshold is below the rounding error of x at the set-point"
                 return VoidFrom(float(joined.t_ns[below[0]]) * 1e-9, why)

@@ -113,8 +113,8 @@ class TriggerBound(NamedTuple):
     due_s: float = math.inf
     """Events are at most this far apart."""
     forced_s: float = math.inf
-    """No event comes earlier than this because it is due: at most :attr:`due_s`, as tests may be
-    missing."""
+    """The earliest time after an event at which the next one may be due; before :attr:`due_s` where
+    tests may be missing."""
     also: tuple["TriggerBound", ...] = ()
     """Further bounds that hold at the same time; only their e_s is used, not their times."""
     unit: float | None = None

@@ -241,12 +241,17 @@ class TriggerBounds:
         Raises: as :meth:`bound`.
         """
         whole = self.bound(conditions, self.floor, self.floor or None)
-        due_s, forced_s = whole.due_s, whole.forced_s
         alone = [
-            one._replace(apart_s=apart_s, due_s=due_s, forced_s=forced_s, unit=1.0, reached=None)
-            for one in whole.every
+            bound._replace(
+                apart_s=apart_s,
+                due_s=whole.due_s,
+                forced_s=whole.forced_s,
+                unit=1.0,
+                reached=None,
+                also=(),
+            )
+            for bound in whole.every
         ]
-        alone = [one._replace(also=()) for one in alone]
         return [(bound._replace(beta=0.0), bound) for bound in alone]
 
     def text(self) -> str:

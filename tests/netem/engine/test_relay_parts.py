@@ -1,5 +1,6 @@
 """Parts of a relay: its histogram, its links, its memory."""
 
+import errno
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from netem.client_table import LinkWarnings
 from netem.relay_links import (
     BUCKETS,
     LinkSpec,
@@ -164,3 +166,11 @@ def test_memory_is_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
             assert len(relay._clients._free_rows) == len(memory.clients)
             assert relay._clients._paths == {}
             assert relay._directions[0].rows == 16
+
+
+def test_a_link_without_clients_tries_again_after_a_lack_of_descriptors() -> None:
+    """With a client it waits for the end of one; without, nothing would end the wait."""
+    for clients in (0, 1):
+        warnings = LinkWarnings(link(("127.0.0.1", 9)))
+        assert warnings.no_descriptor_left(errno.EMFILE, clients)
+        assert warnings.accepts_client(clients) is (clients == 0)

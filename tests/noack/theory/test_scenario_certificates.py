@@ -227,3 +227,15 @@ def test_the_limit_is_found_to_its_resolution(name: str, limit_s: float, usual_s
 def test_all_times_or_none_may_have_a_certificate() -> None:
     assert largest(lambda value_s: 0.5, 0.01) == MOST_S
     assert largest(lambda value_s: math.inf, 0.01) == 0.0
+
+
+def test_events_that_are_due_may_come_as_soon_as_they_are_due() -> None:
+    """Where measurements may be missing, the longest time between two events is longer."""
+    trigger = 'trigger={policy="deadline", interval_s=0.04, rule={policy="absolute", delta=5.0}}'
+    resolved = resolve(
+        load(ROOT / "scenarios" / "double_integrator.toml", [trigger, "network.mansd=0"])
+    )
+    conditions = nominal_conditions(resolved)
+    missing = conditions._replace(sampling_s=5 * conditions.spacing_s)
+    for one in (conditions, missing):
+        assert own_plant(resolved).certificate(one).inter_event_s == pytest.approx(0.04)

@@ -180,6 +180,7 @@ def test_no_random_run_violates_a_claim(policy: str) -> None:
                                'network.initial_sync="known_state"']),
         ("double_integrator", ["plant.initial_state=[3.0, 1e-9]"]),
         ("double_integrator", ["trigger.floor=0.0", "horizon_s=150"]),
+        ("double_integrator", ['trigger={policy="periodic", period_s=0.1}', "network.mansd=0"]),
         ("unstable_pendulum", []),
     ],
 )  # fmt: skip
@@ -188,9 +189,20 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
     x_r = 3.0 if name == "double_integrator" else 0.1
     settings = [f"controller.setpoint=[{x_r}, 0.0]", *settings]
     record = simulate(resolve(load(find_shipped(name, "scenarios"), settings)))
-    verdicts = {claim.verdict for claim in RunClaims(record).judge()}
+    claims = RunClaims(record).judge()
+    verdicts = {claim.verdict for claim in claims}
     assert VIOLATED not in verdicts
     assert HELD in verdicts
+    if any("periodic" in one for one in settings):
+        certified = [claim.verdict for claim in claims if claim.source == "certificate"]
+        assert set(certified) == {HELD}
+
+
+@pytest.mark.parametrize("number", [2839, 4099, 12380])
+def test_no_claim_is_violated_in_runs_that_an_attack_found(number: int) -> None:
+    """u_r ≠ 0 before the first input; an event at the time of a change."""
+    record = simulate(resolve(validate(random_scenario(number), "random")))
+    assert VIOLATED not in {claim.verdict for claim in RunClaims(record).judge()}
 
 
 # --- claims that cannot be judged -----------------------------------------------------------------
