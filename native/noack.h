@@ -491,7 +491,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     /* state */
     noack_trigger_state trigger;
     double *x_s;        /* (n,) */
-    double *event_x;    /* (n,) x at the last event */
+    double *event_x;    /* (n,) x - x_r at the last event */
     int64_t model_ns;
     int64_t knows_state; /* 0: the first measurement is an event */
     int64_t events;      /* number of the next one */
@@ -505,7 +505,7 @@ typedef struct { /* sensor_node/sensor.py makes it */
     int64_t asked_ns; /* time of the measurement */
     int64_t event;
     double left, right;
-    double *scratch; /* (4n + rows of the rule's longest matrix,) */
+    double *scratch; /* (5n + rows of the rule's longest matrix,) */
 } noack_sensor;
 
 typedef struct { /* controller_node/controller.py makes it */
@@ -629,6 +629,8 @@ int64_t noack_trigger_test(
     const noack_trigger_rule *rule, noack_trigger_state *state, int64_t n, int64_t t_ns,
     const double *x, const double *e_s, double sides[2], double *scratch);
 double noack_forecast_ns(const noack_trigger_rule *rule, double size, double t_s);
+/* The set point x_r at a time, (n,); NULL if it is 0. */
+const double *noack_model_point(const noack_model *model, int64_t t_ns);
 void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result);
 const double *noack_transition(noack_transitions *transitions, int64_t dt_ns);

@@ -15,6 +15,7 @@ and corrected by y (native/loop/observer.c). If measurements are missing, the in
 are unknown, and the first known input is used.
 """
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -214,8 +215,8 @@ class Sensor:
         """Ask the user's trigger about a measurement."""
         trigger, n = self._trigger, sensor.machine.n
         assert trigger is not None
-        x, e_s = reals_at(sensor.x, n).copy(), reals_at(sensor.e_s, n).copy()
-        t_ns = sensor.asked_ns
+        t_ns, e_s = sensor.asked_ns, reals_at(sensor.e_s, n).copy()
+        x = self._from_setpoint(t_ns, reals_at(sensor.x, n).copy())
         if sensor.first:
             trigger.start(t_ns, x)
         decision = trigger.test(t_ns, x, e_s)
@@ -226,6 +227,7 @@ class Sensor:
 
     def _start(self, sensor: CData, t_ns: int, x: Vector) -> None:
         """Restart the trigger's condition at an event at x, (n,)."""
+        x = self._from_setpoint(t_ns, x)
         if self._trigger is not None:
             self._trigger.start(t_ns, x)
             return
@@ -236,6 +238,11 @@ class Sensor:
             sensor.scratch,
         )  # fmt: skip
 
+    def _from_setpoint(self, t_ns: int, x: Vector) -> Vector:
+        """Return x − x_r at a time, (n,), which a trigger compares with."""
+        point = self._points[bisect_right(self._since_ns, t_ns)]
+        return x if point is None else x - point
+
     def _set_policy(self, sensor: CData, policy: Policy) -> None:
         """Set a policy as if it had been set at the last event."""
         n, memory = sensor.machine.n, self._memory
@@ -244,7 +251,7 @@ class Sensor:
             sensor.scratch = memory.zeros(5 * n)
             return
         fill_rule(sensor.rule, policy, n, memory)
-        sensor.scratch = memory.zeros(4 * n + rule_rows(policy))
+        sensor.scratch = memory.zeros(5 * n + rule_rows(policy))
         if sensor.trigger.event_ns >= 0:
             core.noack_trigger_condition(
                 ffi.addressof(sensor.rule), ffi.addressof(sensor.trigger), n,

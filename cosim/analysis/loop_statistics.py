@@ -39,7 +39,7 @@ from cosim.record.align import (
 )
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import row_norms
+from noack.core.linear_systems import Matrix, row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -55,6 +55,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import ENDS, LOOP_ROLES
 from noack.protocol.wire_format import Flow
 from noack.runtime.life_cycle import HORIZON
+from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from plant_server.plant import too_old
 
@@ -290,6 +291,15 @@ def list_violations(
     ]
 
 
+def _setpoints(record: RunRecord) -> tuple[list[int], Matrix]:
+    """Return when the set point changed, (k,), and the set points x_r, (k + 1, n); 0 is a row."""
+    changes = changes_of(record)
+    given = (setpoint_of(one) for one in (record.scenario, *(one.scenario for one in changes)))
+    nothing = np.zeros(loop_of(record.scenario).n)
+    points = [nothing if setpoint is None else setpoint[0] for setpoint in given]
+    return [one.first_ns for one in changes], np.array(points)
+
+
 def _largest_mansd(record: RunRecord, since_ns: int) -> int:
     """The largest M − 1 in force at any time from ``since_ns`` on."""
     changes = changes_of(record)
@@ -364,6 +374,7 @@ def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
 class Signals(TypedDict):
     """The fields of a loop's summary about its signals."""
 
+    setpoint: list[float] | None
     initial_state_norm: float | None
     final_state_norm: float | None
     sup_state_norm: float | None
@@ -423,12 +434,17 @@ class SignalStatistics:
     def for_summary(self) -> Signals:
         """Return norms of the state, of the errors, and of the residual of (I1)."""
         first, last, largest = None, None, None
-        for steps in self._record.source.batches(PLANT_STEP, ("x",)):
-            norms = row_norms(steps["x"])
+        since_ns, points = _setpoints(self._record)
+        for steps in self._record.source.batches(PLANT_STEP, ("t_ns", "x")):
+            x = steps["x"]
+            if points.any():
+                x = x - points[np.searchsorted(since_ns, steps["t_ns"], "right")]
+            norms = row_norms(x)
             first = float(norms[0]) if first is None else first
             last, largest = float(norms[-1]), _larger(largest, norms)
         scale = max(self._scale, float(np.finfo(float).tiny))
         return {
+            "setpoint": points[-1].tolist() if points.any() else None,
             "initial_state_norm": first,
             "final_state_norm": last,
             "sup_state_norm": largest,

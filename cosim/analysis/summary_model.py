@@ -331,6 +331,7 @@ class LoopSummary(SummaryPart):
     inter_event_min_s: Real
     inter_event_median_s: Real
     inter_delivery_median_s: Real
+    setpoint: list[float] | None = None
     initial_state_norm: Real
     final_state_norm: Real
     sup_state_norm: Real

@@ -82,6 +82,11 @@ def mode_words(mode: str) -> str:
     return "model-based" if mode == "model" else "zero-order hold"
 
 
+def state_norm(loop: LoopSummary) -> str:
+    """Return the name of the norm that shows whether a loop came to rest."""
+    return "‖x‖" if loop.setpoint is None else "‖x − x_r‖"
+
+
 def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
     """Return what a run was, how it ended, and its results, in a few lines."""
     loop, shared = summary.loops[0], shares_network(summary)
@@ -94,7 +99,10 @@ def run_facts(summary: RunSummary, directory: Path) -> list[tuple[str, str]]:
             f"{loop.events}; {loop.deliveries} received, {loop.drops} lost, "
             f"longest loss burst {loop.longest_loss_burst}",
         ),
-        ("‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)),
+        (
+            state_norm(loop),
+            " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms),
+        ),
     ]
     return [
         ("run", f"{summary.scenario}, {mode}, {summary.kind}, M − 1 = {summary.mansd}"),
@@ -138,8 +146,8 @@ def key_numbers(summary: RunSummary) -> Numbers:
         *interval_rows(
             loop.inter_event_min_s, loop.inter_event_median_s, loop.inter_delivery_median_s
         ),
-        ("‖x‖ at the start", number(loop.initial_state_norm)),
-        ("‖x‖ at the end", number(loop.final_state_norm)),
+        (f"{state_norm(loop)} at the start", number(loop.initial_state_norm)),
+        (f"{state_norm(loop)} at the end", number(loop.final_state_norm)),
         ("maximum ‖e_s‖, ‖e_c‖", f"{number(loop.sup_e_s_norm)}, {number(loop.sup_e_c_norm)}"),
         *_lateness(loop),
         *_record(loop),

@@ -39,6 +39,7 @@ from cosim.output.run_tables import (
     run_title,
     shares_network,
     short_numbers,
+    state_norm,
     summary_tables,
 )
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE, file_of_loop
@@ -115,20 +116,22 @@ def state_of(largest: float | None, final: float | None, diverged_at_s: float | 
     return "stable" if final <= _SETTLED * largest else "bounded"
 
 
-def state_text(largest: float | None, final: float | None, diverged_at_s: float | None) -> str:
-    """Return a loop's state as that word, with the largest and the last ‖x‖."""
+def state_text(
+    largest: float | None, final: float | None, diverged_at_s: float | None, norm: str = "‖x‖"
+) -> str:
+    """Return a loop's state as that word, with the largest and the last ``norm``."""
     word = state_of(largest, final, diverged_at_s)
     if not word or diverged_at_s is not None:
         return word
     if word == "stable":
-        return f"{word}, ‖x‖ fell from {largest:.3g} to {final:.3g}"
-    return f"{word}, ‖x‖ was at most {largest:.3g}, at the end {final:.3g}"
+        return f"{word}, {norm} fell from {largest:.3g} to {final:.3g}"
+    return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
 
 
 def _states(loops: Sequence[LoopSummary]) -> str:
     states = [(one.sup_state_norm, one.final_state_norm, one.diverged_at_s) for one in loops]
     if len(states) == 1:
-        return state_text(*states[0])
+        return state_text(*states[0], state_norm(loops[0]))
     counts = Counter(filter(None, (state_of(*state) for state in states)))
     (first, *others) = counts.most_common() or [("", 0)]
     words = [f"{first[1]} of {len(loops)} loops {first[0]}"] if first[1] else []
@@ -292,7 +295,7 @@ def _warnings(summary: RunSummary, loop: LoopSummary) -> Iterator[str]:
     first, last = loop.initial_state_norm, loop.final_state_norm
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
     if grew and loop.diverged_at_s is None:  # else it is the reason why the run ended
-        yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
+        yield f"{state_norm(loop)} grew from {first:.3g} to {last:.3g} during the run"
     if isinstance(loop.fidelity, FidelityPart) and not loop.fidelity.explained:
         yield "sampling, delay and hold do not explain the difference to the ideal loop"
     if loop.missing_samples:

@@ -53,6 +53,11 @@ static void advance_about(
         result[k] = point[k] + advanced[k];
 }
 
+const double *noack_model_point(const noack_model *model, int64_t t_ns) {
+    int64_t place = first_above(model->since_ns, 0, model->changes, t_ns);
+    return model->has_point[place] ? model->points + place * model->transitions->n : NULL;
+}
+
 void noack_model_advance(
     const noack_model *model, const double *x, int64_t from_ns, int64_t to_ns, double *result) {
     int64_t place = first_above(model->since_ns, 0, model->changes, from_ns);

@@ -4,7 +4,8 @@
    x_s, test, send at most one state update. x_s is reset at every event, whether or not the network
    delivers the update: nothing is acknowledged. Its time is the time of the measurements: what it
    sends does not depend on when a datagram was read. With an observer the estimate x-hat takes the
-   place of x. Where the step needs Python, it returns a question; with the answer it is repeated.
+   place of x. The trigger compares with x - x_r, the distance from the set point. Where the step
+   needs Python, it returns a question; with the answer it is repeated.
 
    In the acknowledgement baseline only an acknowledged update resets x_s: at that of update k,
    x_s <- e^(H(t - t_k)) x(t_k), which equals the controller's model then. After a transmission the
@@ -12,25 +13,41 @@
    rule still requires it. An acknowledgement restarts the trigger's condition. */
 #include "loop.h"
 
+/* The scratch of the trigger; before it are x_s and x - x_r. */
+static double *rule_scratch(const noack_sensor *sensor) {
+    return sensor->scratch + 2 * sensor->machine.n;
+}
+
+/* x - x_r at a time. */
+static const double *distance(const noack_sensor *sensor, int64_t t_ns, const double *x) {
+    const double *point = noack_model_point(&sensor->model, t_ns);
+    int64_t n = sensor->machine.n;
+    double *moved = sensor->scratch + n;
+    if (point == NULL)
+        return x;
+    for (int64_t k = 0; k < n; k++)
+        moved[k] = x[k] - point[k];
+    return moved;
+}
+
 /* Whether a measurement is an event, by the rule or by the answer of the user's trigger. */
 static int64_t test(noack_sensor *sensor, int64_t t_ns, double sides[2]) {
-    int64_t n = sensor->machine.n;
     if (!sensor->is_user)
         return noack_trigger_test(
-            &sensor->rule, &sensor->trigger, n, t_ns, sensor->x, sensor->e_s, sides,
-            sensor->scratch + n);
+            &sensor->rule, &sensor->trigger, sensor->machine.n, t_ns,
+            distance(sensor, t_ns, sensor->x), sensor->e_s, sides, rule_scratch(sensor));
     sides[0] = sensor->left;
     sides[1] = sensor->right;
     return sensor->event;
 }
 
 static void start(noack_sensor *sensor, int64_t t_ns, const double *x) {
+    int64_t n = sensor->machine.n;
     sensor->trigger.event_ns = t_ns;
-    copy(sensor->machine.n, x, sensor->event_x);
+    copy(n, distance(sensor, t_ns, x), sensor->event_x);
     if (!sensor->is_user)
         noack_trigger_start(
-            &sensor->rule, &sensor->trigger, sensor->machine.n, t_ns, x,
-            sensor->scratch + sensor->machine.n);
+            &sensor->rule, &sensor->trigger, n, t_ns, sensor->event_x, rule_scratch(sensor));
 }
 
 /* Write the row of a measurement; at an event send the update before it. */
@@ -40,7 +57,7 @@ static void answer(
     int64_t n = sensor->machine.n;
     const double *weight = sensor->rule.weight;
     double error = weight == NULL ? noack_norm(n, sensor->e_s)
-                                  : image_norm(n, n, weight, sensor->e_s, sensor->scratch + n);
+                                  : image_norm(n, n, weight, sensor->e_s, rule_scratch(sensor));
     begin_row(output, NOACK_MESSAGES, &sensor->machine, message->sequence, message->t_ns, now_ns);
     put_reals(output, n, sensor->x);
     put_reals(output, n, x_s);
@@ -138,7 +155,8 @@ static int64_t acknowledged(
         sensor->trigger.event_ns = t_ns;
         copy(n, x, sensor->event_x);
         if (!sensor->is_user)
-            noack_trigger_restart(&sensor->rule, &sensor->trigger, n, t_ns, x, sensor->scratch + n);
+            noack_trigger_restart(
+                &sensor->rule, &sensor->trigger, n, t_ns, x, rule_scratch(sensor));
         forget(sensor, place + 1);
     }
     begin_row(output, NOACK_ACKNOWLEDGEMENTS, machine, message->sequence, t_ns, now_ns);

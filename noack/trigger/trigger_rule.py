@@ -89,16 +89,6 @@ class TriggerRule(NamedTuple):
         return self.level > 0 and self.idle_ns == -math.inf and self.longest_ns == NEVER_NS
 
     @property
-    def depends_on_state(self) -> bool:
-        """Whether it compares with x, and not with e_s and constants alone."""
-        forms = [self.form]
-        if self.dynamic_variable is not None:
-            forms.append(self.dynamic_variable.gain)
-        n = self.form.up.shape[1] // 2
-        compared = any(rows[:, :n].any() for form in forms for rows in (form.up, form.down))
-        return compared or (self.forecast is not None and self.forecast.mismatch_per_s > 0)
-
-    @property
     def initial_dynamic_variable(self) -> float:
         """η at the start; 0 for a rule without η."""
         return 0.0 if self.dynamic_variable is None else self.dynamic_variable.initial

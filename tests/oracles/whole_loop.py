@@ -199,7 +199,7 @@ class Sensor:
         self.waiting: dict[int, Array] = {}  # updates without an acknowledgement
         self.wait_until_ns = 0
         if s.known_state:
-            self.trigger.event(0, s.x0)
+            self.trigger.event(0, s.x0 - in_force(s.setpoints, 0))
 
     def measure(self, number: int, t_ns: int, y: Array, u: Array) -> Array | None:
         """Process a measurement y, with the inputs since the last one; return x at an event."""
@@ -207,12 +207,13 @@ class Sensor:
         x = y if self.observer is None else self.estimate(number, y, u)
         trigger.use(in_force(self.s.rules, t_ns))
         first, self.started = not self.started, True
+        distance = x - in_force(self.s.setpoints, t_ns)  # with which the trigger compares
         if first:
-            trigger.event(t_ns, x)
+            trigger.event(t_ns, distance)
         x_s = x if first and resets else self.model.flow(self.x_s, self.t_ns, t_ns)
         e_s = x_s - x
-        trigger.measured(t_ns, x, e_s)
-        left, right = trigger.sides(t_ns, x, e_s)
+        trigger.measured(t_ns, distance, e_s)
+        left, right = trigger.sides(t_ns, distance, e_s)
         waits = bool(self.waiting) and t_ns < self.wait_until_ns
         counts, due_ns = trigger.counts(t_ns, trigger.rule), trigger.due_ns(trigger.rule)
         is_event = first or (not waits and (t_ns >= due_ns or (counts and left > right)))
@@ -227,8 +228,8 @@ class Sensor:
             return None
         if resets:  # whether or not the network will deliver the update
             self.x_s = x
-            trigger.event(t_ns, x)
-            trigger.measured(t_ns, x, 0 * x)
+            trigger.event(t_ns, distance)
+            trigger.measured(t_ns, distance, 0 * x)
         else:
             self.waiting[self.events] = x
             self.wait_until_ns = t_ns + (self.s.acknowledgement_timeout_ns or 0)

@@ -16,10 +16,9 @@ from noack.disturbances.step import StepDisturbance
 from noack.impairments.loss_guarantee import LongestBurst, LossGuarantee
 from noack.impairments.loss_prediction import loss_process
 from noack.impairments.markov_chain import NotPredictableError
-from noack.scenario.resolution import loop_of, policy_of, setpoint_of
+from noack.scenario.resolution import loop_of, setpoint_of
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.terms import NetworkConditions
-from noack.trigger.trigger_rule import TriggerRule
 
 OWN_PLANT = "the scenario's plant"
 BOX = "every plant of the uncertainty box"
@@ -168,10 +167,6 @@ def void_at_setpoint(resolved: Scenario, *, knows_start: bool = False) -> Mappin
         why = "at a set-point the error of the observer's first estimate is not known"
         return {OWN_PLANT: why, BOX: why}
     x_r, u_r = setpoint
-    policy = policy_of(resolved)
-    if x_r.any() and isinstance(policy, TriggerRule) and policy.depends_on_state:
-        why = "the trigger compares with x, and not with its distance from the set-point"
-        return {OWN_PLANT: why, BOX: why}
     if u_r.any() and not knows_start:
         why = "the input is 0 until the first one arrives, and not the set-point's u_r ≠ 0"
         return {OWN_PLANT: why, BOX: why}

@@ -107,6 +107,15 @@ def test_the_state_is_stable_bounded_or_diverged(
     assert state_text(largest, final, diverged_at_s) == text
 
 
+def test_at_a_set_point_the_state_is_the_distance_from_it(tmp_path: Path) -> None:
+    scenario = noack.load("double_integrator", {"controller.setpoint": [3.0, 0.0]})
+    summary = noack.simulate(scenario, runs=tmp_path).summary
+    loop = summary.loops[0]
+    assert loop.setpoint == [3.0, 0.0]
+    assert loop.initial_state_norm == 2.0
+    assert "stable, ‖x − x_r‖ fell from 2 to " in verdict(summary)[0].text
+
+
 def test_the_verdict_of_several_loops_counts_them(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("different_loops", {"horizon_s": 2.0}), runs=tmp_path)
     summary = run.summary

@@ -181,11 +181,12 @@ def test_no_random_run_violates_a_claim(policy: str) -> None:
         ("double_integrator", ["plant.initial_state=[3.0, 1e-9]"]),
         ("double_integrator", ["trigger.floor=0.0", "horizon_s=150"]),
         ("double_integrator", ['trigger={policy="periodic", period_s=0.1}', "network.mansd=0"]),
+        ("double_integrator", ['trigger={policy="mixed", sigma=0.05, epsilon=0.01}']),
         ("unstable_pendulum", []),
     ],
 )  # fmt: skip
 def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> None:
-    """Rounding is that of x; until the first input, u is 0 and not u_r."""
+    """Triggers compare with x − x_r; rounding is that of x; u is 0 and not u_r at first."""
     x_r = 3.0 if name == "double_integrator" else 0.1
     settings = [f"controller.setpoint=[{x_r}, 0.0]", *settings]
     record = simulate(resolve(load(find_shipped(name, "scenarios"), settings)))
@@ -193,7 +194,7 @@ def test_no_claim_is_violated_at_a_set_point(name: str, settings: list[str]) -> 
     verdicts = {claim.verdict for claim in claims}
     assert VIOLATED not in verdicts
     assert HELD in verdicts
-    if any("periodic" in one for one in settings):
+    if any(policy in one for one in settings for policy in ("periodic", "relative", "mixed")):
         certified = [claim.verdict for claim in claims if claim.source == "certificate"]
         assert set(certified) == {HELD}
 
