@@ -104,6 +104,7 @@ class Program(TyperGroup):
         """Run the program; the arguments are those of :class:`typer.core.TyperGroup`."""
         words = self._words = list(sys.argv[1:] if args is None else args)
         try:
+            _refuse_empty(words)
             status = super().main(
                 words or ["--help"], prog_name, complete_var, False, windows_expand_args, **extra
             )
@@ -125,7 +126,7 @@ class Program(TyperGroup):
         if not message:
             return ""
         message = message[0].lower() + message[1:].replace("Input should", "should")
-        message = message.replace("Value error, ", "")
+        message = message.replace("Value error, ", "").removeprefix("invalid value: ")
         name = next((word for word in words if word in self.commands), None)
         where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
         if near := getattr(error, "possibilities", None):
@@ -135,6 +136,18 @@ class Program(TyperGroup):
         if name and message.startswith("missing "):
             return f"{where}{message}, e.g. `{examples_of(self.commands[name])[0]}`"
         return f"{where}{message}; see `{command} --help`"
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Raise BadParameter for an argument without a character; as a path it would be ``.``."""
+    for before, word in zip(["", *words], words, strict=False):
+        option, _, value = word.partition("=")
+        if not word and before.startswith("--"):
+            raise typer.BadParameter(f"the value of {before} is empty")
+        if not word:
+            raise typer.BadParameter("an argument is empty")
+        if option.startswith("--") and "=" in word and not value:
+            raise typer.BadParameter(f"the value of {option} is empty")
 
 
 def examples_of(command: "Command") -> list[str]:

@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_valid
 
 from cosim.simulation.exact_simulation import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
+from noack.core.errors import CallerError
 from noack.scenario import toml_file
 from noack.settings.section import NonNegative, Rows, ScenarioSection, Seed
 
@@ -420,7 +421,12 @@ def load(path: Path) -> Campaign:
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
-    return toml_file.validated(Campaign, toml_file.read(path, Campaign), str(path))
+    content = toml_file.read(path, Campaign)
+    if "model" in content and "axes" not in content:
+        raise CallerError(
+            f"{path}: a scenario, not a campaign; a campaign names one by scenario = FILE"
+        )
+    return toml_file.validated(Campaign, content, str(path))
 
 
 def json_schema() -> dict[str, object]:

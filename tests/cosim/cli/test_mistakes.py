@@ -27,6 +27,9 @@ MISTAKES = {
     "'no' is not one of 'sampled', 'continuous'; see `noack adversary --help`",
     "check lane_following too": "noack: check: got unexpected extra argument(s) (too); "
     "see `noack check --help`",
+    "report --tables=": "noack: report: the value of --tables is empty; see `noack report --help`",
+    "campaign scenarios/lane_following.toml": "noack: scenarios/lane_following.toml: a scenario, "
+    "not a campaign; a campaign names one by scenario = FILE",
     "demo --set": "noack: demo: option '--set' requires an argument; see `noack demo --help`",
     "record lane_following --invite plant": "noack: --invite needs --listen: processes of this "
     "host need no invitation",
