@@ -331,9 +331,12 @@ def schedule_tables(loop: LoopSummary) -> Iterator[ResultTable]:
     covered = (loop.certified_for or allowed) if exists else None
     rows = []
     for name, words in _SCHEDULE.items():
-        times_s = (getattr(part, name) if part else None for part in (allowed, observed, covered))
+        times_s = [getattr(part, name) if part else None for part in (allowed, observed, covered)]
         # After a change a certificate needs no first input: it is 0 there.
-        rows.append((words, *(duration(one) if one else NONE for one in times_s)))
+        cells = [duration(one) if one else NONE for one in times_s]
+        if (times_s[1] or 0.0) > (times_s[0] or 0.0):
+            cells[1] += " (late)"
+        rows.append((words, *cells))
     caption = "largest times: allowed by the scenario, observed, covered by the certificates used"
     yield ResultTable("schedule", caption, ("", "allowed", "observed", "certified"), rows)
 

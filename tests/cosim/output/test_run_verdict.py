@@ -107,6 +107,19 @@ def test_the_state_is_stable_bounded_or_diverged(
     assert state_text(largest, final, diverged_at_s) == text
 
 
+def test_the_table_of_times_marks_what_was_later_than_allowed(outcome: Outcome) -> None:
+    assert "(late)" not in printed(outcome, verbose=True)
+    conditions = outcome.summary.loops[0].conditions
+    assert conditions is not None
+    late = conditions.model_copy(update={"hold_s": 0.0125}).model_dump()
+    (row,) = [
+        line for line in printed(outcome, verbose=True, conditions=late).splitlines()
+        if "(late)" in line
+    ]  # fmt: skip
+    assert "age of an input" in row
+    assert "12.5 ms" in row
+
+
 def test_at_a_set_point_the_state_is_the_distance_from_it(tmp_path: Path) -> None:
     scenario = noack.load("double_integrator", {"controller.setpoint": [3.0, 0.0]})
     summary = noack.simulate(scenario, runs=tmp_path).summary
