@@ -186,7 +186,7 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
             nonlocal before, line_s
             before, now_s = done if before < 0 else before, time.monotonic()
             rate = (done - before) / max(now_s - began_s, 1e-3)
-            text = f"{rate:,.0f}/s" if done > before else "starting; compiles at first use"
+            text = f"{rate:,.0f}/s" if done > before else "starting"
             show(completed=done, total=total, rate=text)
             if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
                 line_s = now_s
@@ -198,16 +198,21 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
-    """Show the state of an adversary's search, on a terminal only."""
-    began_s = time.monotonic()
-    with error_console().status("searching") as status:
+    """Show the state of an adversary's search; where there is no terminal, a line at intervals."""
+    console = error_console()
+    began_s = line_s = time.monotonic()
+    with console.status("searching") as status:
 
         def named(aim: str) -> Callable[[str, int, float], None]:
             def report(what: str, nodes: int, value: float) -> None:
-                elapsed_s = time.monotonic() - began_s
-                status.update(
-                    f"{aim}, {what}: {nodes} segments, worst {abs(value):.6g}, {elapsed_s:.0f} s"
-                )
+                nonlocal line_s
+                now_s = time.monotonic()
+                spent = f"{nodes} segments, worst {abs(value):.6g}, {now_s - began_s:.0f} s"
+                status.update(f"{aim}, {what}: {spent}")
+                if not console.is_terminal and now_s - line_s >= _LINE_EVERY_S:
+                    line_s = now_s
+                    line = f"noack: {aim}, {what}: {spent}"
+                    console.print(line, highlight=False, markup=False, soft_wrap=True)
 
             return report
 
