@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 
 from controller_node.controller import Controller, controllers_of
-from noack.core.core_library import core, ffi, reals_at
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
@@ -94,16 +92,3 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
 def machine(part: Plant | Sensor | Controller) -> OneLoop:
     """The machine of one loop."""
     return OneLoop([part])
-
-
-def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int, **settings: Any) -> OneLoop:
-    """A linear plant from x0 on."""
-    system = LinearSystem(A, B, x0)
-    return machine(Plant(system, B.shape[1], period_ns=period_ns, **settings))
-
-
-def state_of(machines: LoopMachines, name: str, loop: int = 0) -> Vector:
-    """A copy of a vector of a machine's state: x, x_s and x_c have n entries, u has m."""
-    own = machines.machines[loop]
-    count = own.machine.m if name == "u" else own.machine.n
-    return np.array(reals_at(getattr(own, name), count))
