@@ -1,7 +1,7 @@
-"""Machines that make one step at a time, and vectors of their state, for tests."""
+"""Machines that make one step at a time, for tests, and what tests ask of a machine."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -92,3 +92,22 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> OneLoop:
 def machine(part: Plant | Sensor | Controller) -> OneLoop:
     """The machine of one loop."""
     return OneLoop([part])
+
+
+T = TypeVar("T")
+
+
+class Machine(Protocol[T]):
+    """One process of the loop, without its input and output; T is what it receives and sends."""
+
+    def handle(self, message: T, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Take a message that arrived at simulated time ``now_ns``."""
+        ...
+
+    def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
+        ...
+
+    def next_deadline_ns(self) -> int | None:
+        """When :meth:`on_timer` is due next; None if no timer is set."""
+        ...

@@ -15,7 +15,6 @@ from noack.trigger.trigger_rule import (
     TriggerRule,
     empty_map,
     error_form,
-    no_form,
     quadratic_form,
     require_rule,
     state_map,
@@ -143,11 +142,6 @@ def quadratic_rule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,
         weight=weight,
     )  # fmt: skip
-
-
-def periodic_rule(period_ns: int, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
-    n = n if weight is None else len(weight)
-    return TriggerRule(no_form(n), longest_ns=period_ns, weight=weight)
 
 
 def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:

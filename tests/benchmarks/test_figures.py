@@ -1,8 +1,9 @@
-"""The figures of single benchmarks, from given measurements, and the programs that they start."""
+"""Benchmarks: figures from given measurements, programs, and the guarantee with few decisions."""
 
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,29 @@ import pytest
 from benchmarks import latency, simulation
 from benchmarks.bare_programs import Flood, command_of
 from benchmarks.faults import FaultedRun, figures_of, recovery_s
+from benchmarks.guarantees import (
+    CAP,
+    COMBINATIONS,
+    REORDERING,
+    Decider,
+    check_row,
+    loop_named,
+    network_rows,
+    row_of,
+    triggers,
+)
 from benchmarks.latency import ping
 from benchmarks.programs import Line, compiled, execute, first_step_s
 from benchmarks.report import MeasurementError
+from cosim.analysis.adversary import Objective, find_worst
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from noack.scenario.sections import POLICIES
 from tests.cosim.record.changed_records import changed, copied
+from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
 def test_the_output_of_a_program_is_read_and_a_failed_one_is_reported() -> None:
@@ -88,3 +103,48 @@ def test_the_effects_of_a_flood_are_read_from_the_record() -> None:
     assert recovery_s(np.array([]), 2.0) == 0.0
     assert recovery_s(np.array([1.9, 2.1, 2.3, 3.0]), 2.0) == pytest.approx(0.3)
     assert recovery_s(np.array([1.9, 2.5]), 2.0) == 0.0
+
+
+# --- the guarantee --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", COMBINATIONS)
+def test_no_combination_is_violated_and_each_would_be_without_it(words: str) -> None:
+    for before in ("loss 50%", f"loss 30% {REORDERING}"):
+        row = check_row(f"{before} {words}", COMBINATIONS[words], 1_000_000)
+        assert row.value == 0
+        free = outcomes_of(Decider(f"{before} limit 1000000").decide())
+        assert violations(free, COMBINATIONS[words]) > 1000
+
+
+def test_the_check_counts_windows_and_gaps() -> None:
+    lost = np.array([1, 1, 0, 1, 0, 0, 1, 0, 0, 0], bool)
+    assert violations(lost, Limits(((1, 2),))) == 1
+    assert violations(lost, Limits(((2, 4),))) == 1  # of the first four, three are lost
+    assert violations(lost, Limits((), 2)) == 1
+    assert violations(lost, Limits(((2, 3),), 1)) == 0
+
+
+def test_only_the_guarantee_limits_what_the_receiver_misses() -> None:
+    longest = [row.value or 0 for row in network_rows() if "longest" in row.name]
+    assert longest[2] == CAP < min(longest[:2])
+
+
+def test_every_policy_that_is_a_rule_is_compared() -> None:
+    paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
+    found = triggers(paper, np.eye(2)).values()
+    names = {one["policy"] for one in found} | {
+        one["rule"]["policy"] for one in found if "rule" in one
+    }
+    assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
+
+
+def test_a_bound_below_the_worst_run_is_reported() -> None:
+    loop = loop_named("double_integrator", 2.0, "identity")
+    worst = find_worst(loop, Objective.ERROR, beam=0)
+    assert worst.certified is not None
+    assert worst.value is not None
+    row = row_of("double_integrator", worst)
+    assert row.holds
+    assert 0.1 < (row.value or 0.0) < 1.0
+    assert row_of("", replace(worst, certified=worst.value * 0.99)).holds is False

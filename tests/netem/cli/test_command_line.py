@@ -44,17 +44,6 @@ def test_a_command_line_describes_a_link(
     assert specs(f"{ADDRESSES} {arguments}") == (link,)
 
 
-def test_addresses() -> None:
-    for listen, to, addresses in (
-        ("127.0.0.1:0", "192.0.2.7:53", (("127.0.0.1", 0), ("192.0.2.7", 53))),
-        ("[::1]:9000", ":9001", (("::1", 9000), ("::1", 9001))),
-        (":9000", "[::1]:9001", (("127.0.0.1", 9000), ("::1", 9001))),
-        ("0.0.0.0:9000", "localhost:9001", (("0.0.0.0", 9000), ("127.0.0.1", 9001))),
-    ):
-        (link,) = specs(f"--listen {listen} --to {to}")
-        assert (link.listen, link.to) == addresses
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

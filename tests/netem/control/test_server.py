@@ -81,14 +81,6 @@ def test_statistics_are_published(
         assert recent["seconds"] > 0
 
 
-def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
-    client.ask("change", link="up", direction="reverse", words=["loss", "5%"])
-    assert relay.settings["up", "reverse"] == settings_of("loss 5%")
-    table = settings_of("delay 1ms mansd 3").model_dump(mode="json")
-    client.ask("change", link="up", direction="reverse", settings=table)
-    assert relay.settings["up", "reverse"] == settings_of("delay 1ms mansd 3")
-
-
 MISTAKES = [
     ({"link": "up", "words": "lozz 5%"}, "lozz: .*loss"),
     ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
