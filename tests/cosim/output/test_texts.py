@@ -5,7 +5,6 @@
 
 import csv
 import io
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from cosim.output.result_tables import (
 )
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
+from tests.approved import compare_text
 from tests.cosim.output.test_page import Page
 
 APPROVED = Path(__file__).with_name("approved")
@@ -69,9 +69,7 @@ def test_the_report_shows_what_was_approved(run: Path) -> None:
 
 def compare(name: str, text: str) -> None:
     text = _ROUNDING.sub(" tiny", _STARTED.sub("started …", text)).rstrip() + "\n"
-    if os.environ.get("APPROVE"):
-        (APPROVED / name).write_text(text, encoding="utf-8")
-    assert text == (APPROVED / name).read_text(encoding="utf-8")
+    compare_text(APPROVED / name, text)
 
 
 # --- tables for papers ----------------------------------------------------------------------------
