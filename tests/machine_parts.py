@@ -1,15 +1,13 @@
-"""Machines that make one step at a time, and vectors of their state, for tests."""
+"""Machines that make one step at a time, for tests, and what tests ask of a machine."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from controller_node.controller import Controller, controllers_of
-from noack.core.core_library import core, ffi, reals_at
-from noack.core.linear_systems import Matrix, Vector
+from noack.core.core_library import core, ffi
 from noack.machines.loop_machines import LoopMachines
-from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.wire_format import Flow, Message
 from noack.scenario.parameter_changes import ParameterChange
@@ -96,14 +94,20 @@ def machine(part: Plant | Sensor | Controller) -> OneLoop:
     return OneLoop([part])
 
 
-def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int, **settings: Any) -> OneLoop:
-    """A linear plant from x0 on."""
-    system = LinearSystem(A, B, x0)
-    return machine(Plant(system, B.shape[1], period_ns=period_ns, **settings))
+T = TypeVar("T")
 
 
-def state_of(machines: LoopMachines, name: str, loop: int = 0) -> Vector:
-    """A copy of a vector of a machine's state: x, x_s and x_c have n entries, u has m."""
-    own = machines.machines[loop]
-    count = own.machine.m if name == "u" else own.machine.n
-    return np.array(reals_at(getattr(own, name), count))
+class Machine(Protocol[T]):
+    """One process of the loop, without its input and output; T is what it receives and sends."""
+
+    def handle(self, message: T, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Take a message that arrived at simulated time ``now_ns``."""
+        ...
+
+    def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
+        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
+        ...
+
+    def next_deadline_ns(self) -> int | None:
+        """When :meth:`on_timer` is due next; None if no timer is set."""
+        ...

@@ -11,12 +11,10 @@ from noack.trigger.mixed import mixed_rule as given_mixed_rule
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import (
     NEVER_NS,
-    Forecast,
     QuadraticForm,
     TriggerRule,
     empty_map,
     error_form,
-    no_form,
     quadratic_form,
     require_rule,
     state_map,
@@ -144,18 +142,6 @@ def quadratic_rule(
         quadratic_form(Q), floor=float(np.sqrt(epsilon)), grid_ns=period_ns, longest_ns=longest_ns,
         weight=weight,
     )  # fmt: skip
-
-
-def periodic_rule(period_ns: int, weight: Matrix | None = None, n: int = 2) -> TriggerRule:
-    n = n if weight is None else len(weight)
-    return TriggerRule(no_form(n), longest_ns=period_ns, weight=weight)
-
-
-def self_triggered_rule(
-    forecast: Forecast, shortest_ns: int, longest_ns: int, weight: Matrix | None = None, n: int = 2
-) -> TriggerRule:
-    rule = periodic_rule(longest_ns, weight, n)
-    return rule._replace(shortest_ns=shortest_ns, forecast=forecast)
 
 
 def lyapunov_rule(factor: Matrix, rate_per_s: float, weight: Matrix | None = None) -> TriggerRule:

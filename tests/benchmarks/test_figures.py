@@ -1,86 +1,40 @@
-"""The figures of single benchmarks, from given measurements, and the programs that they start."""
+"""Benchmarks: figures from given measurements, programs, and the guarantee with few decisions."""
 
-import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import ends, latency, runs, simulation
-from benchmarks.bare_programs import LOOPS, Flood, command_of
+from benchmarks import latency, simulation
+from benchmarks.bare_programs import Flood, command_of
 from benchmarks.faults import FaultedRun, figures_of, recovery_s
+from benchmarks.guarantees import (
+    CAP,
+    COMBINATIONS,
+    REORDERING,
+    Decider,
+    check_row,
+    loop_named,
+    network_rows,
+    row_of,
+    triggers,
+)
 from benchmarks.latency import ping
-from benchmarks.programs import Line, compiled, execute, first_step_s, provide
-from benchmarks.report import MeasurementError, Rounds
+from benchmarks.programs import Line, compiled, execute, first_step_s
+from benchmarks.report import MeasurementError
+from cosim.analysis.adversary import Objective, find_worst
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from noack.scenario.sections import POLICIES
 from tests.cosim.record.changed_records import changed, copied
-
-
-def summary(**changes: Any) -> dict[str, Any]:
-    late = {"p50": 16.0, "p99": 40.0, "max": 150.0, "steps": 10_000, "late_steps": 10}
-    loop = {"missing_samples": 0, "unintended_losses": 0, "lateness_us": {"plant": late}}
-    return {"loops": [loop | changes]}
-
-
-def test_a_missing_sample_or_too_many_late_steps_miss_their_goals() -> None:
-    verdicts = [row.holds for row in runs.demo_rows(summary()) if row.goal is not None]
-    assert verdicts == [True, True, True]
-    late = summary()["loops"][0]["lateness_us"]["plant"] | {"late_steps": 11}
-    rows = [*runs.demo_rows(summary(missing_samples=1, lateness_us={"plant": late}))]
-    assert [row.holds for row in rows[:3]] == [False, True, False]
-
-
-def test_quantiles_of_a_histogram_are_the_middle_of_the_bin_they_fall_in() -> None:
-    histogram = {12: 98, 20: 1, 400: 1}
-    assert latency.quantile_of(histogram, 0.5) == 12.5
-    assert latency.quantile_of(histogram, 0.99) == 20.5
-    assert latency.quantile_of(histogram, 1.0) == 400.5
-
-
-@pytest.mark.parametrize(
-    ("ours", "kernel", "holds", "note"),
-    [
-        (None, {"p50": 12.0, "p99": 20.0, "max": 60.0}, True, ""),
-        (None, "cyclictest is not installed", None, "not installed"),
-        ("SCHED_FIFO refused", {"p50": 12.0, "p99": 20.0, "max": 60.0}, None, "SCHED_FIFO refused"),
-    ],
-)
-def test_lateness_is_judged_against_cyclictest(
-    ours: str | None, kernel: Any, holds: bool | None, note: str
-) -> None:
-    rounds = {asked: Rounds() for asked in (True, False)}
-    for sides in rounds.values():
-        for kind in LOOPS:
-            sides.add(kind, {"p50": 15.0, "p99": 24.0, "max": 90.0})
-    rounds[True].add(latency.KERNEL, kernel)
-    if ours is not None:
-        rounds[True].add(latency.LOOP, ours)
-    (judged,) = [row for row in latency.lateness_rows(rounds) if row.goal is not None]
-    assert judged.holds is holds
-    assert judged.value == 24.0
-    assert note in judged.as_json().get("note", "")
-
-
-def test_the_end_of_a_long_run_is_judged_by_its_memory_and_its_additional_time() -> None:
-    short = ends.End(4.0, 5.0, 200.0, {"claims": 1.0, "replay": 1.0})
-    of_runs = {60.0: short, 660.0: ends.End(20.0, 17.0, 500.0, {"claims": 3.0, "replay": 1.2})}
-    peak, growth, _, speed, by_cpu, of_replay, claims, _ = ends.rows_of(of_runs)
-    assert (peak.value, peak.holds) == (500.0, False)
-    assert growth.ratio == 2.5
-    assert speed.value == 37.5
-    assert (by_cpu.value, by_cpu.holds) == (50.0, False)
-    assert of_replay.value == pytest.approx(3000.0)
-    assert of_replay.holds
-    assert claims.value == 12.0
+from tests.oracles.receiver import Limits, outcomes_of, violations
 
 
 def test_the_output_of_a_program_is_read_and_a_failed_one_is_reported() -> None:
@@ -122,35 +76,6 @@ def test_every_datagram_of_a_ping_arrives(language: str, asked: bool, tmp_path: 
         ping(["false"], 1, 0.001, asked=False)
 
 
-def rounds_of(**sides: tuple[float, float]) -> Rounds:
-    rounds = Rounds()
-    for side, (p50, p99) in sides.items():
-        rounds.add(side, {"p50": p50, "p99": p99, "count": 100})
-    return rounds
-
-
-def test_the_ping_in_c_is_the_measure_of_both_quantiles(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Without a compiler, the goals are not judged."""
-    ours_and_python = {latency.OURS: (28.0, 90.0), latency.PYTHON_PING: (14.0, 45.0)}
-    rounds = rounds_of(**ours_and_python, **{latency.C_PING: (20.0, 40.0)})
-    p50, p99, *plain = latency.rows_of(NAME, rounds, {"sched_fifo"})
-    assert (p50.ratio, p50.holds) == (pytest.approx(1.4), True)
-    assert (p99.ratio, p99.holds) == (2.25, False)
-    assert [row.ratio for row in plain] == [2.0, 2.0]
-    assert all(row.goal is None for row in plain)
-    assert "100 updates; 100 and 100 pings; not applied: sched_fifo" in p50.as_json()["note"]
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(MeasurementError) as reason:
-        compiled("ping.c", tmp_path)
-    rounds = rounds_of(**ours_and_python)
-    rounds.add(latency.C_PING, str(reason.value))
-    p50, p99, *_ = latency.rows_of(NAME, rounds, set())
-    assert p50.holds is p99.holds is None
-    assert "cc is not installed" in p50.as_json()["note"]
-
-
 PERIOD_NS = 2_000_000
 
 
@@ -180,32 +105,46 @@ def test_the_effects_of_a_flood_are_read_from_the_record() -> None:
     assert recovery_s(np.array([1.9, 2.5]), 2.0) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("root", "works", "missing"), [(True, True, []), (True, False, ["b"]), (False, True, ["b"])]
-)
-def test_a_missing_program_is_installed_or_named(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    root: bool,
-    works: bool,
-    missing: Sequence[str],
-) -> None:
-    present, commands = {"a", "apt-get"}, list[list[str]]()
-
-    def execute(command: list[str], **_: Any) -> None:
-        commands.append(command)
-        if works and command[1] == "install":
-            present.add("b")
-
-    monkeypatch.setattr(shutil, "which", lambda name: name if name in present else None)
-    monkeypatch.setattr(os, "geteuid", lambda: 0 if root else 1000)
-    monkeypatch.setattr(subprocess, "run", execute)
-    assert provide({"a": "package-a", "b": "package-b more"}) == missing
-    assert [command[-2:] for command in commands[1:]] == [["package-b", "more"]] * root
-    assert ("apt-get install package-b more" in capsys.readouterr().err) == bool(missing)
+# --- the guarantee --------------------------------------------------------------------------------
 
 
-def test_nothing_is_installed_if_all_programs_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("installs"))
-    monkeypatch.setattr(shutil, "which", lambda name: name)
-    assert provide() == []
+@pytest.mark.parametrize("words", COMBINATIONS)
+def test_no_combination_is_violated_and_each_would_be_without_it(words: str) -> None:
+    for before in ("loss 50%", f"loss 30% {REORDERING}"):
+        row = check_row(f"{before} {words}", COMBINATIONS[words], 1_000_000)
+        assert row.value == 0
+        free = outcomes_of(Decider(f"{before} limit 1000000").decide())
+        assert violations(free, COMBINATIONS[words]) > 1000
+
+
+def test_the_check_counts_windows_and_gaps() -> None:
+    lost = np.array([1, 1, 0, 1, 0, 0, 1, 0, 0, 0], bool)
+    assert violations(lost, Limits(((1, 2),))) == 1
+    assert violations(lost, Limits(((2, 4),))) == 1  # of the first four, three are lost
+    assert violations(lost, Limits((), 2)) == 1
+    assert violations(lost, Limits(((2, 3),), 1)) == 0
+
+
+def test_only_the_guarantee_limits_what_the_receiver_misses() -> None:
+    longest = [row.value or 0 for row in network_rows() if "longest" in row.name]
+    assert longest[2] == CAP < min(longest[:2])
+
+
+def test_every_policy_that_is_a_rule_is_compared() -> None:
+    paper = {"beta": 0.5, "alpha_per_s": 0.25, "floor": 0.0}
+    found = triggers(paper, np.eye(2)).values()
+    names = {one["policy"] for one in found} | {
+        one["rule"]["policy"] for one in found if "rule" in one
+    }
+    assert names == {name for name, made in POLICIES.items() if made.example(2) is not None}
+
+
+def test_a_bound_below_the_worst_run_is_reported() -> None:
+    loop = loop_named("double_integrator", 2.0, "identity")
+    worst = find_worst(loop, Objective.ERROR, beam=0)
+    assert worst.certified is not None
+    assert worst.value is not None
+    row = row_of("double_integrator", worst)
+    assert row.holds
+    assert 0.1 < (row.value or 0.0) < 1.0
+    assert row_of("", replace(worst, certified=worst.value * 0.99)).holds is False

@@ -1,12 +1,10 @@
 """The load generator and the relays: counts only, no rates; and the figures made of them."""
 
-import json
 import shutil
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from benchmarks.relays import (
     Ends,
     Kind,
     Sides,
-    Totals,
     built,
     c_relay,
     figures_of,
@@ -28,7 +25,7 @@ from benchmarks.relays import (
     socat,
     sources,
 )
-from benchmarks.report import MeasurementError, Rounds, Row
+from benchmarks.report import MeasurementError
 
 needs_compiler = pytest.mark.skipif(
     sys.platform != "linux" or shutil.which("cc") is None, reason="the load is Linux's, and in C"
@@ -175,72 +172,3 @@ def test_an_incomplete_burst_or_delay_gives_no_figure() -> None:
     assert relays.quantiles_of("relay", delays_ns, 3.0) == {"p50": 48.0, "p99": 97.0}
     with pytest.raises(MeasurementError, match="relay: 2 of 3 datagrams did not arrive"):
         relays.quantiles_of("relay", np.array([-1, 5, -1]))
-
-
-def test_the_cost_of_many_flows_is_compared_with_one_flow() -> None:
-    rounds = Rounds()
-    for one, many in ((3.0, 4.2), (6.0, 7.2)):
-        rounds.add("ours, one flow", {"cpu_us": one})
-        rounds.add("ours, 10,000 flows", {"cpu_us": many})
-    rounds.missing["ours, with the reverse direction"] = "no such option"
-    ours, reverse, *_ = relays.flow_rows(rounds)
-    assert (ours.ratio, ours.holds) == (pytest.approx(1.3), True)
-    assert reverse.holds is None
-    assert "no such option" in reverse.as_json()["note"]
-
-
-def soaked(**changes: int) -> list[Row]:
-    counts = {"sent": 1000, "received": 950, "longest_gap": 4}
-    soak = new_soak()
-    for name in counts:
-        setattr(soak, name, changes.pop(name, counts[name]))
-    totals = Totals(1000, 950, 4, 0)._replace(**changes)
-    resident_kib = [50e3, 60e3, 60e3, 60e3, 60e3, 61e3]
-    return relays.soak_rows(
-        relays.Soaked(100.0, 20.0, soak, totals, resident_kib, cpu_s=8.0, waited_s=1.0)
-    )
-
-
-def test_each_unintended_loss_of_a_steady_load_misses_its_goal() -> None:
-    rows = soaked()
-    assert [row.holds for row in rows if row.goal is not None] == [True] * 6
-    assert (rows[0].ratio, rows[-2].value, rows[-1].value) == (0.5, 40.0, 5.0)
-    for change, row in (
-        ({"arrived": 999}, "sent but not counted as arrived"),
-        ({"received": 949}, "forwarded but not received"),
-        ({"lost_in_kernel": 1}, "lost in the relay's receive buffer"),
-        ({"longest_gap": 5}, "longest loss burst"),
-    ):
-        assert [found.name for found in soaked(**change) if found.holds is False] == [row]
-
-
-def test_memory_growth_is_measured_from_the_second_to_the_last_quarter() -> None:
-    start, flat, leak = [100.0, 900.0], [1000.0] * 6, [1000.0 + 7 * k for k in range(8)]
-    assert relays.growth_kib([*start, *flat]) == 0
-    assert relays.growth_kib(leak) == 7 * 4  # from the mean of samples 2, 3 to that of 6, 7
-    assert relays.growth_kib([5.0] * 4) == 0
-
-
-def test_group_size_and_period_give_the_rate() -> None:
-    for per_s in (900.0, 57_321.0, 372_500.0):
-        size, period_ns = relays.groups(per_s)
-        assert size * 1e9 / period_ns == pytest.approx(per_s, rel=1e-4)
-        assert size >= 1
-
-
-def test_the_command_line_and_the_totals_of_our_relay() -> None:
-    kind = our_relay("ours", "loss 5% mansd 4", "--realtime", "--segment")
-    command = kind.command(9001, 0)
-    assert Path(command[0]).name.startswith("python")
-    assert " ".join(command[1:]) == (
-        "-m netem --listen 127.0.0.1:0 --to 127.0.0.1:9001 loss 5% mansd 4 "
-        "--realtime --segment --one-way --json"
-    )
-    assert "--one-way" not in our_relay("ours", "delay 10ms", reverse=True).command(9001, 0)
-    forward = {"received": 9, "forwarded": 8, "longest_loss_burst": 1}
-    forward |= {"unintended": {"lost_in_kernel": 0}}
-    text = json.dumps({"links": [{"forward": forward}], "more": 1})
-    assert Totals.parse(f'{{"ready": []}}\n{text}') == Totals(9, 8, 1, 0)
-    for wrong in ("{}", ""):
-        with pytest.raises(MeasurementError, match="cannot be read"):
-            Totals.parse(wrong)

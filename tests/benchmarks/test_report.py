@@ -50,17 +50,6 @@ def test_a_row_holds_fails_or_cannot_be_judged(row: Row, holds: bool | None) -> 
     assert row.holds is holds
 
 
-def test_a_row_as_json_has_all_keys_and_the_reason_if_not_judged() -> None:
-    plain = Row("p50", 3.0, "µs", Peer("ping", 1.5), Goal("<=", 3)).as_json()
-    assert plain == {
-        "name": "p50", "value": 3.0, "unit": "µs", "peer": {"name": "ping", "value": 1.5},
-        "ratio": 2.0, "goal": "<= 3", "holds": True,
-    }  # fmt: skip
-    unjudged = Row("p99", 3.0, "µs", goal=Goal("<=", 3), note="n = 3", unjudged="refused").as_json()
-    assert unjudged.keys() == plain.keys() | {"note"}
-    assert unjudged["note"] == "refused; n = 3"
-
-
 def test_a_busy_machine_is_reported() -> None:
     load = Load()
     load._before = tuple(np.subtract(load._before, (100.0, 60.0, 2.0, 20.0)))

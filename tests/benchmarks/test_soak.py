@@ -2,9 +2,7 @@
 
 import json
 import math
-import shutil
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +17,6 @@ from benchmarks.soak import (
     Trend,
     constant,
     ended_badly,
-    main,
-    size_bytes,
     soak,
     trend,
     warm_up_s,
@@ -106,16 +102,6 @@ def test_each_fault_in_the_summary_is_reported(key: str, value: object, told: st
     assert told in faults[0]
 
 
-@pytest.mark.parametrize("arguments", [["week"], ["--minutes", "x"], ["--minutes", "nan"]])
-def test_a_mistake_on_the_command_line_is_reported(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
-    assert "error: " in capsys.readouterr().err
-
-
 HOUR_S = 3600.0
 LEAK_KIB_PER_S = 500 * 88 / 1024
 """Of 88 bytes a step."""
@@ -169,21 +155,3 @@ def test_changes_of_a_count_are_found_after_the_warm_up_only() -> None:
     assert constant(at_s, [9, 9, 7, 7, 7], 100.0) == (7, 9)
     assert constant(at_s, [7, 7, 8, 7, 7], 100.0) == (7, 7)
     assert constant([0.0, *at_s[1:]], [3, 7, 7, 7, 7], 100.0) == (7, 7)
-
-
-def test_a_folder_may_vanish_while_it_is_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "log").write_bytes(bytes(8192))
-    (tmp_path / "spool").mkdir()
-    (tmp_path / "spool" / "rows").write_bytes(bytes(8192))
-    assert size_bytes(tmp_path) >= 2 * 8192
-    look = Path.stat
-
-    def look_once_more(path: Path) -> object:
-        if path.name == "rows":
-            shutil.rmtree(tmp_path / "spool", ignore_errors=True)
-        return look(path)
-
-    monkeypatch.setattr(Path, "stat", look_once_more)
-    assert 8192 <= size_bytes(tmp_path) < 2 * 8192

@@ -19,7 +19,6 @@ from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
-    NETEM_RELEASE,
     Fate,
     tables,
 )
@@ -110,16 +109,6 @@ def test_every_seed_name_and_flow_has_a_stream_of_its_own(words: str) -> None:
     assert len(set(sequences)) == 12
     for one in (words, f"delay 10ms 5ms {words}", f"{words} duplicate 50%"):
         assert tuple(fates(new_link(one), 0, 100)) == sequences[0]
-
-
-def test_a_stale_datagram_is_recorded_as_such() -> None:
-    link = new_link("delay 10ms gap 2 mansd 3")
-    link.handle(Datagram(0, b"first"), 0)
-    assert sent(link.handle(Datagram(0, b"second"), MS)) == [Datagram(0, b"second")]
-    ((due, outputs),) = drain(link)
-    (row,) = rows_of(outputs, NETEM_RELEASE)
-    assert (due, row["stale"]) == (10 * MS, 1)
-    assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.parameter_changes import ChangeSchedule, ParameterChange
 from noack.scenario.scenario import Scenario
-from tests.machine_interface import Machine
+from tests.machine_parts import Machine
 
 
 class _InFlight(NamedTuple):

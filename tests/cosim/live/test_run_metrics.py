@@ -18,8 +18,7 @@ from cosim.live.run_metrics import RunMetrics
 from cosim.live.run_watcher import Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
 from tests.netem.control.test_emulator_metrics import exposed, values_of
-from tests.noack.runtime.test_json_log import objects
-from tests.noack.runtime.test_metrics_server import read, slow_reader
+from tests.noack.runtime.test_log_and_metrics import objects, read, slow_reader
 
 PROGRESS: dict[str, Any] = {
     "t_s": 2.5, "events": 7, "deliveries": 3, "longest_loss_burst": 4, "x_norm": None, "live": None,

@@ -149,36 +149,6 @@ def test_any_trace_is_measured(records: list[tuple[int, int | None]], deadline_s
     assert len([*measurement_figures(found)]) == 4
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["missing.csv"], "missing.csv: cannot be read: No such file or directory"),
-        ([RURAL, "--deadline", "100"], "--deadline 100: expected a time in s, ms, us or ns"),
-        ([RURAL, "--outage", "-1s"], "--outage -1s: expected a time"),
-        ([RURAL, "--share", "x%"], "--share x%: expected a share, e.g. 0.99 or 99%"),
-        ([RURAL, "--flow", 2], "--flow: has no effect on a packet trace"),
-        ([RURAL, "--rate", "20hz"], "--rate: has no effect on a packet trace"),
-        ([RURAL, "--deadline", "0s"], "--deadline 0s: expected a time"),
-        ([":1", "--share", "99%"], "the sender of a one-way probe does not know what arrives"),
-        ([RURAL, "--silence", "3s"], f"--silence: has no effect on {RURAL}"),
-        (["--listen", ":1", "--for", "5s"], "--for: has no effect on a listener"),
-        ([":1", "--silence", "5s"], "--silence: has no effect on a sender"),
-        ([":1", "--out", "a.html"], "the sender of a one-way probe does not know what arrives"),
-        ([RURAL, "--as", "model"], "--as model: is the form of --write; give its FILE.toml"),
-        ([RURAL, "--set", "trigger.beta=0.3"], "--set: replaces a value of the scenario of"),
-        ([RURAL, "--out", "page.pdf"], "--out page.pdf: the file's name must end in .html"),
-        ([RURAL, "--write", "n.json"], "--write n.json: the file's name must end in .toml"),
-        ([RURAL, "--for-scenario", "nothing"], "nothing"),
-        ([RURAL, "--write", f"{RURAL}/n.toml", "--as", "model"], "n.toml"),
-    ],
-)
-def test_mistakes_are_one_line(words: list[object], message: str) -> None:
-    result = measure(*words)
-    assert result.exit_code in (1, 2)
-    (line,) = result.stderr.strip().splitlines()
-    assert message in line
-
-
 def through(path: Path, sent_ns: np.ndarray) -> PacketTrace:
     """Send packets at some times through a written network."""
     section = toml_file.validated(NetworkSection, toml_file.read(path)["network"], str(path))

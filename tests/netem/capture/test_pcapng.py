@@ -1,6 +1,7 @@
 """Captures, which ``reader`` reads independently of the code; and the thread that writes them."""
 
 import errno
+import json
 import os
 import resource
 import struct
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from netem.capture import CaptureWriter, PcapngSection
 from netem.relay_links import DIRECTIONS, EVENT, Bytes, Events
 from noack.core.errors import CallerError
-from noack.protocol.record_tables import Fate
+from tests.approved import compare_lines
 from tests.netem.capture.reader import (
     INTERFACES,
     SPECS,
@@ -67,35 +68,12 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
     assert parts + section.statistics() == whole
 
 
-LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
+def test_each_fate_has_the_approved_comment() -> None:
+    def comment(fields: str) -> list[str]:
+        (packet,) = read(file_of(json.loads(fields))).packets
+        return [packet.comment]
 
-
-@pytest.mark.parametrize(
-    ("fields", "comment"),
-    [
-        (LOST, "dropped by the loss model, consecutive loss 2"),
-        (LOST | {"mansd": 4}, "dropped by the loss model, consecutive loss 2, cap 4"),
-        ({"fate": Fate.FORCED, "packet": 0, "mansd": 4},
-         "forced: delivered as the first of its flow"),
-        ({"fate": Fate.FORCED, "mansd": 4, "delay_ns": 10_000_000},
-         "forced: delivered by the cap of 4 consecutive losses, delayed 10 ms"),
-        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "delay_ns": 1_000_000},
-         "corrupted in bit 513, consecutive loss 1, delayed 1 ms"),
-        ({"fate": 4, "consecutive_losses": 1}, "dropped by a full queue, consecutive loss 1"),
-        ({"fate": 5, "consecutive_losses": 12}, "dropped in a blackout, consecutive loss 12"),
-        ({"fate": 99}, "unknown fate"),
-        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "mansd": 4},
-         "delivered, delayed 12.345 ms, held back 1.2 ms for the guarantee"),
-        ({"departure": 1, "delay_ns": -5}, "delivered, after 0 ms"),
-        ({"departure": 1, "fate": 3, "bit": 0, "stale": 1, "delay_ns": 10**18},
-         "corrupted in bit 0, delivered out of order (stale), after 1000000000000 ms"),
-        ({"departure": 1, "copy": 1, "bit": 8, "delay_ns": 1000},
-         "copy, delivered, corrupted in bit 8, after 0.001 ms"),
-    ],
-)  # fmt: skip
-def test_the_comment_describes_the_fate(fields: dict[str, Any], comment: str) -> None:
-    (packet,) = read(file_of(fields)).packets
-    assert packet.comment == f"{comment}; forward, flow 3, packet {fields.get('packet', 17)}"
+    compare_lines(Path(__file__).with_name("comments.txt"), comment)
 
 
 def test_a_checksum_of_0_is_sent_as_ffff() -> None:

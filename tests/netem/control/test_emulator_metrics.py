@@ -25,7 +25,7 @@ from noack.core.errors import CallerError, PeerError
 from noack.runtime.address import text_of
 from noack.runtime.connections import metrics_server as servers
 from tests.netem.control.relays import FakeRelay, options, press_q, read_until, terminal
-from tests.noack.runtime.test_metrics_server import read, slow_reader
+from tests.noack.runtime.test_log_and_metrics import read, slow_reader
 
 Values = dict[str, float]
 

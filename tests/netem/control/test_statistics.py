@@ -23,7 +23,7 @@ from netem.control.emulator_statistics import (
     Statistics,
     statistics,
 )
-from netem.control.statistics_view import History, plain_lines, render
+from netem.control.statistics_view import History, render
 from netem.fates import SCHEMA, FateRecorder
 from netem.relay_links import FlowReport
 from netem.tc_words import settings_of
@@ -119,17 +119,6 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
     return found
 
 
-def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
-    *_, last = documents(relay)
-    recent = forward(last)["recent"]
-    assert recent is not None
-    assert recent["seconds"] == 1
-    assert (recent["received_per_s"], recent["received_bits_per_s"]) == (2000, 1_600_000)
-    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (1600, 1_280_000)
-    assert recent["loss"] == pytest.approx(0.2)
-    assert recent["delay_ns"]["p50"] == pytest.approx(10_000_000, rel=0.03)
-
-
 def text_of(relay: FakeRelay, width: int = 80, height: int | None = 24) -> list[str]:
     history = History()
     for document in documents(relay):
@@ -172,20 +161,6 @@ def test_the_view_fits_into_any_width(width: int) -> None:
     for line in lines[2:-1]:
         assert all(number in line for number in ("2,000/s", "20.0 %", "2/2"))
     assert ("last minute" in lines[1]) == (width >= 120)
-
-
-def test_a_pipe_gets_one_line_per_direction_in_use() -> None:
-    relay = FakeRelay("up", "down")
-    relay.unintended["send_errors"] = 3
-    first, *_, last = documents(relay)
-    assert plain_lines(first) == []
-    up, down = plain_lines(last)
-    assert up.startswith(
-        "3.0 s  up forward  received 2,000/s  1.60 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
-        "loss 20.0 %  drawn 20.0 %, predicted 9.91 %  longest loss burst 2, cap 2  forced 300  "
-    )
-    assert up.endswith("in flight 5  UNINTENDED 3 send_errors")
-    assert "down forward" in down
 
 
 def series(history: History, points: int) -> list[float | None]:

@@ -6,16 +6,15 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from itertools import islice
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from cosim.shipped_files import find_shipped
 from netem.relay_links import LinkSpec
 from netem.run_network import NetworkChannel, RunNetwork
 from noack.core.clock import RunClock
@@ -27,11 +26,10 @@ from noack.runtime.address import text_of
 from noack.runtime.real_time_loop import run_loop
 from noack.runtime.telemetry import TelemetryBuffer
 from noack.runtime.udp_sockets import bind
-from noack.scenario.parameter_changes import ParameterChange
 from noack.scenario.resolution import resolve, tables_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
-from tests.machine_interface import Machine
+from tests.machine_parts import Machine
 from tests.netem import any_settings
 from tests.netem.engine.relays import (
     PATIENCE_S,
@@ -55,18 +53,6 @@ arrivals = st.lists(
     ),
     min_size=1, max_size=60,
 )  # fmt: skip
-
-
-IMPAIRMENTS = '[{kind="delay", delay_s=0.02, jitter_s=0.02}, {kind="duplicate", probability=0.3}]'
-
-
-def delaying(*more: str) -> Scenario:
-    path = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
-    return resolve(load(path, [f"network.impairments={IMPAIRMENTS}", *more]))
-
-
-DELAYING = delaying()
-BOTH_WAYS = delaying(f"network.actuation={{mansd=3, impairments={IMPAIRMENTS}}}")
 
 
 class Both:
@@ -96,10 +82,6 @@ class Both:
 
     def let_out(self, now_ns: int) -> None:
         self._compare(self._release(now_ns), self.compiled.on_timer(now_ns))
-
-    def announce(self, change: ParameterChange, now_ns: int) -> None:
-        machine: Any = self.plain
-        self._compare(machine.announce(change, now_ns), self.compiled.announce(change, now_ns))
 
     def received(self) -> tuple[list[bytes], list[bytes]]:
         """Return what the two receivers should have received; check that they did."""
@@ -182,45 +164,6 @@ def test_any_arrivals_give_the_same_rows_and_datagrams(
     assert inputs == list(range(inputs[0], inputs[0] + len(inputs)))
 
 
-@pytest.mark.parametrize("scenario", [DELAYING, BOTH_WAYS])
-@pytest.mark.parametrize("generation", [0, 1])
-@settings(max_examples=10)
-@given(
-    st.lists(
-        st.tuples(
-            st.integers(0, 10**9), st.integers(-10**8, 10**9),
-            st.sampled_from([
-                {"network.mansd": 0},
-                {"network.loss": {"model": "worst_case"}},
-                {"network.mansd": 6, "network.loss": {"model": "lossless"}},
-            ]),
-        ),
-        max_size=4,
-    ),
-    arrivals,
-)  # fmt: skip
-def test_changes_during_the_run_apply_from_the_same_datagram_on(
-    generation: int,
-    scenario: Scenario,
-    changes: list[tuple[int, int, dict[str, Any]]],
-    steps: list[Arrival],
-) -> None:
-    """Some changes are announced too late."""
-    announcements = sorted(changes, key=lambda change: change[0])
-    now_ns, numbers = 0, iter(range(len(changes)))
-    with both(scenario, Start(generation=generation)) as machines:
-        for gap_ns, size, flow in steps:
-            now_ns += gap_ns
-            while announcements and announcements[0][0] <= now_ns:
-                announced_ns, ahead_ns, change = announcements.pop(0)
-                when_ns = max(announced_ns + ahead_ns, 0)
-                machines.let_out(now_ns)
-                machines.announce(ParameterChange(next(numbers), when_ns, change), now_ns)
-            machines.arrive(bytes(size), flow * (scenario is not DELAYING), now_ns)
-        machines.let_out(NEVER_NS)
-        machines.received()
-
-
 class _Rows(list[Any]):
     def extend_table(self, table: str, rows: Any) -> None:
         self.extend(rows.tolist())
@@ -252,7 +195,10 @@ def test_early_and_later_datagrams_are_relayed_and_foreign_ones_counted() -> Non
     early, later, foreign = 3, 700, 5
     published: Counter[str] = Counter()
     delay = 'network.impairments=[{kind="delay", delay_s=0.001}]'
-    scenario = delaying("speed=2.0", 'network.loss={model="lossless"}', delay)
+    lossless = 'network.loss={model="lossless"}'
+    scenario = resolve(
+        load(find_shipped("lane_following", "scenarios"), ["speed=2.0", lossless, delay])
+    )
     tables = {table: of for table, of in tables_of(scenario).items() if OWNER[table] == "netem"}
     telemetry = TelemetryBuffer(tables, lambda table, _, rows: published.update({table: len(rows)}))
     updates = (Message(Flow.UPDATE, k, 0, np.zeros(2), 0) for k in range(early + later))

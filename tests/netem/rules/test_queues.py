@@ -248,18 +248,6 @@ def test_any_arrivals_and_any_cap(
     assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
 
 
-def test_random_arrivals_with_pauses() -> None:
-    """Packets of 100 to 1500 bytes that overload the line."""
-    rng, count, codel = np.random.default_rng(2), 6000, Codel()
-    sizes = rng.integers(100, 1501, count)
-    gaps = rng.exponential(800 * PER_BYTE_NS / 1.1, count)
-    gaps[rng.integers(0, count, 16)] += 300 * MS
-    arrivals = list(zip(np.cumsum(gaps).astype(int).tolist(), sizes.tolist(), strict=True))
-    expected = reference(arrivals, codel, ahead(1500))
-    assert emulated(arrivals, codel) == expected
-    assert expected.count(None) > 20
-
-
 def test_the_law_drops_copies_of_delivered_packets() -> None:
     words = "duplicate 100% rate 8mbit 0 codel target 1us interval 1us mtu 0"
     link, found = Link(settings_of(words), 0, "a"), set()

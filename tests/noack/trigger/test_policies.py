@@ -1,16 +1,29 @@
-"""Every policy at measurements, against the rules as they are stated; mistakes in settings.
+"""Every policy at measurements, against the rules as they are stated; a user's class as a trigger.
 
 The table of all policies is in tests/trigger_rules.py. Here each is applied at measurements; in
 tests/cosim/simulation/batch/test_exact_events.py in continuous time; in
 tests/cosim/analysis/adversary/test_worst_patterns.py by the search for the worst pattern.
 """
 
+from pathlib import Path
+from textwrap import dedent
+
 import numpy as np
 import pytest
 
+from cosim.analysis.replay import replay
+from cosim.record.run_directory import write_scenario
+from cosim.record.run_record import RunRecord
+from cosim.simulation.continuous import continuous_loop_of
+from cosim.simulation.exact_simulation import setting_of
+from cosim.simulation.virtual_time import simulate
 from noack.core.core_library import CoreMemory, core, ffi
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import load
 from noack.scenario.sections import POLICIES
 from noack.trigger.deadline import DeadlineSettings
 from noack.trigger.lyapunov import LyapunovSettings
@@ -110,3 +123,118 @@ def test_the_same_threshold_from_a_later_origin() -> None:
     rule = {"policy": "decaying", "beta": 0.5, "alpha_per_s": 0.25}
     deadline = DeadlineSettings(policy="deadline", rule=rule, interval_s=1.0)
     assert deadline.at_origin(3.0).rule.beta == pytest.approx(0.5 * np.exp(-0.75), rel=1e-12)
+
+
+# --- a user's class -------------------------------------------------------------------------------
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+SEND_ON_DELTA = """
+    import numpy as np
+
+    class Delta:
+        def __init__(self, delta):
+            self.delta = delta
+
+        def start(self, t_s, x):
+            pass
+
+        def test(self, t_s, x, e_s):
+            return np.linalg.norm(e_s), self.delta
+"""
+
+
+def scenario(folder: Path, code: str, name: str = "Delta", parameters: str = "{}") -> Scenario:
+    path = folder / "own.py"
+    path.write_text(dedent(code))
+    trigger = f'{{policy="python", file="{path}", name="{name}", parameters={parameters}}}'
+    overrides = [f"trigger={trigger}", "horizon_s=4.0", "plant.rate_hz=100.0"]
+    return resolve(load(SCENARIOS / "lane_following.toml", overrides))
+
+
+def events(record: RunRecord) -> list[int]:
+    rows = record[SENSOR_MEASUREMENT]
+    return rows["t_ns"][rows["event"] >= 0].tolist()
+
+
+@pytest.mark.parametrize("protocol", ["none", "ack"])
+def test_a_send_on_delta_class_gives_the_same_run_as_the_policy(
+    tmp_path: Path, protocol: str
+) -> None:
+    own = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    network = own.network.model_copy(update={"protocol": protocol})
+    own = own.model_copy(update={"network": network})
+    built_in = resolve(
+        load(
+            SCENARIOS / "lane_following.toml",
+            ['trigger={policy="absolute", delta=0.05}', "horizon_s=4.0", "plant.rate_hz=100.0"],
+        )
+    ).model_copy(update={"network": network})
+    found, expected = simulate(own), simulate(built_in)
+    assert len(events(found)) > 3
+    assert events(found) == events(expected)
+    rows, others = found[SENSOR_MEASUREMENT], expected[SENSOR_MEASUREMENT]
+    different = {name for name in rows.dtype.names if (rows[name] != others[name]).any()}
+    assert different <= {"compared"}  # two functions for the same norm
+    np.testing.assert_allclose(rows["compared"], others["compared"], rtol=1e-14)
+
+
+def test_a_run_keeps_the_file_and_replays_with_it(tmp_path: Path) -> None:
+    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    kept = write_scenario(resolved, run_dir)
+    (tmp_path / "own.py").write_text("class Delta: pass")
+    assert (run_dir / "trigger" / "own.py").is_file()
+    assert replay(simulate(kept)).bit_exact
+    with pytest.raises(CallerError, match=r"trigger\.file = .*has changed"):
+        simulate(resolved)
+
+
+def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path) -> None:
+    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    for refuses in (continuous_loop_of, setting_of):
+        with pytest.raises(CallerError, match="decides at measurements only") as refused:
+            refuses(resolved)
+        assert "\n" not in str(refused.value)
+    assert resolved.coverage.beyond_theory == resolved.trigger.beyond_exact
+    rule = '{policy="python", name="a:B"}'
+    with pytest.raises(CallerError, match='"python" cannot be combined'):
+        load(
+            SCENARIOS / "lane_following.toml",
+            [f'trigger={{policy="dwell", interval_s=0.1, rule={rule}}}'],
+        )
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("x = 1", "LookupError: own.py has no Delta"),
+        ("class Delta:\n  def start(self, t_s, x): pass", "TypeError: it has no method test"),
+        ("class Delta:\n  def __init__(self, gain): pass", "TypeError: Delta.__init__() missing 1"),
+        ("class Delta:\n  def start(self, t_s, x): x[0] = 1\n  def test(self, *given): return True",
+         "ValueError: assignment destination is read-only (own.py, line 2)"),
+        ("class Delta:\n  def start(self, t_s, x): pass\n  def test(self, *given): return None",
+         "TypeError: test(t_s, x, e_s) must return True, False or a pair of numbers"),
+        ("class Delta:\n  def start(self, t_s, x): pass\n  def test(self, *given): return 1 / 0",
+         "ZeroDivisionError: division by zero (own.py, line 3)"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_the_class_gives_one_line(tmp_path: Path, code: str, expected: str) -> None:
+    with pytest.raises(CallerError) as refused:
+        simulate(scenario(tmp_path, code))
+    assert str(refused.value).startswith(f'trigger.name = "Delta": {expected}')
+    assert "\n" not in str(refused.value)
+
+
+def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:
+    code = """
+        class Delta:
+            def start(self, t_s, x):
+                self.since_s = t_s
+
+            def test(self, t_s, x, e_s):
+                return t_s - self.since_s > 0.4999
+    """
+    found = np.diff(events(simulate(scenario(tmp_path, code))))
+    assert len(found) > 5
+    assert set(found) == {500_000_000}

@@ -210,17 +210,3 @@ def test_a_bound_of_zero_is_searched(start: str) -> None:
     assert done.exit_code == ExitStatus.OK, done.output
     for worst in json.loads(done.stdout)["worst"].values():
         assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["lane_following", "--horizon", "-1"], "horizon_s"),
-        (["lane_periodic", "--trigger", "continuous"], "--trigger continuous"),
-        (["lane_crosswind", "--trigger", "continuous"], "--trigger continuous"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused_in_one_line(words: list[str], expected: str) -> None:
-    done = CliRunner().invoke(app, ["adversary", *words])
-    assert (done.exit_code, len(done.stderr.splitlines())) == (ExitStatus.CALLER, 1)
-    assert expected in done.stderr

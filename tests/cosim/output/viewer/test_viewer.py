@@ -41,7 +41,7 @@ from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError, ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
-from tests.cosim.output.test_approved import compare
+from tests.cosim.output.test_texts import compare
 from tests.cosim.summaries import summary_of
 from tests.integration.conftest import noack_command, wait_for
 

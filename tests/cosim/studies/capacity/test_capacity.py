@@ -150,28 +150,3 @@ def test_the_command_compares_the_policies_and_confirms_a_point_live(tmp_path: P
     assert (live["policy"], live["loops"], live["status"]) == ("model", 2, 0)
     assert live["values"]["transmissions"] > 0
     assert "crosses are live runs" in (tmp_path / "capacity.html").read_text()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--set", "network.impairments=[]"], "no bottleneck that the loops could share"),
-        (["--loops", "0,3"], "numbers of loops are at least 1"),
-        (["--loops", "12"], "--loops 12: should be a multiple of 11"),
-        (["--disturbance", "nan"], "--disturbance nan: should be a finite number"),
-        ([*SHORT, "--confirm", "model=77"], "--confirm model=77: no such point"),
-        (["--loops", "few"], "--loops few: write it as"),
-        (["--update-period", "99"], "--update-period 99: between 0 and the horizon"),
-        (["--update-period", "0.015"], "0.015: not a multiple of the time between two"),
-        (["--set", "model.gain=[[-3.0, -0.001]]", "--set", "horizon_s=0.2"], "give a period"),
-        (["--policy", "zoh={}"], "with a new name"),
-        (["--policy", "../x={ policy = 'periodic', period_s = 0.2 }"], "letters, digits"),
-        (["--set", "trigger={ policy = 'periodic', period_s = 0.2 }"], "need an event-triggered"),
-    ],
-)
-def test_a_mistake_is_one_line(words: list[str], message: str, tmp_path: Path) -> None:
-    result = capacity(str(FILE), "--out", str(tmp_path / "study"), *words)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert not (tmp_path / "study").exists()

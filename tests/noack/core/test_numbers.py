@@ -1,8 +1,14 @@
+"""Random streams, numbers as text, and arrays of the core's structures."""
+
+import gc
 import hashlib
+import math
 
 import numpy as np
 import pytest
 
+from noack.core.core_library import CoreMemory, core, ffi, reals_at
+from noack.core.number_format import plus_minus
 from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
 
 
@@ -55,3 +61,51 @@ def test_keys_computed_together_equal_single_keys() -> None:
         keys = stream_keys(np.array(seeds, np.uint64), *path)
         assert keys.tolist() == [list(stream_key(seed, *path)) for seed in seeds]
     assert stream_keys(np.array([], np.uint64), "a").shape == (0, 2)
+
+
+# --- numbers as text ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mean", "halfwidth", "written"),
+    [
+        (36.0, 16.2, "36 ± 16"),
+        (-0.2496, 3.4, "−0.2 ± 3.4"),
+        (9.97, 0.996, "10.0 ± 1.0"),
+        (1.23456e9, 2.34e7, "1.235e+09 ± 2.3e+07"),
+        (3.14159, math.inf, "3.142"),
+        (math.nan, 1.0, "nan"),
+    ],
+)
+def test_a_mean_has_as_many_digits_as_its_interval_supports(
+    mean: float, halfwidth: float, written: str
+) -> None:
+    assert plus_minus(mean, halfwidth) == written
+
+
+# --- arrays that live as long as their memory -----------------------------------------------------
+
+
+def test_arrays_are_copies_that_live_with_their_memory() -> None:
+    memory, given = CoreMemory(), np.arange(6.0).reshape(2, 3).T
+    pointer, whole = memory.reals(given), memory.integers([3, -1])
+    shown = reals_at(pointer, 3, 2)
+    given[:] = 0
+    gc.collect()
+    assert shown.tolist() == [[0.0, 3.0], [1.0, 4.0], [2.0, 5.0]]
+    assert (whole[0], whole[1]) == (3, -1)
+    shown[0, 1] = 7.0  # shares the memory
+    assert pointer[1] == 7.0
+    assert reals_at(memory.zeros(0), 0).tolist() == []
+
+
+def test_models_with_the_same_matrix_share_its_exponentials() -> None:
+    memory, H = CoreMemory(), np.array([[0.0, 1.0], [-2.0, -0.5]])
+    one, other = memory.transitions(H, (5, 0)), memory.transitions(H.copy(), (7,))
+    assert one is other
+    assert memory.transitions(-H) is not one
+    known = np.frombuffer(ffi.buffer(one.steps_ns, 8 * one.places), np.int64)
+    assert sorted(known[known != 0]) == [5, 7]
+    matrix = core.noack_transition(one, 5)
+    assert matrix - one.matrices in range(0, 4 * one.places, 4)  # kept, where it was
+    assert sorted(known[known != 0]) == [5, 7]

@@ -1,25 +1,142 @@
-"""noack_process_check refuses each wrong number that the steps would act on."""
+"""The machines of a process: several loops, interrupted steps, and refusals of wrong numbers."""
 
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from controller_node.controller import Controller
 from noack.core.core_library import ffi
-from noack.machines.loop_machines import LoopMachines
+from noack.core.errors import CallerError
+from noack.machines.loop_machines import LoopMachines, row_types
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import LOOP, tables
+from noack.protocol.wire_format import Message
+from noack.scenario.parameter_changes import ParameterChange
+from noack.scenario.resolution import resolve
+from noack.scenario.scenario_file import validate
+from plant_server.plant import Plant
+from sensor_node.sensor import Sensor, sensors_of
+from tests.machine_parts import OneLoop, SteppedMachines, machine
 from tests.noack.machines.any_machines import (
     MS,
+    Inputs,
     Sizes,
     controller,
+    driven,
     observer,
+    plain,
     plant,
     sensor,
     set_number,
+    sizes,
     text_of,
 )
 from tests.trigger_rules import TABLES
+
+Part = Plant | Sensor | Controller
+COUNT = 120
+
+
+def part_of(role: str, number: int, of: Sizes) -> Part:
+    """The machine of a loop, with a period of its own."""
+    period_ns = (1 + number % 4) * 5 * MS
+    if role == "plant":
+        return plant(number, of, period_ns=period_ns)
+    if role == "sensor":
+        return sensor(number, of, form=number)
+    return controller(number, of, period_ns=period_ns)
+
+
+def outputs_of(part: Part, seed: int, rows: int = 1024) -> list[list[Any]]:
+    """All outputs of a machine."""
+    one = SteppedMachines([part], rows=rows)
+    return [outputs for *_, outputs in driven(one, Inputs(one, seed), COUNT)]
+
+
+@given(sizes(), st.sampled_from(["plant", "sensor", "controller"]), st.integers(0, 1000))
+def test_tables_that_are_full_after_each_row_change_nothing(
+    of: Sizes, role: str, number: int
+) -> None:
+    expected = outputs_of(part_of(role, number, of), number)
+    assert outputs_of(part_of(role, number, of), number, rows=1) == expected
+
+
+@given(
+    st.lists(
+        st.tuples(sizes(), st.integers(0, 1000), st.sampled_from([0, 3, 5, 40])),
+        min_size=2, max_size=5,
+    ),
+    st.sampled_from(["plant", "sensor", "controller"]),
+    st.integers(0, 1000),
+)  # fmt: skip
+def test_several_loops_do_what_each_does_alone(
+    loops: list[tuple[Sizes, int, int]], role: str, seed: int
+) -> None:
+    """Loops of different sizes, periods and phases; only the numbers of the loops are added."""
+    phases_ns = [phase_ms * MS for *_, phase_ms in loops]
+    together = SteppedMachines([part_of(role, number, of) for of, number, _ in loops], phases_ns)
+    alone = [machine(part_of(role, number, of)) for of, number, _ in loops]
+    inputs = Inputs(together, seed)
+    for _ in range(COUNT):
+        message, now_ns = inputs.next()
+        loop = next_tick(alone, phases_ns) if message is None else message.loop
+        own_ns = now_ns - phases_ns[loop]
+        if message is None:
+            outputs, expected = together.on_timer(now_ns), alone[loop].on_timer(own_ns)
+        else:
+            outputs = together.handle(message, now_ns)
+            expected = alone[loop].handle(message._replace(loop=0), own_ns)
+        inputs.sent[loop] += [output for output in outputs if isinstance(output, Message)]
+        for written, own in zip(outputs, expected, strict=True):
+            assert (written.row[0] if isinstance(written, Record) else written.loop) == loop
+            if isinstance(own, Record):
+                compare_rows(together, loop, written, own)
+            else:
+                assert plain([written], numbered=False) == plain([own], numbered=False)
+
+
+def next_tick(alone: list[OneLoop], phases_ns: list[int]) -> int:
+    """Return the loop whose tick is due first; at the same time, that of the smaller number."""
+    dues_ns = [
+        (due_ns + phases_ns[loop], loop)
+        for loop, one in enumerate(alone)
+        if (due_ns := one.next_deadline_ns()) is not None
+    ]
+    return min(dues_ns)[1]
+
+
+def compare_rows(together: SteppedMachines, loop: int, written: Any, own: Record) -> None:
+    """A loop's vector is the beginning of the table's; the rest is NaN; other columns are 0."""
+    assert written.table == own.table
+    types = row_types([part.shape for part in together.parts])[own.table]
+    names = tables(**asdict(together.parts[loop].shape))[own.table].names or ()
+    row = dict(zip(types.names or (), written.row, strict=True))
+    for name, value in zip(names, own.row, strict=True):
+        given_value = np.atleast_1d(row[name])
+        size = np.size(value)
+        assert given_value[:size].tobytes() == np.atleast_1d(value).tobytes()
+        assert np.isnan(given_value[size:]).all()
+    missing = [row[name] for name in row if name not in (LOOP, *names)]
+    assert not any(np.any(value) for value in missing)
+
+
+def test_a_change_that_a_later_loop_refuses_changes_no_loop(content: dict[str, Any]) -> None:
+    """The second loop's trigger has no β."""
+    other = content | {"trigger": {"policy": "absolute", "delta": 0.5}}
+    together = sensors_of([resolve(validate(one, "test")) for one in (content, other)])
+    with pytest.raises(CallerError, match="beta"):
+        together.announce(ParameterChange(0, 50 * MS, {"trigger.beta": 0.5}), 0)
+    assert [structure.machine.inputs for structure in together.machines] == [0, 0]
+    assert not any(part.schedule.has_changes for part in together.parts if part.schedule)
+
+
+# --- wrong numbers --------------------------------------------------------------------------------
 
 SOURCE = Path(__file__).parents[3] / "native" / "loop" / "machine_check.c"
 NULL, FAR, HUGE = ffi.NULL, 2**60 + 1, 2**63 - 1

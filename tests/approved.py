@@ -1,0 +1,30 @@
+"""Texts that people read, against approved files.
+
+``APPROVE=1 pytest`` writes them anew: read the difference.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+
+def compare_text(path: Path, text: str) -> None:
+    """Compare a text with the approved one."""
+    if os.environ.get("APPROVE"):
+        path.write_text(text, encoding="utf-8")
+    assert text == path.read_text(encoding="utf-8")
+
+
+def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
+    """Compare the lines that each input of a file gives with the approved ones.
+
+    An input is a line of its own, and what it gives is indented below it; ``#`` begins a heading.
+    """
+    found: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("    "):
+            continue
+        found.append(line)
+        if not line.startswith("#"):
+            found += [f"    {one}" for one in lines_of(line)]
+    compare_text(path, "\n".join(found) + "\n")
