@@ -198,10 +198,7 @@ class ErrorGains:
 
         N and δ are those of one loop or of several, (…).
         """
-        numbers = np.arange(np.max(events, initial=0), dtype=np.float64)
-        sups = self.kernels[output].sups(np.asarray(spacing_s)[..., None] * numbers)
-        missing = numbers < np.asarray(events)[..., None]
-        return np.asarray(np.where(missing, sups, 0.0).sum(axis=-1))
+        return sum_of_sups(self.kernels[output], events, spacing_s)
 
     def missing_until(self, output: Output, events: Counts, due_s: float) -> Vector:
         """Return Σ_{j<N} sup_{τ ≤ (j+1)L} ‖C e^{(H+αI)τ} W^{−1}‖, for events at most L apart."""
@@ -240,13 +237,18 @@ class ErrorGains:
             for output, (mismatch, input_error) in kernels.through_groups(outputs).items()
         }
 
-    @cached_method
     def stretch(self, until_s: float) -> float:
         """Return sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``, the growth of a sampled error."""
+        return self.now_until(until_s)[Output.WEIGHTED]
+
+    @cached_method
+    def now_until(self, until_s: float) -> Mapping[Output, float]:
+        """Return sup‖C e^{(H+αI)τ} W^{−1}‖ over τ ≤ ``until_s`` for every output."""
         if until_s == 0:
-            return 1.0
+            return {output: self.now(output) for output in self.outputs}
         followed = response_until(self.scaled_H, self.inverse_weight, until_s)
-        return float(followed.through(self.weight).sup_on_grid())
+        kernels = followed.through_each(self.stacked)
+        return {output: float(kernel.sup_on_grid()) for output, kernel in kernels.items()}
 
     @cached_method
     def hold_remainder(self, hold_s: float) -> float:
@@ -260,6 +262,14 @@ class ErrorGains:
         responses = (response_until(G, self.inverse_weight, hold_s, 16) for G in (-self.H, self.H))
         sups = (followed.through(third).sup_on_grid() for followed in responses)
         return float(hold_s**3 / 6 * max(sups))
+
+
+def sum_of_sups(kernel: KernelBounds, events: int | Counts, spacing_s: float | Vector) -> Vector:
+    """Return Σ_{j<N} sup_{τ ≥ jδ} k(τ), (…)."""
+    numbers = np.arange(np.max(events, initial=0), dtype=np.float64)
+    sups = kernel.sups(np.asarray(spacing_s)[..., None] * numbers)
+    missing = numbers < np.asarray(events)[..., None]
+    return np.asarray(np.where(missing, sups, 0.0).sum(axis=-1))
 
 
 def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
@@ -486,6 +496,22 @@ class PlantGains:
     def columns(self) -> Columns:
         """The columns through which e_s is driven."""
         return Columns(self.split_mismatch[0], self.input_matrix, self._forcing.limited)
+
+    @cached_property
+    def driven(self) -> Mapping[Output, tuple[KernelBounds, KernelBounds]]:
+        """‖C e^{(H+αI)τ} B U‖ and ‖C e^{(H+αI)τ} L_E‖ for every output C e_c; none in a hold.
+
+        Raises:
+            NotDecayingError: α is not below the decay rate of e^{Hτ}.
+        """
+        error, columns = self.error, self.columns
+        if not error.scaled_H.any():
+            return {}
+        by_input, mismatched = (
+            response(error.scaled_H, driven).through_each(error.stacked)
+            for driven in (columns.input_error, columns.mismatch)
+        )
+        return {output: (by_input[output], mismatched[output]) for output in error.outputs}
 
     @cached_method
     def growth(self, until_s: float | Vector, cells: int) -> Growth:

@@ -321,24 +321,23 @@ def _rounded_up(time_s: float, step_s: float) -> float:
 class ErrorGrowth:
     """The growth of e_s without a test: from the bound after a test, or from 0 after an event.
 
-    sup‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ + ``input_error`` sup‖p‖
+    Then ‖e_s‖_W ≤ ``fixed`` + ``estimation`` η + Σ_C ``shares``_C sup‖C x‖ =: b. Until the next
+    test, sup‖e_s‖_W ≤ ``stretch`` b + ``driven`` · (sup‖p‖, sup‖R_E x‖, 1).
     """
 
     def __init__(self, plant: PlantGains, longest_s: float, after: TriggerBound) -> None:
-        stretch, outputs = plant.error.stretch(longest_s), plant.outputs
-        self.fixed: Vector = np.asarray(stretch * after.beta)
-        self.input_error: Vector = np.zeros(())
+        outputs = plant.outputs
+        self.longest_s, self.stretch = longest_s, plant.error.stretch(longest_s)
+        self.fixed, self.shares = after.beta, after.shares
         # The trigger tests x_s − x̂, and may compare it with x̂.
-        self.estimation = stretch * (1 + sum(
+        self.estimation = 1 + sum(
             share * spectral_norm(outputs[C] @ plant.error.inverse_weight)
             for C, share in after.shares.items()
-        ))  # fmt: skip
-        shares: dict[str, Vector | float] = {C: stretch * of for C, of in after.shares.items()}
+        )
+        still = np.zeros(())
+        self.driven: tuple[Vector, Vector, Vector] = (still, still, still)
         if longest_s > 0:
-            self.input_error, mismatch, forced = plant.growth(longest_s, COARSE_CELLS).totals
-            shares[Output.MISMATCH] = shares.get(Output.MISMATCH, 0.0) + mismatch
-            self.fixed = self.fixed + forced
-        self.shares: Mapping[str, Vector | float] = shares
+            self.driven = plant.growth(longest_s, COARSE_CELLS).totals
 
 
 def list_growths(plant: PlantGains, sampling_s: float, bound: TriggerBound) -> list[ErrorGrowth]:

@@ -3,17 +3,24 @@
 Assumptions: the trigger ‖e_s‖_W > βe^{−αt} is tested at least every h seconds, the network keeps
 its guarantee about losses, and the input is held. With all signals scaled by e^{αt}:
 
-    sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
-    sup‖C x‖    ≤ free_C + gain_C q + Γ_C β̃,   Γ_C ≤ gain_C D_K       (plant, input error p)
-    q           ≤ Σ_{C = σKH, ½σ²KH², r(σ)W} (sup‖C x‖ + D_C β̃)       (input of age ≤ σ)
-    π = sup‖p‖  ≤ D_K β̃ + q
-    β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                      (between two tests)
+    sup‖C e_c‖  ≤ D_C β + I_C sup‖R_E x‖ + J_C π                              (I1)
+    sup‖C x‖    ≤ free_C + gain_C (q + sup‖K e_c‖)                            (the plant)
+    q           ≤ Σ_{C = σKH, ½σ²KH², r(σ)W} (sup‖C x‖ + sup‖C e_c‖)          (input of age ≤ σ)
+    π = sup‖p‖  ≤ sup‖K e_c‖ + q
+    β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                              (between two tests)
 
-with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. A policy's
-threshold may contain more than β (:mod:`noack.theory.bounds.trigger_bounds`), and Γ_C is smaller if
-few updates may be lost in a window (:mod:`noack.theory.certificates.loss_accumulation`). These
-inequalities are linear in q and β̃ and hold on every [0, T]. So their solution bounds the run if
-the loop gain is below 1.
+with at most N missing events: the longest burst of losses, and ⌈d/δ⌉ in flight. Each e_s, now or at
+an event, is what it was at the last test, at most β, and what has entered since, through L_E and
+B U. Both parts are followed on their own, each with its direction:
+
+    D_C = sup_{r≤h} ‖C e^{Gr} W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{Gτ} W⁻¹‖,       G = H + αI
+    J_C = ∫₀^h ‖C e^{Gr} B U‖ dr + Σ_{j<N} min(h sup_{τ≥jδ} ‖C e^{Gτ} B U‖, I_B sup ‖C e^{Gτ} W⁻¹‖)
+
+and I_C the same with L_E. A policy's threshold may contain more than β
+(:mod:`noack.theory.bounds.trigger_bounds`); where e_s may have grown in several ways, β̃ is used in
+place of β, without I_C and J_C. The part of x from lost events is smaller if few updates may be
+lost in a window (:mod:`noack.theory.certificates.loss_accumulation`). These inequalities are linear
+and hold on every [0, T]. So their solution bounds the run if the loop gain is below 1.
 
 **Solution.** For v ≤ F v + g with F, g ≥ 0: if some w > 0 has F w < w, the spectral radius of F is
 below 1, and v ≤ x for every x with x − F x ≥ g. Both are checked with a bound of all rounding, so
@@ -24,15 +31,13 @@ misses g by r, adding w max r/(w − F w) is enough.
 import math
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from functools import cached_property
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.core.linear_systems import Matrix, Vector
-from noack.theory.bounds.gains import Coefficients, Counts, Output
+from noack.theory.bounds.gains import Coefficients, Counts, Output, sum_of_sups
 from noack.theory.bounds.terms import Constants, NetworkConditions, Part
 from noack.theory.bounds.trigger_bounds import (
     COARSE_CELLS,
@@ -133,13 +138,15 @@ class LoopConstants(NamedTuple):
     loop_gain: Vector
     estimation_error: Vector
     received_input_error: Vector
+    earlier_input_error: Vector
+    """The part of the input error that does not come from the present e_s."""
     exists: NDArray[np.bool_]
     """Where there is a certificate; of the others only ``loop_gain`` is of use."""
 
     def of_loop(self, loop: int, rate_per_s: float, inter_event_s: float | None) -> Constants:
         """Return the constants of one loop."""
         own = {name: values[loop].item() for name, values in self._asdict().items()}
-        del own["exists"]
+        del own["exists"], own["earlier_input_error"]
         return Constants(rate_per_s=rate_per_s, inter_event_s=inter_event_s, **own)
 
 
@@ -182,96 +189,135 @@ class ErrorInequalities:
 
         A loop without a certificate has a loop gain that is not below 1, and perhaps infinite.
         """
-        conditions, error = self._conditions, self._error
+        conditions = self._conditions
         events = np.full(len(spacing_s), conditions.dropouts)
         is_spaced = spacing_s > 0
         if conditions.delay_s > 0:  # without a spacing, any number of updates may be in flight
             events[is_spaced] += np.ceil(conditions.delay_s / spacing_s[is_spaced]).astype(np.int64)
-        if method is BoundMethod.DRIFTING:
-            bound = self._drifting(spacing_s)
-        else:
-            gains = {C: self._missing_gain(C, events, spacing_s) for C in error.outputs}
-            in_flight = self._missing_gain(Output.GAIN, events - conditions.dropouts, spacing_s)
-            bound = _ErrorBound({C: error.now(C) for C in error.outputs}, gains, in_flight)
-        signals = self._signals(bound, self._from_errors(bound, spacing_s))
-        loop_gain, solved = self._solved(signals)
-        if conditions.delay_s > 0:
-            loop_gain = np.where(is_spaced, loop_gain, np.inf)
-        sensor_error = solved[..., 1] + solved[..., 2]
+        is_counted = is_spaced | (conditions.delay_s == 0)
+        solved: list[tuple[_Signals, Vector, Matrix]] = []
+        for growths in self._growths:  # all bounds of e_s hold; of each, one growth applies
+            own = growths[0] if len(growths) == 1 and self._error.decays else None
+            signals = self._signals(method, events, spacing_s, own)
+            each = [self._solved(signals, growth, own) for growth in growths]
+            gain = np.max([one.loop_gain for one in each], axis=0)
+            solved.append((signals, gain, np.max([one.bound for one in each], axis=0)))
+        smallest = np.min([bound for _, _, bound in solved], axis=0)
+        gain = np.where(is_counted, np.min([gain for _, gain, _ in solved], axis=0), np.inf)
+        found = []
+        for signals, _, bound in solved:  # each b is another one
+            bound = np.where(np.arange(_SIGNALS) == 1, bound, smallest)
+            found.append(self._found(signals, events, gain, bound, is_counted))
+        exists = np.any([one.exists for one in found], axis=0)
+        return LoopConstants(*map(np.fmin.reduce, zip(*found, strict=True)))._replace(exists=exists)
+
+    def _found(
+        self,
+        signals: "_Signals",
+        events: Counts,
+        loop_gain: Vector,
+        solved: Matrix,
+        is_counted: NDArray[np.bool_],
+    ) -> LoopConstants:
+        """Return what follows from bounds of the signals, (loops, 6)."""
         states = signals.free + _applied(signals.states, solved)
         state = dict(zip(self._states, np.moveaxis(states, -1, 0), strict=True))
-
-        def of_error(output: Output) -> Vector:
-            return _product(signals.errors[output], solved)
-
+        held, estimation = solved[..., 0], solved[..., 2]
         found = (
-            (of_error(Output.WEIGHTED) + solved[..., 2]) / self.unit,
-            sensor_error / self.unit,
-            of_error(Output.GAIN) + solved[..., 0],
+            (_product(signals.errors[Output.WEIGHTED], solved) + estimation) / self.unit,
+            (_product(signals.sensor, solved) + estimation) / self.unit,
+            _product(signals.errors[Output.GAIN], solved) + held,
             self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
             state[Output.MISMATCH],
             loop_gain,
-            solved[..., 2],
-            error.now(Output.GAIN) * solved[..., 1] + solved[..., 0],
-            np.isfinite(solved).all(axis=-1) & (is_spaced | (conditions.delay_s == 0)),
+            estimation,
+            _product(signals.received, solved) + held,
+            _product(signals.earlier, solved) + held,
+            np.isfinite(solved).all(axis=-1) & is_counted,
         )
-        columns = (np.broadcast_to(values, events.shape) for values in found)
-        return LoopConstants(events, *columns)
-
-    def _drifting(self, spacing_s: Vector) -> "_ErrorBound":
-        """Return the bound of e_c by its value d ago, and by what has driven it since.
-
-        d ago, e_c consisted of e_s and of the errors of events that are lost.
-        """
-        error, dropouts, kernels = self._error, self._conditions.dropouts, self._error.kernels
-        return _ErrorBound(
-            {output: float(kernel.sup()) for output, kernel in kernels.items()},
-            {output: error.missing(output, dropouts, spacing_s) for output in kernels},
-            np.zeros(()),
-            self._drift,
-        )
-
-    @cached_property
-    def _drift(self) -> Mapping[Output, tuple[Vector, Vector, Vector]]:
-        growths = self._plant.growths(self._conditions.delay_s, COARSE_CELLS)
-        return {output: growth.totals for output, growth in growths.items()}
+        return LoopConstants(events, *(np.broadcast_to(values, events.shape) for values in found))
 
     @property
     def unit(self) -> float:
         """The unit of Δ and β̃/β."""
         return self._bound.beta if self._bound.unit is None else self._bound.unit
 
-    def _signals(self, bound: "_ErrorBound", from_errors: Mapping[str, Vector]) -> "_Signals":
-        """Return how all outputs depend on (q, β̃, η, π, sup‖R_E x‖, 1).
+    def _signals(
+        self, method: BoundMethod, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
+    ) -> "_Signals":
+        """Return how all outputs depend on (q, b, η, π, sup‖R_E x‖, 1).
 
-        An event's x_s − x̂ is at most β̃ + η, the present x_s − x at most β̃.
+        Every ‖e_s‖_W has grown by ``own`` from at most b at the last test; without it b is β̃. An
+        event's x_s − x̂ is at most this plus η, the present x_s − x is at most this.
         """
-        still = (0.0, 0.0, 0.0)
-        by_input = bound.drift.get(Output.GAIN, still)
-        present = bound.present[Output.GAIN]
-        states = [
-            _columns(
-                gain, from_errors[name], from_errors[name] - gain * present,
-                *(gain * driven for driven in by_input),
-            )
-            for name, (_, gain) in self._states.items()
-        ]  # fmt: skip
-        errors = {
-            output: _columns(0.0, now + gone, gone, *bound.drift.get(output, still))
-            for (output, now), gone in zip(
-                bound.present.items(), bound.missing.values(), strict=True
-            )
-        }
+        held, test, estimated, *_ = np.eye(_SIGNALS)
+        sensor = test if own is None else _columns(0.0, own.stretch, 0.0, *own.driven)
+        present = {output: self._present(output, own) for output in self._error.outputs}
+        received, dropouts = present[Output.GAIN], np.full_like(events, self._conditions.dropouts)
+
+        def missing(output: Output, count: Counts) -> Matrix:
+            return self._missing(output, count, spacing_s, own)
+
+        if method is BoundMethod.DRIFTING:
+            # d ago, e_c consisted of e_s and of the errors of events that are lost.
+            delay_s = self._conditions.delay_s
+            present = {output: self._present(output, own, delay_s) for output in present}
+            errors = {output: row + missing(output, dropouts) for output, row in present.items()}
+            earlier, near = errors[Output.GAIN], present[Output.GAIN]
+        else:
+            gone = {output: missing(output, events) for output in present}
+            errors = {output: row + gone[output] for output, row in present.items()}
+            earlier = gone[Output.GAIN]
+            near = received + missing(Output.GAIN, events - dropouts)
+        whole = errors[Output.GAIN]
+        lost = whole[..., 1] - near[..., 1]
+        alone = self._alone(lost, spacing_s)
+        states = []
+        for name, (_, gain) in self._states.items():
+            gain = np.asarray(gain)[..., None]
+            row = gain * (held + whole)
+            if name in alone:
+                in_windows = gain * (held + near) + alone[name][:, None] * (sensor + estimated)
+                row = np.where((alone[name] < gain[..., 0] * lost)[:, None], in_windows, row)
+            states.append(row)
         free = _columns(*(state.free for state in self._states.values()))
-        return _Signals(list(self._states), free, _rows(*states), errors)
+        rows = _rows(*states)
+        return _Signals([*self._states], free, rows, errors, sensor, received, earlier)
 
-    def _solved(self, signals: "_Signals") -> tuple[Vector, Matrix]:
-        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6).
+    def _present(self, output: Output, own: ErrorGrowth | None, later_s: float = 0.0) -> Matrix:
+        """Return the bound of sup‖C e_s‖ as a row of the signals.
 
-        The bounds are infinite where the loop gain is not below 1.
+        It is that of what e_s becomes, if nothing resets it, up to ``later_s`` after.
         """
+        until_s, still = later_s + (0.0 if own is None else own.longest_s), np.zeros(())
+        driven: tuple[Vector, Vector, Vector] = (still, still, still)
+        if until_s > 0:
+            driven = self._plant.growths(until_s, COARSE_CELLS)[output].totals
+        return _columns(0.0, self._error.now_until(until_s)[output], 0.0, *driven)
+
+    def _missing(
+        self, output: Output, events: Counts, spacing_s: Vector, own: ErrorGrowth | None
+    ) -> Matrix:
+        """Return the bound of the part of sup‖C e_c‖ from missing events as a row of the signals.
+
+        The part of e_s that has grown since the last test is followed from where it entered.
+        """
+        gain = self._missing_gain(output, events, spacing_s)
+        if own is None:
+            return _columns(0.0, gain, gain, 0.0, 0.0, 0.0)
+        driven = [gain * size for size in own.driven]
+        if own.longest_s > 0:
+            for place, kernel in enumerate(self._plant.driven.get(output, ())):
+                followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
+                driven[place] = np.minimum(driven[place], followed)
+        return _columns(0.0, gain, gain, *driven)
+
+    def _solved(
+        self, signals: "_Signals", growing: ErrorGrowth, own: ErrorGrowth | None
+    ) -> Solution:
+        """Return the loop gains, (loops,), and the bounds of the signals, (loops, 6)."""
         errors, hold_s, beyond = signals.errors, self._conditions.hold_s, self._beyond
         held: dict[str, float] = {
             Output.GAIN_RATE: hold_s,
@@ -291,53 +337,44 @@ class ErrorInequalities:
             estimation.fixed + free + estimation.from_input * beyond,
         )
         of_mismatch = signals.through({Output.MISMATCH: 1.0})
+        through, free = signals.through(growing.shares)
+        of_test = (through + growing.estimation * estimated, growing.fixed + free)
+        if own is None:
+            by_input, mismatched, forced = growing.driven
+            of_test = (
+                growing.stretch * of_test[0] + _columns(0.0, 0.0, 0.0, by_input, mismatched, 0.0),
+                growing.stretch * of_test[1] + forced,
+            )
         others = ((input_error, beyond), of_mismatch, (0.0 * input_error, 1.0))
-
-        def solved(growing: ErrorGrowth) -> Solution:
-            through, free = signals.through(growing.shares)
-            F = through + np.asarray(growing.input_error)[..., None] * input_error
-            F = F + np.asarray(growing.estimation)[..., None] * estimated
-            fixed = growing.fixed + free + growing.input_error * beyond
-            each = (of_age, (F, fixed), of_estimate, *others)
-            rows = _rows(*(row for row, _ in each))
-            return solve_inequalities(rows, np.broadcast_to(
-                _columns(*(right for _, right in each)), rows.shape[:-1]
-            ))  # fmt: skip
-
-        # Of each bound one growth applies, and all bounds hold.
-        each = [[solved(growth) for growth in growths] for growths in self._growths]
-        gains = [np.max([one.loop_gain for one in solutions], axis=0) for solutions in each]
-        bounds = [np.max([one.bound for one in solutions], axis=0) for solutions in each]
-        return np.min(gains, axis=0), np.min(bounds, axis=0)
+        each = (of_age, of_test, of_estimate, *others)
+        rows = _rows(*(row for row, _ in each))
+        right = _columns(*(right for _, right in each))
+        return solve_inequalities(rows, np.broadcast_to(right, rows.shape[:-1]))
 
     def _missing_gain(self, output: Output, events: Counts, spacing_s: Vector) -> Vector:
         if self._error.decays or math.isinf(self._bound.due_s):
             return self._error.missing(output, events, spacing_s)
         return self._error.missing_until(output, events, self._bound.due_s)
 
-    def _from_errors(self, bound: "_ErrorBound", spacing_s: Vector) -> Mapping[str, Vector]:
-        """Return Γ_C for every output, from D_K and from the losses in windows.
+    def _alone(self, lost: Vector, spacing_s: Vector) -> Mapping[str, Vector]:
+        """Return S_C for every output, from the losses in windows; infinite where it is not needed.
 
-        The second is computed only where it can be smaller: where all lost updates together have
-        less effect than the longest burst at its largest.
+        It is computed only where it can be smaller: where all lost updates together have less
+        effect than the longest burst at its largest, ``lost``.
         """
-        present = bound.present[Output.GAIN] + bound.in_flight
-        share = bound.present[Output.GAIN] + bound.missing[Output.GAIN]
-        sizes = {output: gain * share for output, (_, gain) in self._states.items()}
         if self._lost is None:
-            return sizes
+            return {}
         windows = self._conditions.guarantee.windows
         density = min(window.losses / window.packets for window in windows)
         lasting = density * self._error.kernels[Output.GAIN].integral()
-        which = np.flatnonzero(lasting < (share - present) * spacing_s).tolist()
-        if not which:
-            return sizes
-        for output, (_, gain) in self._states.items():
-            alone = np.full(len(spacing_s), np.inf)
+        which = np.flatnonzero(lasting < lost * spacing_s).tolist()
+        found: dict[str, Vector] = {}
+        for output in self._states if which else ():
+            found[output] = np.full(len(spacing_s), np.inf)
             for loop in which:
-                alone[loop] = self._lost.total(output, float(spacing_s[loop]), windows, loop)
-            sizes[output] = np.minimum(sizes[output], gain * present + alone)
-        return sizes
+                total = self._lost.total(output, float(spacing_s[loop]), windows, loop)
+                found[output][loop] = total
+        return found
 
     def inter_event_s(
         self,
@@ -354,8 +391,7 @@ class ErrorInequalities:
         """
         # The part of D_K that is the e_s of now.
         own = np.where(drifts, 0.0, self._error.now(Output.GAIN))
-        sensor_error = constants.overshoot * self.unit - constants.estimation_error
-        others = constants.input_error - own * sensor_error
+        others = constants.earlier_input_error
         estimation = np.where(searched, constants.estimation_error, 0.0)
         # After an event e_s is the estimation error, and x_s − x̂ differs from e_s by one, too.
         times_s = [
@@ -380,23 +416,10 @@ class ErrorInequalities:
         return np.asarray(grid_s * np.maximum(np.ceil(found_s / grid_s - 1e-9), 1.0))
 
 
-class _ErrorBound(NamedTuple):
-    """sup‖C e_c‖ ≤ (present_C + missing_C) β̃ + drift_C · (π, sup‖R_E x‖, 1), for every output C."""
-
-    present: Mapping[Output, float]
-    """The gain of e_s, now or where the drift begins."""
-    missing: Mapping[Output, Vector]
-    """The gain of the events that are missing then."""
-    in_flight: Vector
-    """The part of missing_K that is not lost."""
-    drift: Mapping[Output, tuple[Vector, Vector, Vector]] = MappingProxyType({})
-    """The gains of what has driven e_c since then; none without a delay."""
-
-
 class _Signals(NamedTuple):
-    """The outputs of x and e_c as linear functions of (q, β̃, η, π, sup‖R_E x‖, 1).
+    """The outputs of x and e_c as linear functions of (q, b, η, π, sup‖R_E x‖, 1).
 
-    η = sup‖x̂ − x‖_W.
+    η = sup‖x̂ − x‖_W, and b bounds ‖e_s‖_W after each test, or is β̃.
     """
 
     names: list[str]
@@ -406,6 +429,12 @@ class _Signals(NamedTuple):
     """(…, k, 6)"""
     errors: Mapping[Output, Vector]
     """(…, 6) of sup‖C e_c‖."""
+    sensor: Vector
+    """(…, 6) of β̃ = sup‖e_s‖_W."""
+    received: Vector
+    """(…, 6) of sup‖K e_c‖ while no event is missing."""
+    earlier: Vector
+    """(…, 6) of the part of sup‖K e_c‖ that does not come from the present e_s."""
 
     def through(self, gains: Mapping[str, Vector | float]) -> tuple[Vector, Vector]:
         """Return Σ_C gain_C sup‖C x‖ by its linear, (…, 6), and its constant part, (…)."""

@@ -155,6 +155,18 @@ class _SampledPlant(PlantGains):
         return coefficients
 
     @cached_property
+    def driven(self) -> Mapping[Output, tuple[KernelBounds, KernelBounds]]:
+        nodes_s, states = self.samples.models
+        by_input, mismatched = self.columns.input_error, self.columns.mismatch
+        return {
+            output: (
+                _sampled(nodes_s, C @ states @ by_input),
+                _sampled(nodes_s, C @ states @ mismatched),
+            )
+            for output, C in self.error.outputs.items()
+        }
+
+    @cached_property
     def forced(self) -> Mapping[str, KernelBounds]:
         nodes_s, states = self.samples.plant
         return {

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.enclosure import KernelBounds, NotDecayingError, constant_kernel
 from noack.theory.bounds.gains import Coefficients, ErrorGains, Output, PlantGains
 from noack.theory.bounds.terms import Constants, NoCertificateError
 from tests.noack.theory.certificate_kinds import Bounds, Broken, Kind, Observed
@@ -58,6 +58,15 @@ class NoMismatch(PlantGains):
     @property
     def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
         return {**super().states, Output.MISMATCH: Coefficients(0.0, 0.0)}
+
+
+class NoGrowthOfMissing(PlantGains):
+    """Leaves out by how much a missing event's e_s had grown since the test before."""
+
+    @property
+    def driven(self) -> dict[Output, tuple[KernelBounds, KernelBounds]]:  # type: ignore[override]
+        none = constant_kernel(0.0)
+        return dict.fromkeys(self.error.outputs, (none, none))
 
 
 class NoCurvature(ErrorGains):
@@ -116,6 +125,11 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     ),
     "no free response": (with_gains(ErrorGains, NoFreeResponse), {"beta": 0.01}),
     "no mismatch": (with_gains(ErrorGains, NoMismatch), {"mismatch": 0.5, "beta": 0.01}),
+    "a missing error has not grown": (
+        with_gains(ErrorGains, NoGrowthOfMissing),
+        {"n": 1, "m": 1, "mansd": 1, "delay_steps": 0, "hold_steps": 0, "sample_steps": 3,
+         "mismatch": 0.5, "beta": 0.01, "step_share": 0.03},
+    ),
     "only the first moment": (
         with_gains(OnlyTheFirstMoment, PlantGains),
         {"spread": 10.0, "n": 2, "m": 1, "mansd": 1, "alpha_share": 0.8, **EVENTFUL},
