@@ -30,7 +30,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.scenario import Scenario
 
-BAND, KEPT = "90 % of draws", "kept settings"
+BAND, KEPT = "90 % of draws", "for comparison"
 _SMALLEST = 1e-6
 """Smallest value on a logarithmic axis, as a share of the largest; an error is 0 after a reset."""
 _DECADES = 7
@@ -141,6 +141,10 @@ def _events(shown: Shown) -> _Part:
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
     crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
     items = [dots, replace(crosses, marker="x", stroke=1.6)]
+    if (other := shown.reference) is not None:
+        before = Marks(x=other.event_s, y=np.diff(other.event_s, prepend=0.0), label=KEPT,
+                       colour=FORCED, opacity=0.45)  # fmt: skip
+        items.insert(0, before)
     return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
 
 

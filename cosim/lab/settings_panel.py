@@ -1,173 +1,101 @@
 """The settings of the loop: choices and sliders, the form of all keys, and the scenario's text.
 
-Groups of the form are built when they are opened; mistakes are shown at their fields.
+The browser makes the sliders itself, see ``lab.js``. Groups of the form are built when they are
+opened; mistakes are shown at their fields.
 """
 
 from collections.abc import Awaitable, Callable
 
 from nicegui import ui
-from nicegui.elements.mixins.value_element import ValueElement
 from nicegui.events import ValueChangeEventArguments
 
 from cosim.interactive.controls import (
-    Choice,
+    Controls,
     Field,
     FieldKind,
     Group,
-    Slider,
     by_field,
-    chosen,
-    controls_of,
-    dragged,
     filled,
     form_of,
 )
 from cosim.interactive.draft import Draft, DraftError, Mistake
-from noack.core.errors import NoackError
 from noack.core.number_format import number
 
-Changed = Callable[[Draft, str], Awaitable[None]]
-"""Called with the new draft and the key that changed; an empty key: the whole text."""
-
-
-class FastSlider(ValueElement[float]):
-    """A slider that sends its place up to 60 times a second while it is dragged."""
-
-    LOOPBACK = False  # a late answer of the server would move it back
-
-    def __init__(
-        self, slider: Slider, on_change: Callable[[ValueChangeEventArguments[float]], object]
-    ) -> None:
-        low, high = slider.ends
-        super().__init__(
-            tag="q-slider", value=slider.position, on_value_change=on_change, throttle=1 / 60
-        )
-        self.props["min"], self.props["max"], self.props["step"] = low, high, slider.step
-        self.props["aria-label"] = slider.label
+Apply = Callable[[Callable[[Draft], Draft], str], Awaitable[None] | None]
+"""Applies a change of the draft; the second argument is the key."""
 
 
 class SettingsPanel:
-    """The panel; it shows a draft and passes on each change."""
+    """The form and the text; both show a draft and pass on each change."""
 
-    def __init__(self, draft: Draft, changed: Changed) -> None:
-        self._draft, self._changed = draft, changed
+    def __init__(self, draft: Draft, apply: Apply) -> None:
+        self._draft, self._apply = draft, apply
         self._quiet = False
-        self._shape: tuple[object, ...] = ()
-        self._sliders: dict[str, tuple[Slider, FastSlider, ui.label]] = {}
-        self._controls = ui.column().classes("w-full gap-1")
-        self._form = FormPanel(draft, self._apply)
+        self._form = FormPanel(draft, apply)
         with ui.expansion("all settings (TOML)").classes("w-full").props("dense") as whole:
             self._mistakes = ui.column().classes("gap-0 w-full").props("role=status")
             self._editor = ui.codemirror(
                 draft.text, language="TOML", line_wrapping=False, on_change=self._edited
             ).classes("w-full h-96")
         whole.on("after-show", js_handler="labNameEditor")
-        self._build()
 
-    def show(self, draft: Draft, *, text: bool = True) -> None:
-        """Show another draft; with ``text`` also in the editor."""
-        self._draft = draft
-        self._quiet = True
+    def show(self, draft: Draft) -> None:
+        """Show another draft; what is being typed stays."""
+        self._draft, self._quiet = draft, True
         try:
-            self._build()
             self._form.show(draft)
-            if text and self._editor.value != draft.text:
+            if self._editor.value != draft.text:
                 self._editor.set_value(draft.text)
         finally:
             self._quiet = False
-
-    def begin(self) -> None:
-        """Name in the browser what can only be named there."""
-        ui.run_javascript("labSpeakSliders()")
 
     def show_dark(self, *, dark: bool) -> None:
         """Choose the colours of the editor."""
         self._editor.set_theme("vscodeDark" if dark else "vscodeLight")
 
     def show_mistakes(self, mistakes: list[Mistake]) -> None:
-        """Show mistakes at their fields and above the editor, and mark their sliders."""
+        """Show mistakes at their fields and above the editor."""
         self._form.show_mistakes(mistakes)
         self._mistakes.clear()
         with self._mistakes:
             for one in mistakes:
                 ui.label(one.text).classes("text-negative")
-        wrong = {one.key for one in mistakes}
-        for key, (_, _, shown) in self._sliders.items():
-            change = "add" if key in wrong else "remove"
-            shown.classes(**{change: "text-negative"})
-
-    def _build(self) -> None:
-        try:
-            controls = controls_of(self._draft)
-        except DraftError:
-            return  # the mistakes are shown; the sliders stay
-        if controls.shape == self._shape:
-            for slider in controls.sliders:
-                _, element, shown = self._sliders[slider.key]
-                self._sliders[slider.key] = (slider, element, shown)
-                shown.set_text(_text(slider.value))
-                if abs(element.value - slider.position) > slider.step / 2:
-                    element.set_value(slider.position)
-            return
-        self._shape, self._sliders = controls.shape, {}
-        self._controls.clear()
-        with self._controls:
-            for choice in controls.choices:
-                self._add_choice(choice)
-            for slider in controls.sliders:
-                self._add_slider(slider)
-
-    def _add_choice(self, choice: Choice) -> None:
-        def select(event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
-            if self._quiet or event.value == choice.value:
-                return None
-            return self._apply(lambda draft: chosen(draft, choice.key, event.value), "")
-
-        ui.select(
-            dict(choice.options), value=choice.value, label=choice.label, on_change=select
-        ).classes("w-full").props("dense options-dense")
-
-    def _add_slider(self, slider: Slider) -> None:
-        key = slider.key
-
-        def moved(event: ValueChangeEventArguments[float]) -> Awaitable[None] | None:
-            current = self._sliders[key][0]
-            value = current.value_at(float(event.value))
-            self._sliders[key][2].set_text(_text(value))
-            if self._quiet or value == current.value:
-                return None
-            return self._apply(lambda draft: dragged(draft, current, value), key)
-
-        with ui.row().classes("w-full no-wrap justify-between gap-2 mt-1"):
-            ui.label(slider.label)
-            shown = ui.label(_text(slider.value)).classes("font-mono")
-        element = FastSlider(slider, moved).classes("w-full")
-        element.props("dense")
-        self._sliders[key] = (slider, element, shown)
-
-    def _apply(self, change: Callable[[Draft], Draft], key: str) -> Awaitable[None] | None:
-        """Show a change at once, before the next event is handled; return what follows from it."""
-        try:
-            draft = change(self._draft)
-        except NoackError as error:
-            ui.notify(str(error), type="negative")
-            return None
-        self.show(draft)
-        return self._changed(draft, key)
 
     def _edited(self, event: ValueChangeEventArguments[str]) -> Awaitable[None] | None:
         if self._quiet or event.value == self._draft.text:
             return None
-        self.show(self._draft.with_text(event.value), text=False)
-        return self._changed(self._draft, "")
+        self._draft = self._draft.with_text(event.value)
+        return self._apply(lambda draft: draft.with_text(event.value), "scenario")
 
 
-def _text(value: float) -> str:
+def controls_part(controls: Controls, wrong: set[str], *, live: bool) -> dict[str, object]:
+    """Return choices and sliders for the browser.
+
+    Args:
+        controls: they.
+        wrong: keys with mistakes.
+        live: whether a loop is running, which some sliders change.
+    """
+    return {
+        "choices": [
+            {"key": one.key, "label": one.label, "value": one.value,
+             "options": [*one.options.items()]}
+            for one in controls.choices
+        ],
+        "sliders": [
+            {"key": one.key, "label": one.label + " · also live" * (live and one.live),
+             "min": one.ends[0], "max": one.ends[1], "step": one.step, "place": one.position,
+             "text": value_text(one.value), "wrong": one.key in wrong}
+            for one in controls.sliders
+        ],
+    }  # fmt: skip
+
+
+def value_text(value: float) -> str:
+    """Return the value of a slider as text."""
     return f"{value:g}" if isinstance(value, int) else number(value, 3)
 
 
-Apply = Callable[[Callable[[Draft], Draft], str], Awaitable[None] | None]
-"""Applies a change of the draft; the second argument is the key."""
 _REST_MS = 400
 """So long after the last key press, a text is taken."""
 _Input = ui.input | ui.select
