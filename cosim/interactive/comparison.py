@@ -32,14 +32,16 @@ class Comparison(NamedTuple):
 
 def compare(reference: Reference, run: Exploration) -> Comparison:
     """Compare a run with a reference."""
-    other = reference.run
+    until_s = min(float(one.t_s[-1]) for one in (reference.run, run))
+    other, now = (one.until(until_s) for one in (reference.run, run))
+    until = "" if other is reference.run and now is run else f", until {number(until_s, 3)} s"
     rows = (
-        _counts("transmissions", len(other.event_s), len(run.event_s)),
-        _counts("lost", other.lost, run.lost),
-        _sizes("‖x‖ at the end", float(other.x_norm[-1]), float(run.x_norm[-1])),
-        _sizes("largest ‖e_c‖", other.largest_e_c, run.largest_e_c),
+        _counts("transmissions", len(other.event_s), len(now.event_s)),
+        _counts("lost", other.lost, now.lost),
+        _sizes("‖x‖ at the end", float(other.x_norm[-1]), float(now.x_norm[-1])),
+        _sizes("largest ‖e_c‖", other.largest_e_c, now.largest_e_c),
     )
-    return Comparison(f"compared with {reference.name}", _settings(other, run), rows)
+    return Comparison(f"compared with {reference.name}{until}", _settings(other, run), rows)
 
 
 def _settings(other: Exploration, run: Exploration) -> str:
@@ -76,5 +78,6 @@ def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:
     if texts[0] == texts[1]:
         words = "the same" if math.isfinite(before) else "–"
     elif math.isfinite(before) and math.isfinite(after) and before > 0:
-        words = f"{number(after / before, 3)} times as large"
+        ratio = number(after / before, 3)
+        words = "nearly the same" if ratio == "1" else f"{ratio} times as large"
     return name, texts[0], texts[1], words

@@ -185,7 +185,7 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
     if above.any():
         return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", BAD)
     share = percent(float(np.nanmax(np.append(used[0], 0.0))))
-    return VerdictLine(f"guarantee kept: ‖e_c‖ used at most {share} of its bound", GOOD)
+    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", GOOD)
 
 
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:

@@ -21,13 +21,21 @@ from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
 from cosim.interactive.comparison import Reference, compare
-from cosim.interactive.controls import Controls, chosen, controls_of, dragged
+from cosim.interactive.controls import (
+    Controls,
+    by_field,
+    chosen,
+    controls_of,
+    dragged,
+    filled,
+    form_of,
+)
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
 from cosim.interactive.scenario_guarantee import verdict_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
-from cosim.lab.settings_panel import SettingsPanel, controls_part, value_text
+from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
 from cosim.lab.sources import LiveSource, RecordedSource, report_address
 from cosim.lab.stage import Stage, figure_part
 from cosim.output.figure_format import FigureFormat, figure_width_in
@@ -83,6 +91,7 @@ class _Page:
         self._source, self._state, self._comparing = EXPLORE, 0, True
         self._kept: Reference | None = None
         self._controls: Controls | None = None
+        self._form = form_of(draft)
         self._moved = ["", ""]
         """Key and text of the slider that was moved last."""
         self._last = ("", 0.0)
@@ -114,10 +123,9 @@ class _Page:
             )
         with ui.element("main").classes("lab-body w-full"):
             with ui.element("aside").props("id=lab-drawer aria-label=settings tabindex=-1"):
-                for name in ("guide", "controls"):
-                    ui.element("div").props(f"id=lab-{name} hidden" if name == "guide" else
-                                            f"id=lab-{name}")  # fmt: skip
-                self._settings = SettingsPanel(self._session.draft, self._apply)
+                for name in ("guide hidden", "controls", "form"):
+                    ui.element("div").props(f"id=lab-{name}")
+                self._text = TextPanel(self._session.draft, self._apply)
             with ui.element("div").classes("lab-main"):
                 self._build_bar()
                 self._build_stage()
@@ -139,26 +147,27 @@ class _Page:
             with ui.element("label").props("hidden"):
                 ui.label("drawn state ").classes("inline")
                 ui.element("select").props("id=lab-state")
-            ui.element("progress").props("id=lab-progress max=1 hidden aria-label=progress")
 
     def _build_stage(self) -> None:
         with ui.element("div").classes("lab-stage").props("id=lab-stage"):
             ui.element("div").props("id=lab-figure role=img")
             with ui.element("div").classes("lab-side"):
+                ui.element("progress").props("id=lab-progress max=1 hidden aria-label=progress")
                 ui.element("section").props("id=lab-verdict aria-label=verdict")
                 with ui.element("a").props("id=lab-report hidden target=_blank"):
                     ui.label("report of this run (all figures and tables)")
                 for name, role in _PLACES.items():
                     ui.element("div").props(f"id=lab-{name} {role}")
-                with ui.element("div").classes("lab-of-live w-full"):
-                    self._live.build_details()
+                for source in (self._live, self._recorded):
+                    with ui.element("div").classes(f"lab-of-{source.name} w-full"):
+                        source.build_details()
 
     async def begin(self) -> None:
         """Draw for the first time."""
         await self._client.connected()
         self._is_dark, slow = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
         self._live.shows_viewer = not slow
-        self._settings.show_dark(dark=self._is_dark)
+        self._text.show_dark(dark=self._is_dark)
         steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
         await self._stage.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
@@ -173,6 +182,11 @@ class _Page:
                     value = slider.value_at(float(said["place"]))
                     self._moved = [slider.key, value_text(value)]
                     await self._apply(lambda draft: dragged(draft, slider, value), slider.key)
+            case "fill":
+                found = (one for one in self._form.all_fields() if one.key == said["key"])
+                field, text = next(found), str(said["text"]).strip()
+                if text != field.text(self._session.draft):
+                    await self._apply(lambda draft: filled(draft, field, text), field.key)
             case "choose":
                 key, kind = said["key"], str(said["value"])
                 await self._apply(lambda draft: chosen(draft, key, kind), key)
@@ -204,7 +218,7 @@ class _Page:
                 facts = self._session.results.facts
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": shown.state}
-        name = self._live.report if live else self._recorded.name * (self._source == RECORDED)
+        name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
         await self._stage.show(
             pending=self._session.pending if self._source == EXPLORE else "",
             progress=self._live.progress if live else None, report=name and report_address(name),
@@ -302,11 +316,13 @@ class _Page:
         draft, keys, self._unsettled = self._session.draft, self._unsettled, set()
         with self._client:
             if keys:
-                self._settings.show(draft)
-                self._settings.show_mistakes(self._session.mistakes)
-                with suppress(DraftError):
-                    await self._stage.show(query=f"?{draft.query()}")
-                if not self._session.mistakes:
+                mistakes = self._session.mistakes
+                self._text.show(draft, mistakes)
+                with suppress(DraftError):  # the text is no TOML; the form stays
+                    self._form = form_of(draft)
+                    form = form_part(self._form, draft, by_field(self._form, mistakes))
+                    await self._stage.show(query=f"?{draft.query()}", form=form)
+                if not mistakes:
                     await self._live.change(draft, keys)
             await self._show()
 
@@ -357,7 +373,7 @@ class _Page:
     async def _toggle(self) -> None:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
-        self._settings.show_dark(dark=self._is_dark)
+        self._text.show_dark(dark=self._is_dark)
 
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")

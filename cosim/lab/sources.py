@@ -5,6 +5,7 @@ Each has its controls in the bar above the figure; a live run also its log and t
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -36,6 +37,8 @@ _ABOUT = (
 class LiveSource:
     """The live run; all visitors of the page see the same one."""
 
+    name = "live"
+
     def __init__(self, services: LabServices, replay: Callable[[str], Awaitable[None]]) -> None:
         self._services, self._replay = services, replay
         self._live: LiveRun | None = None
@@ -43,17 +46,19 @@ class LiveSource:
         self._version = self._lines = 0
         self._viewer, self._is_offered, self.shows_viewer = "", False, False
         self._start = ui.button("run live", icon="play_arrow").props("no-caps dense")
-        self._stop = ui.button("stop", icon="stop", on_click=self._end).props("outline dense")
+        self._stop = ui.button("stop", icon="stop", on_click=self._end).props(
+            "outline no-caps dense"
+        )
         self._again = ui.button("replay this run", icon="replay", on_click=self._open).props(
             "no-caps dense"
         )
-        self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
         self._stop.disable()
         self._again.set_visibility(False)
 
     def build_details(self) -> None:
         """Build kill buttons, log and viewer, which are below what is said of the run."""
         with ui.row().classes("items-center gap-2"):
+            self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
             self._kill = [
                 ui.button(f"kill {role}", icon="dangerous", on_click=self._killer(role)).props(
                     "outline color=negative no-caps dense"
@@ -102,7 +107,7 @@ class LiveSource:
             return [VerdictLine(*line) for line in live.verdict]
         lines = [VerdictLine(_words(live), NEUTRAL)]
         if (progress := live.progress) is not None:
-            kept = progress.warnings[-1:] or ["guarantee: nothing has violated it so far"]
+            kept = progress.warnings[-1:] or ["guarantee kept so far"]
             style = DOUBTFUL if progress.warnings else NEUTRAL
             lines += [VerdictLine(kept[0], style)]
             lines += [transmission_line(progress.events, progress.deliveries)]
@@ -224,24 +229,31 @@ def _words(live: LiveRun) -> str:
 class RecordedSource:
     """The recorded runs; one of them is chosen."""
 
+    name = "recorded"
+
     def __init__(self, services: LabServices, calls: PageCalls, changed: Changed) -> None:
         self._services, self._calls, self._changed = services, calls, changed
         self.view: RunView | None = None
         self.note = ""
         self._newest: str | None = None
+        self._replays = False
+        """Whether the run is replayed once its record is read."""
         self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
         self._select.props("dense options-dense")
         self._loop = ui.select([], label="loop", on_change=self._open).props("dense options-dense")
         ui.button(icon="refresh", on_click=self.refresh).props(
             'flat dense aria-label="look for new runs"'
         )
-        ui.button("replay", on_click=lambda: self.ask(replayed)).props("outline no-caps dense")
-        ui.button("compare with the ideal loop", on_click=lambda: self.ask(compared)).props(
-            "outline no-caps dense"
-        )
+
+    def build_details(self) -> None:
+        """Build what can be asked about a run, below what is said of it."""
+        for text, function in (("replay", replayed), ("compare with the ideal loop", compared)):
+            ui.button(text, on_click=partial(self._ask, function)).props(
+                "outline no-caps dense"
+            ).classes("mr-2")
 
     @property
-    def name(self) -> str:
+    def chosen(self) -> str:
         """Name of the chosen run; empty without one."""
         return str(self._select.value or "")
 
@@ -261,41 +273,50 @@ class RecordedSource:
 
     async def replay(self, name: str) -> None:
         """Choose a run, and replay it."""
+        self._replays = True
         self.refresh()
-        self._select.set_value(name)
-        await self.ask(replayed)
+        if self.chosen != name:
+            self._select.set_value(name)
+        elif self.view is not None:
+            await self._replay()
 
-    async def ask(self, function: Callable[[Path], str]) -> None:
+    async def _replay(self) -> None:
+        if self._replays:
+            self._replays = False
+            await self._ask(replayed)
+
+    async def _ask(self, function: Callable[[Path], str]) -> None:
         """Show what a function says about the chosen run."""
-        if not self.name:
+        if not self.chosen:
             return
         self.note = "computing …"
         await self._changed()
         try:
-            self.note = await self._calls.compute(function, self._services.runs / self.name)
+            self.note = await self._calls.compute(function, self._services.runs / self.chosen)
         except NoackError as error:
             self.note = str(error)
         await self._changed()
 
     async def _open(self, event: ValueChangeEventArguments[str]) -> None:
-        if not self.name:
+        if not self.chosen:
             return
         if event.sender is self._select:
             self.view = None
         self.note = "" if self.view else "reading the record …"
-        name, loop = self.name, self._loop.value
+        name, loop = self.chosen, self._loop.value
         try:
             view = await self._calls.compute(recorded_view, self._services.runs / name, loop)
         except NoackError as error:
             self.note = str(error)
         else:
-            if name != self.name:
+            if name != self.chosen:
                 return  # another one was chosen meanwhile
             self.view = view
             self.note = "" if self.note.startswith("reading") else self.note
             self._loop.set_visibility(len(view.loops) > 1)
             self._loop.set_options([*view.loops], value=loop if loop in view.loops else None)
         await self._changed()
+        await self._replay()
 
 
 def report_address(name: str) -> str:
