@@ -8,7 +8,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -63,7 +63,22 @@ class Draft:
     folder: Path
     """Relative file names in the text are relative to it."""
     base_text: str
-    text: str
+    before: str
+    """The text before the edits."""
+    edits: Mapping[str, Callable[[Table], object]] = field(default_factory=dict)
+    """Changes of the content by key, in order."""
+
+    @cached_property
+    def text(self) -> str:
+        """The text; while a slider is dragged nobody needs it, and it takes milliseconds."""
+        if not self.edits:
+            return self.before
+
+        def change(content: Table) -> None:
+            for edit in self.edits.values():
+                edit(content)
+
+        return changed_text(self.before, self.content, change)
 
     @cached_property
     def content(self) -> Table:
@@ -90,24 +105,28 @@ class Draft:
 
     def with_value(self, key: str, value: object) -> "Draft":
         """Return the draft with another value of a key; comments are kept where possible."""
-        return self._changed(lambda content: put(content, key, value, key))
+        return self._changed(key, lambda content: put(content, key, value, key))
 
     def without(self, key: str) -> "Draft":
         """Return the draft without a key, which then has its default."""
         if leaf(self.content, key) is _ABSENT:
             return self
-        return self._changed(lambda content: remove(content, key))
+        return self._changed(key, lambda content: remove(content, key))
 
-    def _changed(self, change: Callable[[Table], object]) -> "Draft":
+    def _changed(self, key: str, change: Callable[[Table], object]) -> "Draft":
         content = copy.deepcopy(self.content)
         change(content)
-        made = replace(self, text=changed_text(self.text, content, change))
+        if "text" in self.__dict__:
+            made = replace(self, before=self.text, edits={key: change})
+        else:
+            earlier = {one: edit for one, edit in self.edits.items() if one != key}
+            made = replace(self, edits={**earlier, key: change})
         made.__dict__["content"] = content
         return made
 
     def with_text(self, text: str) -> "Draft":
         """Return the draft with another text."""
-        return replace(self, text=text)
+        return Draft(self.base, self.folder, self.base_text, text)
 
     def query(self) -> str:
         """Return the draft as the query of an address: the base and the keys that differ from it.

@@ -1,21 +1,22 @@
 """One run of a scenario as the page draws it: trajectories, events, errors and key numbers.
 
-The run is exact, in continuous time, where the exact simulation covers the scenario. It takes some
-milliseconds. Otherwise the machines run in virtual time, which takes up to half a second.
+An explored run is exact, in continuous time, where the exact simulation covers the scenario. It
+takes some milliseconds. Otherwise the machines run in virtual time, which takes up to half a
+second. A run that is recorded, or that is being recorded, is drawn from its record.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.analysis.run_summary import summarise
-from cosim.analysis.summary_model import LoopSummary
 from cosim.analysis.value_reduction import decimate_all
-from cosim.record.align import align_tables
+from cosim.record.align import aligned_parts
+from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous import (
     ContinuousRun,
-    ContinuousSummary,
     LoopState,
     TooManyEventsError,
     run_continuous,
@@ -39,11 +40,12 @@ _MOST_EVENT_POINTS = 600
 
 _MOST_EVENTS = 3000
 """A run with more events is drawn up to there, so that dragging stays quick."""
+_NEARLY = 1e-3
 _SHORT = 0.5
 """Inter-event times shrink to 0 if the second half of the events takes less than this share of the
 time of the first."""
 
-EXACT, SAMPLED = "exact", "sampled"
+EXACT, SAMPLED, LIVE, RECORDED = "exact", "sampled", "live", "recorded"
 
 Numbers = tuple[tuple[str, str], ...]
 """Key numbers: label and value."""
@@ -56,7 +58,7 @@ class Exploration:
     scenario: Scenario
     """The resolved scenario."""
     kind: str
-    """EXACT or SAMPLED."""
+    """EXACT or SAMPLED; LIVE or RECORDED for a run from its record."""
     t_s: Vector
     """Times in ascending order, (N,); an event's time occurs twice, before and after its reset."""
     x: Matrix
@@ -76,17 +78,60 @@ class Exploration:
     delivered: NDArray[np.bool_]
     """Whether each update was delivered, (k,)."""
     diverged_at_s: float | None
-    numbers: Numbers
     cut: str = ""
     """In words, why the run is drawn until its last event only; empty if it is drawn whole."""
 
+    @cached_property
+    def numbers(self) -> Numbers:
+        """The key numbers of the run."""
+        events, lost = len(self.event_s), self.lost
+        share = f" ({100 * lost / events:.0f} %)" if events else ""
+        ended = self.cut or "reached the horizon"
+        if self.diverged_at_s is not None:
+            ended = f"diverged at {number(self.diverged_at_s, 4)} s"
+        elif self.kind in (LIVE, RECORDED):
+            ended = f"until {number(float(self.t_s[-1]), 4)} s"
+        shortest_s = number(float(np.diff(self.event_s).min()), 4) + " s" if events > 1 else "–"
+        return (
+            ("run", ended),
+            ("transmissions", str(events)),
+            ("delivered", str(events - lost)),
+            ("lost", f"{lost}{share}"),
+            ("longest loss burst", str(longest_burst(self.delivered))),
+            ("shortest inter-event time", shortest_s),
+            ("‖x‖ at the start", number(float(self.x_norm[0]), 4)),
+            ("‖x‖ at the end", number(float(self.x_norm[-1]), 4)),
+        )
+
     @property
+    def lost(self) -> int:
+        """Number of transmissions that were not delivered."""
+        return int(np.sum(~self.delivered))
+
+    @property
+    def largest_e_c(self) -> float:
+        """The largest ‖e_c‖ from the controller's first update on; NaN before it."""
+        known = self.e_c_norm[self.controller_knows & np.isfinite(self.e_c_norm)]
+        return float(known.max()) if len(known) else np.nan
+
+    def until(self, t_s: float) -> "Exploration":
+        """Return the run up to a time; itself if it does not go on much longer."""
+        if self.t_s[-1] <= t_s * (1 + _NEARLY):
+            return self
+        drawn, sent = self.t_s <= t_s, self.event_s <= t_s
+        return replace(
+            self, t_s=self.t_s[drawn], x=self.x[drawn], x_s=self.x_s[drawn], x_c=self.x_c[drawn],
+            e_s_norm=self.e_s_norm[drawn], e_c_norm=self.e_c_norm[drawn], threshold=None,
+            event_s=self.event_s[sent], delivered=self.delivered[sent],
+        )  # fmt: skip
+
+    @cached_property
     def x_norm(self) -> Vector:
         """‖x‖, (N,)."""
         norms: Vector = np.linalg.norm(self.x, axis=1)
         return norms
 
-    @property
+    @cached_property
     def controller_knows(self) -> NDArray[np.bool_]:
         """Whether the controller has a state: not before its first update, (N,)."""
         if self.scenario.network.initial_sync == "known_state":
@@ -150,11 +195,10 @@ def _of_exact(run: ContinuousRun, resolved: Scenario, cut: str) -> Exploration:
     t_s, x, e_s, e_c = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(t_s, kind="stable")
     t_s, x, e_s, e_c = t_s[order], x[order], e_s[order], e_c[order]
-    facts = summary(run, resolved)
+    diverged_at_s = summary(run, resolved).diverged_at_s
     return Exploration(
         resolved, EXACT, t_s, x, x + e_s, x + e_c, run.system.norms(e_s), run.system.norms(e_c),
-        threshold_at(resolved, t_s), run.event_s, run.delivered, facts.diverged_at_s,
-        key_numbers(facts, cut), cut,
+        threshold_at(resolved, t_s), run.event_s, run.delivered, diverged_at_s, cut,
     )  # fmt: skip
 
 
@@ -172,26 +216,10 @@ def threshold_at(resolved: Scenario, t_s: Vector) -> Vector | None:
     return np.maximum(decaying, trigger.floor)
 
 
-def key_numbers(facts: ContinuousSummary | LoopSummary, cut: str = "") -> Numbers:
-    """Return the key numbers of a summary; for ``cut`` see :class:`Exploration`."""
-
-    def text(value: float | None, unit: str = "") -> str:
-        return "–" if value is None else number(float(value), 4) + unit
-
-    share = f" ({100 * facts.drops / facts.events:.0f} %)" if facts.events else ""
-    ended = cut or "reached the horizon"
-    if facts.diverged_at_s is not None:
-        ended = f"diverged at {text(facts.diverged_at_s)} s"
-    return (
-        ("run", ended),
-        ("transmissions", text(facts.events)),
-        ("delivered", text(facts.deliveries)),
-        ("lost", text(facts.drops) + share),
-        ("longest loss burst", text(facts.longest_loss_burst)),
-        ("shortest inter-event time", text(facts.inter_event_min_s, " s")),
-        ("‖x‖ at the start", text(facts.initial_state_norm)),
-        ("‖x‖ at the end", text(facts.final_state_norm)),
-    )
+def longest_burst(delivered: NDArray[np.bool_]) -> int:
+    """Return the largest number of consecutive updates that were not delivered."""
+    ends = np.flatnonzero(np.concatenate([[True], delivered, [True]]))
+    return int(np.diff(ends).max()) - 1
 
 
 _COLUMNS = 600
@@ -207,27 +235,34 @@ def run_of(scenario: Scenario) -> Exploration:
     return explore(scenario) if why_not_exact(scenario) is None else simulate_sampled(scenario)
 
 
-@np.errstate(all="ignore")  # a run may diverge
 def simulate_sampled(scenario: Scenario) -> Exploration:
-    """Run a scenario in virtual time; decimate its samples.
+    """Run a scenario in virtual time.
 
     Raises:
         NoackError: the scenario is wrong, or has several loops.
     """
-    resolved = resolve(scenario)
-    record = simulate(resolved)
-    aligned, loop = align_tables(record), summarise(record, 0, HORIZON)
-    known = aligned.since_delivery(resolved)
-    x_c = np.where(known[:, None], aligned.x_c, np.nan)
-    e_c_norm = np.where(known, aligned.e_c_norm, np.nan)
-    t_s = np.asarray(aligned.t_ns / NS_PER_S)
-    curves = [aligned.x, aligned.x_s, x_c, aligned.e_s_norm, e_c_norm]
-    kept = decimate_all(t_s, np.column_stack(curves), _COLUMNS)
-    x, x_s, x_c, e_s_norm, e_c_norm = (curve[kept] for curve in curves)
-    sent = record.events()
+    record = simulate(resolve(scenario))
+    return of_record(record, SAMPLED, summarise(record, 0, HORIZON).diverged_at_s)
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def of_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) -> Exploration:
+    """Return the run of a loop's record, which may still grow; its samples are decimated."""
+    resolved, parts = record.scenario, []
+    columns = _COLUMNS if record.is_short else max(record.slice_columns // 10, 1)
+    for part in aligned_parts(record):
+        one, known = part.aligned, part.aligned.since_delivery(resolved)
+        curves = np.column_stack([
+            one.t_ns / NS_PER_S, one.x, one.x_s, np.where(known[:, None], one.x_c, np.nan),
+            one.e_s_norm, np.where(known, one.e_c_norm, np.nan), one.threshold,
+        ])  # fmt: skip
+        parts.append(curves[decimate_all(curves[:, 0], curves[:, 1:], columns)])
+    curves, n = np.concatenate(parts), record.loop.n
+    t_s, x, x_s, x_c, norms = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
+    sent, is_decaying = record.events(), threshold_at(resolved, t_s[:1, 0]) is not None
     return Exploration(
-        resolved, SAMPLED, t_s[kept], x, x_s, x_c, e_s_norm, e_c_norm,
-        threshold_at(resolved, t_s[kept]), np.asarray(sent["t_ns"] / NS_PER_S),
-        np.isin(sent["event"], record[CONTROLLER_DELIVERY]["sequence"]), loop.diverged_at_s,
-        key_numbers(loop),
+        resolved, kind, t_s[:, 0], x, x_s, x_c, norms[:, 0], norms[:, 1],
+        norms[:, 2] if is_decaying else None, np.asarray(sent["t_ns"] / NS_PER_S),
+        np.isin(sent["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
+        diverged_at_s,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.scenario import Scenario
 
-BAND, KEPT = "90 % of draws", "kept settings"
+BAND, KEPT = "90 % of draws", "for comparison"
 _SMALLEST = 1e-6
 """Smallest value on a logarithmic axis, as a share of the largest; an error is 0 after a reset."""
 _DECADES = 7
@@ -93,7 +93,7 @@ def _state(shown: Shown) -> _Part:
         band = Band(x=draws.t_s, low=low, high=high, label=BAND, colour=PLANT, opacity=0.22)
         items.insert(0, band)
     if other is not None and i < other.x.shape[1]:
-        items.append(_kept(other, other.x[:, i]))
+        items.insert(0, _kept(other, other.x[:, i]))
         about = np.concatenate([about, other.x[:, i]])
     return f"{run.state_names[i]}: plant and both models", items, Axis(about=about)
 
@@ -116,7 +116,7 @@ def _errors(shown: Shown) -> _Part:
     if draws is not None:
         items.append(_edge(draws, _positive(draws.e_c_norm.high, floor)))
     if other is not None:
-        items.append(_kept(other, _known_error(other, floor)))
+        items.insert(0, _kept(other, _known_error(other, floor)))
     y = Axis(logarithmic=True, about=about, decades=_DECADES)
     return "errors of the models (logarithmic)", items, y
 
@@ -131,7 +131,7 @@ def _norm(shown: Shown) -> _Part:
         edges = (draws.x_norm.low, draws.x_norm.high)
         items += [_edge(draws, _positive(edge, 0.0)) for edge in edges]
     if other is not None:
-        items.append(_kept(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
+        items.insert(0, _kept(other, _positive(other.x_norm, _SMALLEST * _largest(other.x_norm))))
     return "‖x‖ (logarithmic)", items, Axis(logarithmic=True, about=norm, decades=_DECADES)
 
 
@@ -141,6 +141,10 @@ def _events(shown: Shown) -> _Part:
     dots = Marks(x=t_s[delivered], y=since_s[delivered], label="delivered", colour=CONTROLLER)
     crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
     items = [dots, replace(crosses, marker="x", stroke=1.6)]
+    if (other := shown.reference) is not None:
+        before = Marks(x=other.event_s, y=np.diff(other.event_s, prepend=0.0), label=KEPT,
+                       colour=FORCED, opacity=0.45)  # fmt: skip
+        items.insert(0, before)
     return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
 
 

@@ -1,13 +1,14 @@
-"""The page as a visitor sees it: settings at the left, what follows from them at the right.
+"""The page as a visitor sees it: the figure, what is said of it, and a drawer with the settings.
 
-The page itself, then its menu of files and its tutorial.
+The figure shows one of three sources: the explored run, the live run, or a recorded one. What the
+browser is sent are the parts of :class:`cosim.lab.stage.Stage`.
 """
 
+import asyncio
 import io
-import json
 import re
 import tomllib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -16,32 +17,53 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 from nicegui import ui
-from nicegui.events import ValueChangeEventArguments
+from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
+from cosim.interactive.comparison import Reference, compare
+from cosim.interactive.controls import (
+    Controls,
+    by_field,
+    chosen,
+    controls_of,
+    dragged,
+    filled,
+    form_of,
+)
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
-from cosim.interactive.exploration_figure import Shown
-from cosim.lab.explore_panel import ExplorePanel, Rows
+from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
+from cosim.interactive.scenario_guarantee import verdict_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
-from cosim.lab.live_panel import LivePanel
-from cosim.lab.runs_panel import RunsPanel
-from cosim.lab.settings_panel import SettingsPanel
+from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
+from cosim.lab.sources import LiveSource, RecordedSource, report_address
+from cosim.lab.stage import Stage, figure_part
 from cosim.output.figure_format import FigureFormat, figure_width_in
 from cosim.output.page_kit import TERMS
+from cosim.output.run_verdict import BAD, DOUBTFUL, GOOD, VerdictLine
 from noack.core.errors import NoackError
 from noack.core.file_access import write_whole
 from noack.core.linear_systems import Vector
 
 _FOLDER = Path(__file__).parent
-_EXPLORE, _LIVE, _RUNS, _TUTORIAL = "explore", "run live", "recorded runs", "tutorial"
-_KEEP = "keep for comparison"
+EXPLORE, LIVE, RECORDED = "explore", "live", "recorded"
+_KEEP, _FORGET = "keep for comparison", "forget the kept run"
+_TONES = {GOOD: "good", DOUBTFUL: "doubt", BAD: "bad"}
+_POLL_S = 0.25
+_GESTURE_S = 1.0
+"""Changes of one key follow each other within this time while a slider is dragged."""
+_PLACES = {
+    "note": "role=status", "pending": "role=status", "compare": "role=region aria-label=comparison",
+    "facts": "",
+}  # fmt: skip
+"""Places beside the figure, with their roles."""
 
 
 async def show_page(services: LabServices) -> None:
     """Build the page for one visitor."""
     ui.add_css(_FOLDER / "lab.css")
-    ui.add_head_html(f"<script>{_FOLDER.joinpath('lab.js').read_text()}</script>")
+    for name in ("figure.js", "lab.js"):
+        ui.add_head_html(f"<script>{_FOLDER.joinpath(name).read_text()}</script>")
     ui.colors(primary="#1f5f99", negative="#b3261e", warning="#8a5300", positive="#1b6e3c")
     query = ui.context.client.request.url.query if ui.context.client.request else ""
     problem = ""
@@ -62,116 +84,261 @@ class _Page:
     def __init__(self, services: LabServices, draft: Draft) -> None:
         self._services, self._client = services, ui.context.client
         self._calls = PageCalls(services)
-        self._session = Session(self._calls, draft, self._drawn)
+        self._session = Session(self._calls, draft, self._drawn, self._settle)
+        self._stage = Stage(self._client)
         self._dark = ui.dark_mode(None)
         self._is_dark = False
-        self._tab = _EXPLORE
-        self._figures: dict[str, ExplorePanel] = {}
-        """The figure of each tab that has one."""
-        self._outdated: set[str] = set()
-        """Tabs whose figure is not that of the newest results."""
+        self._source, self._state, self._comparing = EXPLORE, 0, True
+        self._kept: Reference | None = None
+        self._controls: Controls | None = None
+        self._form = form_of(draft)
+        self._moved = ["", ""]
+        """Key and text of the slider that was moved last."""
+        self._last = ("", 0.0)
+        """Key of the last change, and when it was."""
+        self._unsettled = {""}
+        """Keys that have changed since the settings rested."""
         self._client.on_disconnect(self._session.end)  # a page that connects again is a new one
+        ui.on("lab", self._take)
 
     def build(self) -> None:
-        """Build header and panels."""
+        """Build head, bar, figure and drawer."""
         with ui.header().classes("items-center gap-3 py-1 lab-head"):
-            ui.label("noack lab").classes("text-h6").props("role=heading aria-level=1")
+            ui.label("noack lab").classes("text-h6 lab-title").props("role=heading aria-level=1")
+            for text, icon, kind in (
+                ("settings", "tune", "drawer"), ("tutorial", "school", "guide"),
+            ):  # fmt: skip
+                ui.button(icon=icon).classes(f"lab-{kind}-button").props(
+                    f'flat color=white dense aria-label="{text}" title="{text}" '
+                    f"aria-expanded=false aria-controls=lab-{kind}"
+                ).on("click", js_handler=f"() => labToggle{kind.capitalize()}()")
             self._scenarios = ui.select(
                 sorted(self._services.known), value=self._session.draft.base, label="scenario",
                 on_change=self._choose,
-            ).props("dense options-dense dark standout").classes("w-56 lab-scenario")  # fmt: skip
+            ).props("dense options-dense dark standout").classes("lab-scenario")  # fmt: skip
             ui.space()
-            self._keep = ui.button(_KEEP, icon="compare", on_click=self._compare).props(
-                f'flat color=white dense no-caps aria-label="{_KEEP}"'
-            ).classes("lab-keep")  # fmt: skip
-            FileMenu(self._services, self._calls, self._session)
+            FileMenu(self._services, self._calls, self._session, self._shown)
             ui.button(icon="contrast", on_click=self._toggle).props(
                 'flat color=white dense aria-label="dark or light"'
             )
         with ui.element("main").classes("lab-body w-full"):
-            with ui.column().classes("gap-2 lab-settings").props("role=region aria-label=settings"):
-                ui.button("settings", icon="tune").classes("lab-sheet-button").props(
-                    "flat no-caps aria-expanded=false"
-                ).on("click", js_handler="labToggleSettings")
-                with ui.column().classes("w-full gap-2 lab-sheet"):
-                    self._settings = SettingsPanel(self._session.draft, self._changed)
-            with ui.column().classes("gap-2 w-full"):
-                with ui.tabs(on_change=self._show_tab).props("dense align=left no-caps") as tabs:
-                    for name in (_EXPLORE, _LIVE, _RUNS, _TUTORIAL):
-                        ui.tab(name)
-                self._tabs = tabs
-                with ui.tab_panels(tabs, value=_EXPLORE, animated=False, keep_alive=True).classes(
-                    "w-full"
-                ):
-                    with ui.tab_panel(_EXPLORE).classes("p-0"):
-                        self._figures[_EXPLORE] = ExplorePanel()
-                    with ui.tab_panel(_LIVE).classes("p-0"):
-                        self._live = LivePanel(self._services, self._open_run, self._run_ended)
-                    with ui.tab_panel(_RUNS).classes("p-0"):
-                        self._runs = RunsPanel(
-                            self._services, self._calls, lambda: tabs.set_value(_LIVE)
-                        )
-                    with ui.tab_panel(_TUTORIAL).classes("p-0 lab-guided"):
-                        TutorialPanel(self._begin_step)
-                        with ui.column().classes("gap-2 w-full"):
-                            self._figures[_TUTORIAL] = ExplorePanel()
+            with ui.element("aside").props("id=lab-drawer aria-label=settings tabindex=-1"):
+                for name in ("guide hidden", "controls", "form"):
+                    ui.element("div").props(f"id=lab-{name}")
+                self._text = TextPanel(self._session.draft, self._apply)
+            with ui.element("div").classes("lab-main"):
+                self._build_bar()
+                self._build_stage()
+        ui.timer(_POLL_S, self._follow)
+
+    def _build_bar(self) -> None:
+        with ui.element("div").classes("lab-bar"):
+            self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE,
+                                      on_change=self._switch).props("no-caps dense")  # fmt: skip
+            with ui.element("div").classes("lab-of lab-of-live"):
+                self._live = LiveSource(self._services, self._replay)
+                self._live.on_start(lambda: self._session.draft)
+            with ui.element("div").classes("lab-of lab-of-recorded"):
+                self._recorded = RecordedSource(self._services, self._calls, self._show)
+            self._keep = ui.button(_KEEP, icon="compare", on_click=self._keep_run).props(
+                "outline no-caps dense"
+            )
+            ui.checkbox("compare", value=True, on_change=self._compare).props("dense")
+            with ui.element("label").props("hidden"):
+                ui.label("drawn state ").classes("inline")
+                ui.element("select").props("id=lab-state")
+
+    def _build_stage(self) -> None:
+        with ui.element("div").classes("lab-stage").props("id=lab-stage"):
+            ui.element("div").props("id=lab-figure role=img")
+            with ui.element("div").classes("lab-side"):
+                ui.element("progress").props("id=lab-progress max=1 hidden aria-label=progress")
+                ui.element("section").props("id=lab-verdict aria-label=verdict")
+                with ui.element("a").props("id=lab-report hidden target=_blank"):
+                    ui.label("report of this run (all figures and tables)")
+                for name, role in _PLACES.items():
+                    ui.element("div").props(f"id=lab-{name} {role}")
+                for source in (self._live, self._recorded):
+                    with ui.element("div").classes(f"lab-of-{source.name} w-full"):
+                        source.build_details()
 
     async def begin(self) -> None:
         """Draw for the first time."""
-        await ui.context.client.connected()
-        ui.run_javascript("labNameLostServer()")
-        self._settings.begin()
-        self._is_dark = await ui.run_javascript(
-            "window.matchMedia('(prefers-color-scheme: dark)').matches", timeout=ANSWER_S
-        )
-        self._settings.show_dark(dark=self._is_dark)
-        self._live.take(self._session.draft)
+        await self._client.connected()
+        self._is_dark, slow = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
+        self._live.shows_viewer = not slow
+        self._text.show_dark(dark=self._is_dark)
+        steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
+        await self._stage.show(source=EXPLORE, steps=steps)
         await self._session.change(self._session.draft)
-        await self._live.begin()
 
-    async def _show_tab(
-        self, event: ValueChangeEventArguments[str | ui.tab | ui.tab_panel | None]
-    ) -> None:
-        self._tab = str(event.value)
+    async def _take(self, event: GenericEventArguments) -> None:
+        """Take what the visitor does with elements that are not the framework's."""
+        said = event.args
+        match said["what"]:
+            case "slide":
+                sliders = self._controls.sliders if self._controls else ()
+                if slider := next((one for one in sliders if one.key == said["key"]), None):
+                    value = slider.value_at(float(said["place"]))
+                    self._moved = [slider.key, value_text(value)]
+                    await self._apply(lambda draft: dragged(draft, slider, value), slider.key)
+            case "fill":
+                found = (one for one in self._form.all_fields() if one.key == said["key"])
+                field, text = next(found), str(said["text"]).strip()
+                if text != field.text(self._session.draft):
+                    await self._apply(lambda draft: filled(draft, field, text), field.key)
+            case "choose":
+                key, kind = said["key"], str(said["value"])
+                await self._apply(lambda draft: chosen(draft, key, kind), key)
+            case "state":
+                self._state = int(said["number"])
+                await self._show()
+            case "step":
+                step = STEPS[int(said["number"])]
+                draft = open_draft(step.scenario)
+                for name, setting in step.settings.items():
+                    draft = draft.with_value(name, setting)
+                await self._open(draft)
+
+    # What is shown
+
+    async def _show(self) -> None:
+        """Show the chosen source."""
+        shown, live = self._shown(), self._source == LIVE
+        with suppress(DraftError):  # the mistakes are shown; the sliders stay
+            self._controls = controls_of(self._session.draft)
+        parts = self._drawing(shown)
+        if self._controls is not None:
+            wrong = {one.key for one in self._session.mistakes}
+            parts["controls"] = controls_part(self._controls, wrong, live=self._live.is_running)
+        if shown is not None:
+            run = shown.run
+            facts: Mapping[str, Sequence[tuple[str, str]]] = {f"this run ({run.kind})": run.numbers}
+            if self._source == EXPLORE and self._session.results is not None:
+                facts = self._session.results.facts
+            parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
+            parts["states"] = {"names": run.state_names, "chosen": shown.state}
+        name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
+        await self._stage.show(
+            pending=self._session.pending if self._source == EXPLORE else "",
+            progress=self._live.progress if live else None, report=name and report_address(name),
+            **parts,
+        )  # fmt: skip
+
+    def _drawing(self, shown: Shown | None) -> dict[str, object]:
+        """Return what is shown anew while a slider is dragged; ``slider`` is its new value."""
+        parts: dict[str, object] = {
+            "source": self._source, "stale": shown is None, "note": self._note(shown),
+            "verdict": self._verdict(),
+        }  # fmt: skip
+        if shown is not None:
+            parts["figure"] = figure_part(exploration_figure(shown))
+            reference = self._reference()
+            parts["compare"] = reference and compare(reference, shown.run)._asdict()
+        return parts
+
+    def _note(self, shown: Shown | None) -> str:
+        """Return what is wrong with the settings, or what the drawing leaves out."""
+        session = self._session
+        if self._source != EXPLORE:
+            return self._recorded.note if self._source == RECORDED else ""
+        first = session.mistakes[0].text if session.mistakes else ""
+        more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
+        note = first + more or session.note
+        return f"{note}. The figure shows the settings before" if note and shown is None else note
+
+    def _shown(self) -> Shown | None:
+        """Return what the figure shows; None without a run."""
+        view, reference = self._recorded.view, self._reference()
+        shown = None
+        if self._source == EXPLORE and self._session.results is not None:
+            shown = self._session.results.shown(0)
+        elif self._source == LIVE and self._live.run is not None:
+            shown = Shown(self._live.run, 0)
+        elif self._source == RECORDED and view is not None:
+            shown = Shown(view.run, 0, guarantee=view.bounds)
+        if shown is None:
+            return None
+        state = min(self._state, shown.run.x.shape[1] - 1)
+        return shown._replace(state=state, reference=reference and reference.run)
+
+    def _reference(self) -> Reference | None:
+        """Return the run that the shown one is compared with."""
+        session = self._session
+        if not self._comparing or self._kept is not None:
+            return self._kept if self._comparing else None
+        if self._source == EXPLORE:
+            name, run = "the settings before the last change", session.before
+        else:
+            name = "the ideal loop with the settings of this page"
+            run = session.results.run if session.results else None
+        return None if run is None else Reference(name, run)
+
+    def _verdict(self) -> list[tuple[str, str]]:
+        lines: Sequence[VerdictLine] = ()
+        if self._source == LIVE:
+            lines = self._live.verdict
+        elif self._source == RECORDED and (view := self._recorded.view) is not None:
+            lines = [*view.verdict, *(VerdictLine(text, "") for text in view.remarks)]
+        elif self._source == EXPLORE and (results := self._session.results) is not None:
+            known = CERTIFICATE in results.known
+            lines = verdict_of(results.run, results.certificate if known else None)
+        return [(text, _TONES.get(style, "")) for text, style in lines]
+
+    # What the visitor does
+
+    async def _switch(self, event: ValueChangeEventArguments[str]) -> None:
+        self._source = event.value
         self._live.remove_old_viewer()
-        if event.value == _RUNS:
-            self._runs.refresh()
-        await self._draw()
+        if self._source == RECORDED:
+            self._recorded.refresh()
+        await self._show()
+
+    async def _replay(self, name: str) -> None:
+        self._sources.set_value(RECORDED)
+        await self._recorded.replay(name)
+
+    async def _follow(self) -> None:
+        """Follow the live run."""
+        if self._live.follow() and self._source == LIVE:
+            await self._show()
 
     async def _drawn(self) -> None:
-        if self._client.is_deleted:
+        """Show a new run at once: the figure, and what is said of it in a few words."""
+        shown = self._shown()
+        if self._source != EXPLORE or shown is None:
+            await self._show()
             return
-        self._settings.show_mistakes(self._session.mistakes)
-        self._outdated = set(self._figures)
-        await self._draw()
+        await self._stage.show(slider=self._moved, **self._drawing(shown))
 
-    async def _draw(self) -> None:
-        """Draw the tab's figure; one that nobody sees would take time from a running loop."""
-        if self._tab in self._outdated:
-            self._outdated.remove(self._tab)
-            await self._figures[self._tab].draw(self._session, dark=self._is_dark)
+    async def _settle(self) -> None:
+        """Bring up to date what need not follow while a slider is dragged."""
+        draft, keys, self._unsettled = self._session.draft, self._unsettled, set()
+        with self._client:
+            if keys:
+                mistakes = self._session.mistakes
+                self._text.show(draft, mistakes)
+                with suppress(DraftError):  # the text is no TOML; the form stays
+                    self._form = form_of(draft)
+                    form = form_part(self._form, draft, by_field(self._form, mistakes))
+                    await self._stage.show(query=f"?{draft.query()}", form=form)
+                if not mistakes:
+                    await self._live.change(draft, keys)
+            await self._show()
 
-    def _run_ended(self) -> None:
-        if self._tab == _RUNS:
-            self._runs.refresh()
-
-    def _open_run(self, name: str) -> None:
-        self._tabs.set_value(_RUNS)
-        self._runs.show(name)
-
-    async def _changed(self, draft: Draft, key: str) -> None:
-        self._show_address(draft)
-        await self._session.change(draft)
-        if not self._session.mistakes:
-            await self._live.change(draft, key)
-
-    def _show_address(self, draft: Draft) -> None:
-        """Put the settings into the address, so that it can be shared."""
+    def _apply(self, change: Callable[[Draft], Draft], key: str) -> Awaitable[None]:
+        """Apply a change at once, before the next event is handled; return what follows."""
+        now_s = asyncio.get_running_loop().time()
+        last_key, last_s = self._last
+        self._last = key, now_s
         try:
-            query = json.dumps(f"?{draft.query()}")
-        except DraftError:
-            return
-        ui.run_javascript(f"labShowQuery({query})")
+            draft = change(self._session.draft)
+        except NoackError as error:
+            ui.notify(str(error), type="negative")
+            return self._show()
+        self._unsettled.add(key)
+        gesture = key != last_key or now_s - last_s > _GESTURE_S
+        return self._session.change(draft, gesture=gesture)
 
     async def _choose(self, event: ValueChangeEventArguments[str]) -> None:
         if event.value == self._session.draft.base:
@@ -183,31 +350,30 @@ class _Page:
             return
         await self._open(draft)
 
-    async def _begin_step(self, step: "Step") -> None:
-        draft = open_draft(step.scenario)
-        for key, value in step.settings.items():
-            draft = draft.with_value(key, value)
-        await self._open(draft)
-
     async def _open(self, draft: Draft) -> None:
-        self._session.reference = None
+        self._session.results = self._session.before = None
         self._session.draft = draft
         self._scenarios.set_value(draft.base)
-        self._settings.show(draft)
-        await self._changed(draft, "")
+        self._sources.set_value(EXPLORE)
+        await self._session.change(draft)
 
-    async def _compare(self) -> None:
-        self._session.keep()
-        text = _KEEP if self._session.reference is None else "forget the kept settings"
-        self._keep.set_text(text)
-        self._keep.props["aria-label"] = text
-        await self._drawn()
+    async def _keep_run(self) -> None:
+        shown = self._shown()
+        if self._kept is not None or shown is None:
+            self._kept = None
+        else:
+            self._kept = Reference(f"the kept run ({shown.run.kind})", shown.run)
+        self._keep.set_text(_KEEP if self._kept is None else _FORGET)
+        await self._show()
+
+    async def _compare(self, event: ValueChangeEventArguments[bool | None]) -> None:
+        self._comparing = bool(event.value)
+        await self._show()
 
     async def _toggle(self) -> None:
         self._is_dark = not self._is_dark
         self._dark.set_value(self._is_dark)
-        self._settings.show_dark(dark=self._is_dark)
-        await self._drawn()
+        self._text.show_dark(dark=self._is_dark)
 
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
@@ -216,8 +382,15 @@ _NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,63}\.toml")
 class FileMenu:
     """The menu in the header."""
 
-    def __init__(self, services: LabServices, calls: PageCalls, session: Session) -> None:
+    def __init__(
+        self,
+        services: LabServices,
+        calls: PageCalls,
+        session: Session,
+        shown: Callable[[], Shown | None],
+    ) -> None:
         self._services, self._calls, self._session = services, calls, session
+        self._shown = shown
         opener = ui.button(icon="more_vert").props('flat color=white dense aria-label="files"')
         with opener, ui.menu():
             ui.menu_item("save as scenario …", self._ask)
@@ -226,8 +399,11 @@ class FileMenu:
             for kind in (FigureFormat.SVG, FigureFormat.PDF):
                 ui.menu_item(f"figure ({kind.upper()})", partial(self._figure, kind))
             ui.menu_item("glossary", self._open_words)
-        with ui.dialog() as self._words, ui.card():
-            Rows("lab-words", TERMS)
+        with ui.dialog() as self._words, ui.card(), ui.element("dl").classes("lab-words"):
+            for term, meaning in TERMS:
+                for tag, text in (("dt", term), ("dd", meaning)):
+                    with ui.element(tag):
+                        ui.label(text)
         with ui.dialog() as self._dialog, ui.card():
             ui.label(f"Save in {services.folder}")
             self._name = ui.input("file name", value="my_loop.toml", validation={
@@ -265,13 +441,11 @@ class FileMenu:
         ui.notify("copied; it opens as long as this page runs", type="positive")
 
     def _data(self) -> None:
-        if self._session.results is not None:
-            content = csv_of(self._session.results.run)
-            ui.download(content, "exploration.csv", "text/csv")
+        if (shown := self._shown()) is not None:
+            ui.download(csv_of(shown.run), "exploration.csv", "text/csv")
 
     async def _figure(self, kind: FigureFormat) -> None:
-        shown = self._session.shown()
-        if shown is not None:
+        if (shown := self._shown()) is not None:
             content = await self._calls.compute(figure_file, shown, kind)
             ui.download(content, f"exploration.{kind}")
 
@@ -297,7 +471,7 @@ def figure_file(shown: Shown, kind: FigureFormat) -> bytes:
 
 
 class Step(NamedTuple):
-    """A step: what to read, which settings it begins with, what to drag."""
+    """A step of the tutorial: what to read, which settings it begins with, what to drag."""
 
     title: str
     text: str
@@ -306,42 +480,7 @@ class Step(NamedTuple):
     drag: str
 
 
-def _steps() -> list[Step]:
-    content = tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text(encoding="utf-8"))
-    return [Step(**step) for step in content["steps"]]
-
-
-Begin = Callable[[Step], Awaitable[None]]
-
-
-class TutorialPanel:
-    """The text of one step at a time; the figure is beside it."""
-
-    def __init__(self, begin: Begin) -> None:
-        self._begin, self._place, self._steps = begin, 0, _steps()
-        with ui.card().classes("w-full"):
-            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
-            self._text = ui.label()
-            self._drag = ui.label().classes("font-bold")
-            with ui.row():
-                ui.button("show it", on_click=self._start)
-                self._back = ui.button("back", on_click=lambda: self._go(-1)).props("flat")
-                self._next = ui.button("next", on_click=lambda: self._go(1)).props("flat")
-            ui.label("“show it”, “next” and “back” replace the settings by those of the step.")
-        self._show()
-
-    def _show(self) -> None:
-        step = self._steps[self._place]
-        self._title.set_text(f"{self._place + 1} of {len(self._steps)}: {step.title}")
-        self._text.set_text(step.text)
-        self._drag.set_text(step.drag)
-        self._back.set_visibility(self._place > 0)
-        self._next.set_visibility(self._place < len(self._steps) - 1)
-
-    async def _go(self, by: int) -> None:
-        self._place += by
-        self._show()
-        await self._start()
-
-    async def _start(self) -> None:
-        await self._begin(self._steps[self._place])
+STEPS = [
+    Step(**step)
+    for step in tomllib.loads(_FOLDER.joinpath("tutorial.toml").read_text("utf-8"))["steps"]
+]

@@ -23,15 +23,15 @@ import uvicorn
 from fastapi import FastAPI
 from nicegui import ui
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
 from cosim.lab.lab_page import show_page
-from cosim.lab.lab_services import LabServices
-from cosim.lab.runs_panel import serve_reports
+from cosim.lab.lab_services import LabServices, PageCalls
+from cosim.lab.run_views import report_page
 from cosim.output.viewer.rerun_program import HOST, OWN_HOST, socket_user
-from noack.core.errors import MachineError
+from noack.core.errors import MachineError, NoackError
 
 
 @dataclass(frozen=True)
@@ -214,3 +214,31 @@ _POLICY_VIOLATION = WebSocketClose(code=1008)
 def _begins(scope: Scope, root: str) -> bool:
     first = "/" + scope["path"].removeprefix("/").partition("/")[0]
     return secrets.compare_digest(first.encode(), root.encode())
+
+
+# A run directory may come from somebody else; a report needs no scripts.
+_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:"
+
+
+def serve_reports(application: FastAPI, services: LabServices) -> PageCalls:
+    """Serve the reports of recorded runs below the page's address; a missing one is written.
+
+    Returns:
+        The reports that are being written, which the end of the server gives up.
+    """
+    calls = PageCalls(services)
+
+    @application.get("/report/{name}")
+    async def report(name: str) -> Response:
+        if name not in services.recorded():
+            return PlainTextResponse(f"no run {name} is recorded in {services.runs}", 404)
+        try:
+            page = await calls.compute(report_page, services.runs / name)
+        except asyncio.CancelledError:
+            return PlainTextResponse("noack lab has ended", 503)
+        except NoackError as error:
+            return PlainTextResponse(str(error), 409)
+        headers = {"content-security-policy": _POLICY, "cache-control": "no-store"}
+        return HTMLResponse(page, headers=headers)
+
+    return calls

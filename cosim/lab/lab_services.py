@@ -25,10 +25,10 @@ from cosim.interactive.exploration_figure import (
     MARGIN,
     RUN,
     DraftResults,
-    Shown,
 )
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
+from cosim.lab.run_views import live_view
 from cosim.record.run_directory import SUMMARY_FILE
 from noack.core.errors import NoackError
 from noack.scenario.scenario import Scenario
@@ -40,6 +40,7 @@ ANSWER_S = 60.0
 """So long a browser may take to answer: without a graphics card it may draw for seconds."""
 _GIVE_UP_S = 3.0
 """So long the worker may go on with a call whose page does not want it any more."""
+_LOOK_S = 0.4
 _NICE = 10
 """The worker yields to a live run and to the page."""
 
@@ -53,6 +54,7 @@ class LabServices:
         self._pool = _new_pool()
         self._turn = asyncio.Lock()
         self._following: asyncio.Task[None] | None = None
+        self._watching: asyncio.Task[None] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -113,7 +115,21 @@ class LabServices:
         self.live = LiveRun(horizon_s)
         await self.live.start(text, folder, self.runs)
         self._following = asyncio.create_task(self.live.follow())
+        self._watching = asyncio.create_task(self._watch(self.live))
         return self.live
+
+    async def _watch(self, live: LiveRun) -> None:
+        """Read what a live run has recorded, again and again, for an eighth of the time at most."""
+        took_s = 0.0
+        while not live.is_over:
+            await asyncio.sleep(max(_LOOK_S, 7 * took_s))
+            if live.state != "running" or live.run_dir is None or not live.watched:
+                continue
+            live.watched, began_s = False, time.perf_counter()
+            with suppress(NoackError, OSError, ValueError):  # the run ends, and its spool goes
+                live.seen = await self.compute(live_view, live.run_dir) or live.seen
+                live.version += 1
+            took_s = time.perf_counter() - began_s
 
     def recorded(self) -> list[str]:
         """Return the names of the run directories, the newest first."""
@@ -182,17 +198,18 @@ class Session:
     calls: PageCalls
     draft: Draft
     on_drawn: Callable[[], Awaitable[None]]
-    """Called when there is something new to draw."""
+    """Called when there is a new run."""
+    on_rest: Callable[[], Awaitable[None]]
+    """Called once the settings have rested for a moment, and with each further result."""
     results: DraftResults | None = None
     """Of the draft; None without a run."""
-    reference: Exploration | None = None
-    state: int = 0
+    before: Exploration | None = None
+    """The run before the last change, for comparison."""
     mistakes: list[Mistake] = field(default_factory=list)
     note: str = ""
     """Why there is no run, or what its drawing leaves out."""
     pending: str = ""
     """In words: what is computed, or waits for the processor."""
-    redraw_ms: float = 0.0
     _wanted: int = 0
     _drawn: int = 0
     _busy: bool = False
@@ -204,8 +221,20 @@ class Session:
             self._later.cancel()
         self.calls.give_up()
 
-    async def change(self, draft: Draft) -> None:
-        """Take another draft; of several changes during a redraw only the newest is drawn."""
+    @property
+    def is_behind(self) -> bool:
+        """Whether a newer draft than the drawn one waits."""
+        return self._drawn < self._wanted
+
+    async def change(self, draft: Draft, *, gesture: bool = True) -> None:
+        """Take another draft; of several changes during a redraw only the newest is drawn.
+
+        Args:
+            draft: the new one.
+            gesture: whether a new change begins: the run before it is kept for comparison.
+        """
+        if gesture and self.results is not None:
+            self.before = self.results.run
         self.draft = draft
         self._wanted += 1
         if self._later is not None:
@@ -214,27 +243,13 @@ class Session:
             return
         self._busy = True
         try:
-            while self._drawn < self._wanted:
+            while self.is_behind:
                 self._drawn = self._wanted
-                began_s = time.perf_counter()
                 await self._explore()
                 await self.on_drawn()
-                self.redraw_ms = 1e3 * (time.perf_counter() - began_s)
         finally:
             self._busy = False
         self._later = asyncio.create_task(self._compute_rest())
-
-    def keep(self) -> None:
-        """Keep the run for comparison, or forget the one that was kept."""
-        kept = self.reference is not None
-        self.reference = None if kept or self.results is None else self.results.run
-
-    def shown(self) -> Shown | None:
-        """Return what the figure shows; None without a run."""
-        if self.results is None:
-            return None
-        self.state = min(self.state, self.results.run.x.shape[1] - 1)
-        return self.results.shown(self.state)._replace(reference=self.reference)
 
     async def _explore(self) -> None:
         self.results, self.mistakes, self.note = None, [], ""
@@ -256,23 +271,24 @@ class Session:
 
     async def _compute_rest(self) -> None:
         """Compute what takes longer, once the settings have rested for a moment."""
+        await asyncio.sleep(_QUIET_S)
+        await self.on_rest()
         if (results := self.results) is None:
             return
-        await asyncio.sleep(_QUIET_S)
         scenario = self.draft.scenario
         try:
             results.put(CERTIFICATE, await self._compute("certificate", certify, scenario))
-            await self.on_drawn()
+            await self.on_rest()
             if why_not_exact(scenario) is None:
                 results.put(ENSEMBLE, await self._compute("bands", explore_ensemble, scenario))
-                await self.on_drawn()
+                await self.on_rest()
             await asyncio.sleep(_MARGIN_S)
             margin = await self._compute("margin", margin_of, scenario)
             if margin.defined:
                 results.put(MARGIN, margin)
         except NoackError as error:
             self.note, self.pending = str(error), ""
-        await self.on_drawn()
+        await self.on_rest()
 
     async def _compute(self, what: str, function: Callable[[Scenario], T], scenario: Scenario) -> T:
         """Compute a result, and say so; if it does not come soon, that it waits."""
@@ -280,7 +296,7 @@ class Session:
         async def say_waiting() -> None:
             await asyncio.sleep(_SLOW_S)
             self.pending = f"{what}: waiting for the processor"
-            await self.on_drawn()
+            await self.on_rest()
 
         self.pending = f"computing: {what}"
         waiting = asyncio.create_task(say_waiting())

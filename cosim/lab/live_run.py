@@ -14,6 +14,7 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cosim.interactive.draft import Draft
 from cosim.live.launcher import launch
@@ -23,6 +24,9 @@ from noack.core.errors import ExitStatus, NoackError
 from noack.core.process_limits import python_command
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.control_messages import RunProgress, parse_message
+
+if TYPE_CHECKING:
+    from cosim.interactive.exploration import Exploration
 
 _ADDRESS = re.compile(r"http://\S+")
 MOST_LINES = 200
@@ -50,6 +54,10 @@ class LiveRun:
     verdict: list[tuple[str, str]] = field(default_factory=list)
     """At the end: lines, each with its style as :mod:`cosim.output.run_verdict` names it."""
     ok: bool | None = None
+    seen: "Exploration | None" = None
+    """What is drawn of it: what was recorded when a page last asked for it."""
+    watched: bool = False
+    """Whether a page has shown the run since then."""
     version: int = 0
     """Grows with each change."""
     _process: asyncio.subprocess.Process | None = None

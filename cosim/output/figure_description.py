@@ -1,7 +1,7 @@
 """The content of a figure as plain data: rows of panels, their axes and their items.
 
 Reports, pages of studies, files and notebooks draw a :class:`FigureDescription` by matplotlib
-(:mod:`cosim.output.figure_drawing`), the lab page by its chart library (:mod:`cosim.lab.chart`).
+(:mod:`cosim.output.figure_drawing`), the lab page in the browser (:mod:`cosim.lab.stage`).
 Arrays may have any length, including 0. Values that are not finite are drawn as gaps.
 """
 
@@ -297,6 +297,29 @@ def finite(values: Reals, *, positive: bool = False) -> Reals:
         if positive:
             shown &= values > 0
     return np.where(shown, values, np.nan)
+
+
+def log_ends(values: Reals, measured: Reals, decades: int) -> tuple[float, float] | None:
+    """Return the ends of a logarithmic axis for some values; None without positive ones.
+
+    They are at most ``decades`` below and above the decade of the largest measured value.
+    """
+    measured = finite(measured, positive=True)
+    if not np.isfinite(measured).any():
+        return None
+    values = values[values > 1 / LARGEST]  # without zeros
+    decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
+    low, high = max(values.min(), decade / 10**decades), min(values.max(), decade * 10**decades)
+    margin = max((high / low) ** 0.05, 1.1)
+    return float(low / margin), float(high * margin)
+
+
+def near_ends(ends: tuple[float, float], measured: Reals) -> tuple[float, float]:
+    """Return the ends of a linear axis, moved to near the measured values."""
+    values = np.append(finite(measured), 0.0)
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    room = 0.25 * (high - low) or 1.0
+    return max(ends[0], low - room), min(ends[1], high + room)
 
 
 def histogram(values: Reals, bins: int = 30) -> tuple[Reals, Reals]:

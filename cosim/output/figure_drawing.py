@@ -36,6 +36,8 @@ from cosim.output.figure_description import (
     Rule,
     Spans,
     finite,
+    log_ends,
+    near_ends,
 )
 from cosim.output.figure_layout import (
     BAR_IN,
@@ -373,24 +375,14 @@ def _set_ends(axes: Axes, which: Literal["x", "y"], described: Axis) -> None:
 
 def _limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
     """Show all curves, but at most ``decades`` below and above the largest measured value."""
-    measured = finite(measured, positive=True)
-    if not np.isfinite(measured).any():
-        return
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines])
-    values = values[values > 1 / LARGEST]  # without zeros
-    decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
-    low, high = max(values.min(), decade / 10**decades), min(values.max(), decade * 10**decades)
-    margin = max((high / low) ** 0.05, 1.1)
-    axes.set_ylim(low / margin, high * margin)
+    values = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines]
+    if (ends := log_ends(np.concatenate(values), measured, decades)) is not None:
+        axes.set_ylim(*ends)
 
 
 def _limit_axis(axes: Axes, measured: Reals) -> None:
     """Show the measured values whole; bands only as far as they are near them."""
-    values = np.append(finite(measured), 0.0)
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    room = 0.25 * (high - low) or 1.0
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, low - room), min(top, high + room))
+    axes.set_ylim(*near_ends(axes.get_ylim(), measured))
 
 
 class _Numbers(LogFormatter):

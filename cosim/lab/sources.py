@@ -1,0 +1,324 @@
+"""Where the figure comes from besides exploring: a live run, and recorded runs.
+
+Each has its controls in the bar above the figure; a live run also its log and the rerun viewer.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from urllib.parse import quote
+
+from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
+
+from cosim.interactive.controls import controls_of
+from cosim.interactive.draft import Draft, DraftError
+from cosim.interactive.exploration import Exploration
+from cosim.lab.lab_services import LabServices, PageCalls
+from cosim.lab.live_run import MOST_LINES, LiveRun
+from cosim.lab.run_views import RunView, compared, recorded_view, replayed
+from cosim.output.run_verdict import DOUBTFUL, NEUTRAL, VerdictLine, transmission_line
+from noack.core.errors import NoackError
+from noack.core.number_format import number
+from noack.runtime.run_registry import find, request_change
+
+Changed = Callable[[], Awaitable[None]]
+_REJOIN_S = 5.0
+_KILLABLE = ("sensor", "netem", "controller")
+_ABOUT = (
+    "“run live” starts plant, sensor, network emulator (netem), controller and recorder as five "
+    "processes on this machine, which exchange real UDP packets in real time. The figure then "
+    "shows what they record, dashed beside it the ideal loop. The kill buttons end a process by "
+    "SIGKILL; if killed processes are restarted, the loop goes on."
+)
+
+
+class LiveSource:
+    """The live run; all visitors of the page see the same one."""
+
+    name = "live"
+
+    def __init__(self, services: LabServices, replay: Callable[[str], Awaitable[None]]) -> None:
+        self._services, self._replay = services, replay
+        self._live: LiveRun | None = None
+        """The run that is shown, with its version and the number of its lines that are shown."""
+        self._version = self._lines = 0
+        self._viewer, self._is_offered, self.shows_viewer = "", False, False
+        self._start = ui.button("run live", icon="play_arrow").props("no-caps dense")
+        self._stop = ui.button("stop", icon="stop", on_click=self._end).props(
+            "outline no-caps dense"
+        )
+        self._again = ui.button("replay this run", icon="replay", on_click=self._open).props(
+            "no-caps dense"
+        )
+        self._stop.disable()
+        self._again.set_visibility(False)
+
+    def build_details(self) -> None:
+        """Build kill buttons, log and viewer, which are below what is said of the run."""
+        with ui.row().classes("items-center gap-2"):
+            self._restarts = ui.checkbox("restart killed processes", value=True).props("dense")
+            self._kill = [
+                ui.button(f"kill {role}", icon="dangerous", on_click=self._killer(role)).props(
+                    "outline color=negative no-caps dense"
+                )
+                for role in _KILLABLE
+            ]
+        self._log = ui.log(max_lines=MOST_LINES).classes("w-full h-40 lab-log")
+        self._log.props('tabindex=0 role=region aria-label="log of the run"')
+        self._frame = ui.element("div").classes("w-full")
+
+    def on_start(self, draft: Callable[[], Draft]) -> None:
+        """Say which draft a run takes when it starts."""
+
+        async def begin() -> None:
+            await self._begin(draft())
+
+        self._start.on_click(begin)
+
+    @property
+    def run(self) -> Exploration | None:
+        """What is drawn of it."""
+        if (live := self._services.live) is None:
+            return None
+        live.watched = True
+        return live.seen
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a loop runs, which settings can change."""
+        return self._services.live is not None and self._services.live.state == "running"
+
+    @property
+    def progress(self) -> float | None:
+        """Which share of the run is over; None without one that goes on."""
+        live = self._services.live
+        if live is None or live.is_over:
+            return None
+        return min((live.progress.t_s if live.progress else 0.0) / live.horizon_s, 1.0)
+
+    @property
+    def verdict(self) -> list[VerdictLine]:
+        """How it is: the verdict at its end; before, what is known so far."""
+        if (live := self._services.live) is None:
+            return [VerdictLine(_ABOUT, NEUTRAL)]
+        if live.verdict:
+            return [VerdictLine(*line) for line in live.verdict]
+        lines = [VerdictLine(_words(live), NEUTRAL)]
+        if (progress := live.progress) is not None:
+            kept = progress.warnings[-1:] or ["guarantee kept so far"]
+            style = DOUBTFUL if progress.warnings else NEUTRAL
+            lines += [VerdictLine(kept[0], style)]
+            lines += [transmission_line(progress.events, progress.deliveries)]
+        return lines
+
+    @property
+    def report(self) -> str:
+        """Name of the run directory of a run that has ended; empty before."""
+        live = self._services.live
+        return live.run_dir.name if live and live.verdict and live.run_dir else ""
+
+    def follow(self) -> bool:
+        """Bring buttons and log up to date; return whether something has changed."""
+        live = self._services.live
+        if live is None or (self._live, self._version) == (live, live.version):
+            return False
+        if self._live is not live:
+            self._live, self._lines, self._viewer = live, 0, ""
+            self._log.clear()
+            self._frame.clear()
+        self._version = live.version
+        for line in live.lines[max(self._lines - live.first_line, 0) :]:
+            self._log.push(line)
+        self._lines = live.first_line + len(live.lines)
+        for button, enabled in (
+            (self._start, live.is_over),
+            (self._stop, not live.is_over),
+            *((one, live.state == "running") for one in self._kill),
+        ):
+            button.set_enabled(enabled)
+        self._again.set_visibility(bool(self.report))
+        if live.viewer and live.viewer != self._viewer:
+            self._viewer = live.viewer
+            self._offer_viewer(live.viewer)
+        if live.state != "running":
+            self.remove_old_viewer()
+        return True
+
+    def remove_old_viewer(self) -> None:
+        """Remove the viewer of a loop that has ended: loaded again it would find no server."""
+        if self._is_offered or (self._live is not None and self._live.is_over):
+            self._is_offered = False
+            self._frame.clear()
+
+    async def change(self, draft: Draft, keys: set[str]) -> None:
+        """Pass new values of sliders on to the running loop, if that can change them."""
+        live = self._services.live
+        if not self.is_running or live is None or live.run_dir is None:
+            return
+        known = {one.key for one in controls_of(draft).sliders if one.live} & keys
+        if not known:
+            return
+        try:
+            run = find(run_dir=live.run_dir)
+            await asyncio.to_thread(request_change, run, {key: draft.value(key) for key in known})
+        except NoackError as error:
+            ui.notify(str(error), type="warning")
+
+    async def _begin(self, draft: Draft) -> None:
+        try:
+            if draft.value("ports") is not None:
+                draft = draft.without("ports")  # fixed ports may be taken by another run
+            if self._restarts.value:
+                draft = draft.with_value("recovery.rejoin_within_s", _REJOIN_S)
+            horizon_s = draft.scenario.horizon_s
+        except DraftError as error:
+            ui.notify(str(error), type="negative")
+            return
+        self._start.disable()
+        await self._services.run_live(draft.text, horizon_s, draft.folder)
+
+    async def _open(self) -> None:
+        if self.report:
+            await self._replay(self.report)
+
+    def _end(self) -> None:
+        if self._services.live is not None:
+            self._services.live.stop()
+
+    def _killer(self, role: str) -> Callable[[], None]:
+        def kill() -> None:
+            live = self._services.live
+            if live is None or not live.kill(role):
+                ui.notify(f"no {role} is running", type="warning")
+
+        return kill
+
+    def _offer_viewer(self, address: str) -> None:
+        if self.shows_viewer:
+            self._show_viewer(address)
+            return
+        self._is_offered = True
+        with self._frame:
+            ui.label("This browser draws without a graphics card: the viewer would take the "
+                     "processor from the loop and from this page.")  # fmt: skip
+            ui.button("show the viewer here", on_click=lambda: self._show_viewer(address)).props(
+                "outline no-caps dense"
+            )
+
+    def _show_viewer(self, address: str) -> None:
+        self._is_offered = False
+        self._frame.clear()
+        with self._frame:
+            ui.link("open the viewer in a tab of its own", address, new_tab=True)
+            ui.element("iframe").props(f'src="{address}" title="rerun viewer"').classes(
+                "w-full lab-viewer"
+            )
+
+
+def _words(live: LiveRun) -> str:
+    if (progress := live.progress) is None:
+        return live.state
+    found = f"{live.state}: {progress.t_s:.1f} of {live.horizon_s:g} s"
+    if progress.x_norm is not None:
+        found += f", ‖x‖ {number(progress.x_norm, 3)}"
+    return f"{found}, longest loss burst {progress.longest_loss_burst}"
+
+
+class RecordedSource:
+    """The recorded runs; one of them is chosen."""
+
+    name = "recorded"
+
+    def __init__(self, services: LabServices, calls: PageCalls, changed: Changed) -> None:
+        self._services, self._calls, self._changed = services, calls, changed
+        self.view: RunView | None = None
+        self.note = ""
+        self._newest: str | None = None
+        self._replays = False
+        """Whether the run is replayed once its record is read."""
+        self._select = ui.select([], label="run", on_change=self._open).classes("w-72")
+        self._select.props("dense options-dense")
+        self._loop = ui.select([], label="loop", on_change=self._open).props("dense options-dense")
+        ui.button(icon="refresh", on_click=self.refresh).props(
+            'flat dense aria-label="look for new runs"'
+        )
+
+    def build_details(self) -> None:
+        """Build what can be asked about a run, below what is said of it."""
+        for text, function in (("replay", replayed), ("compare with the ideal loop", compared)):
+            ui.button(text, on_click=partial(self._ask, function)).props(
+                "outline no-caps dense"
+            ).classes("mr-2")
+
+    @property
+    def chosen(self) -> str:
+        """Name of the chosen run; empty without one."""
+        return str(self._select.value or "")
+
+    def refresh(self) -> None:
+        """Look for new runs; choose the newest that has ended, if it is a new one."""
+        names = self._services.recorded()
+        newest = next((name for name in names if self._services.has_ended(name)), None)
+        chosen = self._select.value if newest == self._newest else newest
+        self._newest = newest
+        self._loop.set_visibility(False)
+        if newest is None:
+            self.note = (
+                f"No run has ended in the folder {self._services.runs} yet. A live run appears "
+                "here; so does each run of “noack run” and “noack simulate” in this folder."
+            )
+        self._select.set_options(names, value=chosen)
+
+    async def replay(self, name: str) -> None:
+        """Choose a run, and replay it."""
+        self._replays = True
+        self.refresh()
+        if self.chosen != name:
+            self._select.set_value(name)
+        elif self.view is not None:
+            await self._replay()
+
+    async def _replay(self) -> None:
+        if self._replays:
+            self._replays = False
+            await self._ask(replayed)
+
+    async def _ask(self, function: Callable[[Path], str]) -> None:
+        """Show what a function says about the chosen run."""
+        if not self.chosen:
+            return
+        self.note = "computing …"
+        await self._changed()
+        try:
+            self.note = await self._calls.compute(function, self._services.runs / self.chosen)
+        except NoackError as error:
+            self.note = str(error)
+        await self._changed()
+
+    async def _open(self, event: ValueChangeEventArguments[str]) -> None:
+        if not self.chosen:
+            return
+        if event.sender is self._select:
+            self.view = None
+        self.note = "" if self.view else "reading the record …"
+        name, loop = self.chosen, self._loop.value
+        try:
+            view = await self._calls.compute(recorded_view, self._services.runs / name, loop)
+        except NoackError as error:
+            self.note = str(error)
+        else:
+            if name != self.chosen:
+                return  # another one was chosen meanwhile
+            self.view = view
+            self.note = "" if self.note.startswith("reading") else self.note
+            self._loop.set_visibility(len(view.loops) > 1)
+            self._loop.set_options([*view.loops], value=loop if loop in view.loops else None)
+        await self._changed()
+        await self._replay()
+
+
+def report_address(name: str) -> str:
+    """Return the address of a run's report, relative to the page."""
+    return f"report/{quote(name)}"
