@@ -32,19 +32,15 @@ from cosim.output.figure_files import inline, save_figure
 from cosim.output.run_figures import (
     Trajectory,
     Transmissions,
-    envelopes,
     run_figures,
     states_figure,
 )
 from cosim.output.run_tables import key_numbers
 from cosim.output.timing_figures import later_than
 from cosim.record.run_record import RunRecord
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
 from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import summary_of
@@ -235,12 +231,3 @@ def test_a_wrong_width_is_refused(words: list[str], message: str) -> None:
     done = CliRunner().invoke(app, ["campaign", "mb_vs_zoh", *words])
     assert done.exit_code == 2
     assert message in done.stderr
-
-
-def test_only_a_far_bound_is_drawn_lighter() -> None:
-    run = simulate(resolve(load(find_shipped("lane_following", "scenarios"))))
-    (panel,) = run_figures(run, envelopes(run))["errors"]().rows[0].panels
-    opacity = {item.label: item.opacity for item in panel.items if isinstance(item, Line)}
-    assert opacity["certified for every plant of the uncertainty box"] < 1
-    assert opacity["bound, given the updates missing now"] == 1
-    assert opacity["threshold"] == 1
