@@ -16,7 +16,7 @@ from noack.plants.fmu import FmuSettings, FmuSystem
 from noack.plants.linear import LinearSystem
 from noack.plants.plant_settings import OdeSystem, PlantEquations, SystemFailedError
 from noack.settings.user_files import located
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 from tests.noack.plants.motion import motion
 from tests.plant_server.fmus.build import build
 
@@ -114,12 +114,10 @@ def test_settings_that_do_not_fit_the_fmu_are_refused_with_the_approved_line(
             key: tuple(value) if isinstance(value, list) else value
             for key, value in json.loads(more).items()
         }
-        with pytest.raises(CallerError) as refused:
-            FmuSystem(settings(fmu, **given), X0)
-        line = str(refused.value)
+        (line,) = lines_of_error(lambda: FmuSystem(settings(fmu, **given), X0))
         for old, new in (("Integer", "Int32"), ("Real", "Float64")):  # types of FMI 2
             line = line.replace(f"of type {old};", f"of type {new};")
-        return line.splitlines()
+        return [line]
 
     compare_lines(Path(__file__).with_name("fmu_mistakes.txt"), refusal)
     assert not list(own_folder_for_temporary_files.iterdir())
@@ -139,10 +137,8 @@ def test_fmus_that_cannot_be_run_are_refused_in_one_line(
     edit: tuple[str, str], expected: str, tmp_path: Path
 ) -> None:
     before = Path.cwd()
-    with pytest.raises(CallerError) as refused:
-        FmuSystem(settings(build(tmp_path, 2, edit=edit)), X0)
-    assert expected in str(refused.value)
-    assert "\n" not in str(refused.value)
+    (line,) = lines_of_error(lambda: FmuSystem(settings(build(tmp_path, 2, edit=edit)), X0))
+    assert expected in line
     assert Path.cwd() == before
 
 

@@ -26,7 +26,7 @@ from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.link_load import link_loads, load_warnings, require_capacity, update_delay
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
@@ -113,9 +113,7 @@ def test_a_mistake_in_a_delay_file_gives_the_approved_line(tmp_path: Path) -> No
         (tmp_path / name).unlink(missing_ok=True)
         if content is not None:
             (tmp_path / name).write_text(content)
-        with pytest.raises(CallerError) as caught:
-            read_delay(tmp_path, jitter_s=jitter_s, file=name)
-        return str(caught.value).splitlines()
+        return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
 
     compare_lines(Path(__file__).with_name("delay_mistakes.txt"), mistake)
 

@@ -26,7 +26,7 @@ from noack.scenario.runtime_parameters import is_of_loss_alone, text_of
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_checks import input_at
 from noack.scenario.scenario_file import load, validate
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 SEEDS = range(60)
@@ -148,12 +148,10 @@ def scenario(content: dict[str, Any]) -> Scenario:
 
 
 def test_an_invalid_change_is_refused_with_the_approved_line(scenario: Scenario) -> None:
-    def refusal(settings: str) -> list[str]:
-        with pytest.raises(CallerError) as caught:
-            changed(scenario, json.loads(settings))
-        return str(caught.value).splitlines()
-
-    compare_lines(Path(__file__).with_name("change_mistakes.txt"), refusal)
+    compare_lines(
+        Path(__file__).with_name("change_mistakes.txt"),
+        lambda settings: lines_of_error(lambda: changed(scenario, json.loads(settings))),
+    )
     script = {"network.loss": {"model": "scripted", "lost": list(range(900))}}
     with pytest.raises(CallerError, match=r"^[^\n]*at most 1024[^\n]*$"):
         changed(scenario, script)
