@@ -21,7 +21,7 @@ from noack.core.errors import CallerError
 from noack.protocol.topology import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -205,7 +205,6 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
 
 ROBOT = '[controller]\nssh = "robot"\n'
 UNREACHABLE = "not an address at which other hosts can reach this one"
-LISTEN = 'listen = "192.0.2.1"\n'
 
 
 def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
@@ -269,23 +268,9 @@ def test_processes_without_a_table_stay_here(hosts: Path, monkeypatch: pytest.Mo
         listening_for(hosts)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        (ROBOT, "hosts.toml: listen: missing"),
-        (LISTEN, "no process is on another host"),
-        (f'listen = "0.0.0.0"\n{ROBOT}', "hosts.toml: listen: 0.0.0.0 is not an address"),
-        (f'{LISTEN}[recorder]\nssh = "robot"\n{ROBOT}', "the keys here are controller"),
-        (f'{LISTEN}[plant]\nssh = "-oProxyCommand=reboot"\n', "plant.ssh"),
-        (f'{LISTEN}plant = "robot"\n', "plant"),
-        (f'{LISTEN}[plant]\nssh = "a\\u0000b"\n', "has a control character"),
-        (f'{LISTEN}{ROBOT}command = "a\\u0000"\n', "controller.command"),
-        (f'{LISTEN}{ROBOT}runs = "a\\nb"\n', "controller.runs"),
-    ],
-)
-def test_a_mistake_gives_one_line(hosts: Path, text: str, line: str) -> None:
-    hosts.write_text(text)
-    with pytest.raises(CallerError) as caught:
-        listening_for(hosts)
-    assert line in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
+def test_a_mistake_in_a_file_of_hosts_gives_the_approved_line(hosts: Path) -> None:
+    def mistake(line: str) -> list[str]:
+        hosts.write_text(json.loads(line))
+        return lines_of_error(lambda: listening_for(hosts), FILE=hosts)
+
+    compare_lines(Path(__file__).with_name("host_mistakes.txt"), mistake)

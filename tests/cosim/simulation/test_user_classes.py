@@ -26,6 +26,7 @@ from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from tests.approved import compare_lines, lines_of_error
 from tests.plant_server.fmus.build import build
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -86,21 +87,12 @@ def test_a_run_keeps_the_class_and_is_replayed_bit_for_bit(name: str, tmp_path: 
     assert replay(load_record(ending.run_dir)).bit_exact
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("controller.setpoint=[1.0, 0.0]", 'controller.setpoint.*: not with controller.kind = "py'),
-        ("plant.watchdog.policy=model", 'plant.watchdog.policy.*"model" predicts u = K x_c; not'),
-        ("controller.file=nothing.py", "controller.file = .nothing.py.: cannot be read: No such"),
-        ("controller.name=Other", "controller.name = .Other.: LookupError: saturated_lqr.py has"),
-        ("controller.parameters={}", "SaturatedLqr.: TypeError: .*missing 3 required positional"),
-    ],
-)
-def test_mistakes_in_the_settings_give_one_line(setting: str, message: str) -> None:
+def test_mistakes_in_the_settings_give_the_approved_lines() -> None:
     path = SCENARIOS / "saturated_lqr.toml"
-    with pytest.raises(CallerError, match=message) as refused:
-        simulate(resolve(load(path, [setting])))
-    assert "\n" not in str(refused.value)
+    compare_lines(
+        Path(__file__).with_name("class_mistakes.txt"),
+        lambda setting: lines_of_error(lambda: simulate(resolve(load(path, [setting]))), FILE=path),
+    )
     with pytest.raises(CallerError, match=r"^controller\.kind = .*: u is not K x_c; this needs"):
         resolve(load(path)).coverage.require_exact()
 
