@@ -9,14 +9,8 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from cosim.live import coordinator
+from cosim.live import coordinator, remote_access
 from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
-from cosim.live.remote_access import (
-    ConnectionFloodWatch,
-    listen_address,
-    listening_for,
-    with_clocks,
-)
 from noack.core.errors import CallerError
 from noack.protocol.topology import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
@@ -212,7 +206,7 @@ def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
 
     def found(text: str) -> list[str]:
         try:
-            return ["{} port {}".format(*listen_address(json.loads(text)))]
+            return ["{} port {}".format(*remote_access.listen_address(json.loads(text)))]
         except CallerError as error:
             return [str(error).partition(" (")[0]]
 
@@ -221,13 +215,13 @@ def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
 
 def test_one_loop_records_the_bounds_of_its_clocks() -> None:
     one = load(Path("scenarios/lane_following.toml"))
-    assert with_clocks(one).clocks == ClocksSection()
+    assert remote_access.with_clocks(one).clocks == ClocksSection()
     strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
-    assert with_clocks(strict) is strict
+    assert remote_access.with_clocks(strict) is strict
 
 
 def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:
-    watch = ConnectionFloodWatch()
+    watch = remote_access.ConnectionFloodWatch()
 
     def lines(*counts: int) -> list[str]:
         for count in counts:
@@ -259,18 +253,18 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_processes_without_a_table_stay_here(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
-    found = listening_for(hosts)
+    found = remote_access.listening_for(hosts)
     assert found.address == ("192.0.2.1", 7400)
     assert found.invitation is None
     assert {role: host.ssh for role, host in found.hosts.items()} == {"controller": "robot"}
     monkeypatch.setenv("PATH", str(hosts.parent))
     with pytest.raises(CallerError, match="no ssh client is installed"):
-        listening_for(hosts)
+        remote_access.listening_for(hosts)
 
 
 def test_a_mistake_in_a_file_of_hosts_gives_the_approved_line(hosts: Path) -> None:
     def mistake(line: str) -> list[str]:
         hosts.write_text(json.loads(line))
-        return lines_of_error(lambda: listening_for(hosts), FILE=hosts)
+        return lines_of_error(lambda: remote_access.listening_for(hosts), FILE=hosts)
 
     compare_lines(Path(__file__).with_name("host_mistakes.txt"), mistake)

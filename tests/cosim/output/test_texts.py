@@ -14,14 +14,7 @@ from typer.testing import CliRunner
 
 import noack
 from cosim.cli import app
-from cosim.output.result_tables import (
-    KEY_VALUE,
-    ResultTable,
-    as_csv,
-    as_latex,
-    latex_text,
-    save_tables,
-)
+from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
 from tests.approved import compare_text
@@ -91,27 +84,29 @@ def rows_of(path: Path) -> list[list[str]]:
     ("\\漢\n--x", r"\textbackslash{}? {-}{-}x"),
 ])  # fmt: skip
 def test_a_text_is_escaped(text: str, latex: str) -> None:
-    assert latex_text(text) == latex
+    assert result_tables.latex_text(text) == latex
 
 
 def test_units_move_to_the_heads_and_numbers_are_aligned() -> None:
-    table = ResultTable("t", "c", ("", "time", "mixed"), [
+    table = result_tables.ResultTable("t", "c", ("", "time", "mixed"), [
         ("a", "0.5 s", "1 s"), ("b", "12 s", "2 ms"), ("c", "−1.25 s", "-"),
     ])  # fmt: skip
-    text = as_latex(table)
+    text = result_tables.as_latex(table)
     assert r"\begin{tabular}{@{}lrr@{}}" in text
     assert r" & time [s] & mixed \tabularnewline" in text
     assert r"a & 0.5\phantom{0} & 1 s \tabularnewline" in text
     assert r"b & 12\phantom{.00} & 2 ms \tabularnewline" in text
     assert r"c & \ensuremath{-}1.25 & -- \tabularnewline" in text
-    assert as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
-    rows = ResultTable("t", "c", KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")])
-    assert as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
+    assert result_tables.as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
+    rows = result_tables.ResultTable(
+        "t", "c", result_tables.KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")]
+    )
+    assert result_tables.as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
 
 
 def test_tables_of_a_run_have_its_numbers(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("lane_following", {"horizon_s": 5.0}))
-    save_tables(summary_tables(run.summary), tmp_path)
+    result_tables.save_tables(summary_tables(run.summary), tmp_path)
     numbers = dict(rows_of(tmp_path / "numbers.csv"))
     assert numbers["transmissions"] == str(run.summary.loops[0].events)
     shortest_s = float(numbers["shortest inter-event time [s]"])
