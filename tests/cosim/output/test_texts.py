@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
 from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
 from tests.approved import compare_text
+from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
 
 APPROVED = Path(__file__).with_name("approved")
@@ -48,7 +47,7 @@ def test_the_terminal_shows_what_was_approved(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["noack"])
-    done = CliRunner().invoke(app, [str(run) if word == "RUN" else word for word in words])
+    done = invoke(*(run if word == "RUN" else word for word in words))
     assert done.exit_code == 0, done.output
     compare(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
 
@@ -128,9 +127,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)
         assert [file.name for file in files[:2]] == [f"{name}.tex", f"{name}.csv"]
-    done = CliRunner().invoke(
-        app, ["margin", "lane_periodic", "--most", "2", "--no-period", "--tables", str(tmp_path)]
-    )
+    done = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
     assert done.exit_code == 0, done.output
     for ending in ("tex", "csv"):
         own = tmp_path / "margin" / f"margin.{ending}"

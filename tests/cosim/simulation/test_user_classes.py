@@ -11,12 +11,10 @@ import control
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from typer.testing import CliRunner
 
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import linearisation, summarise
 from cosim.analysis.summary_model import NoLinearisationPart
-from cosim.cli import app
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord, load_record
@@ -27,6 +25,7 @@ from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.approved import compare_lines, lines_of_error
+from tests.command_line import invoke
 from tests.plant_server.fmus.build import build
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -268,10 +267,10 @@ def test_a_failed_plant_stops_moving_and_the_run_is_recorded(
 
 def test_check_describes_the_plant_and_refuses_invalid_settings(tmp_path: Path) -> None:
     path = prepared(tmp_path, PYTHON, "{}")
-    done = CliRunner().invoke(app, ["check", str(path)])
+    done = invoke("check", path)
     assert done.exit_code == 0
     assert "the plant: class VanDerPol of mine.py" in " ".join(done.stdout.split())
-    done = CliRunner().invoke(app, ["check", str(path), "--json"])
+    done = invoke("check", path, "--json")
     system: dict[str, Any] = json.loads(done.stdout)["plant"]["system"]
     assert (system["kind"], len(system["sha256"])) == ("python", 64)
     for wrong, expected in (
