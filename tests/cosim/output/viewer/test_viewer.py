@@ -36,12 +36,12 @@ from cosim.output.viewer.run_recording import RunRecording
 from cosim.record.align import AlignedRun
 from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
 from tests.cosim.output.test_texts import compare
 from tests.cosim.summaries import summary_of
-from tests.integration.conftest import wait_for
+from tests.integration.conftest import noack_command, wait_for
 
 Floats = NDArray[np.float64]
 
@@ -368,6 +368,42 @@ def listening(viewer: "subprocess.Popen[str]") -> list[str]:
         for address in one.net_connections("inet")
         if address.status == psutil.CONN_LISTEN
     ]
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "words"),
+    [
+        (signal.SIGINT, 0, ()),
+        (signal.SIGHUP, ExitStatus.TERMINATED, ("--web",)),
+        pytest.param(
+            signal.SIGKILL, -signal.SIGKILL, (),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="tells no child elsewhere"),
+        ),
+    ],
+)  # fmt: skip
+def test_the_command_serves_a_page_on_the_loopback_until_it_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sent: int, status: int, words: tuple[str, ...]
+) -> None:
+    """Without a display, or if no window is wanted."""
+    pretend_window(tmp_path, monkeypatch, opens=True)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if words:
+        monkeypatch.setenv("DISPLAY", ":0")
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    with subprocess.Popen(
+        noack_command("view", str(path), *words),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    ) as child:  # fmt: skip
+        assert child.stdout is not None
+        page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
+        assert get(page)[0] == 200
+        assert get(page + RECORDING) == (200, path.read_bytes())
+        assert listening(child) == ["127.0.0.1"] * 2
+        child.send_signal(sent)
+        assert child.wait() == status
+        wait_for(lambda: not is_left(child.pid))
 
 
 T_NS = 4_244_000_000
