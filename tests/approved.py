@@ -7,6 +7,10 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pytest
+
+from noack.core.errors import NoackError
+
 
 def compare_text(path: Path, text: str) -> None:
     """Compare a text with the approved one."""
@@ -28,3 +32,13 @@ def compare_lines(path: Path, lines_of: Callable[[str], Sequence[str]]) -> None:
         if not line.startswith("#"):
             found += [f"    {one}" for one in lines_of(line)]
     compare_text(path, "\n".join(found) + "\n")
+
+
+def lines_of_error(call: Callable[[], object], **places: Path) -> list[str]:
+    """The lines of the error that a call raises, with the names of files and folders replaced."""
+    with pytest.raises(NoackError) as caught:
+        call()
+    text = str(caught.value)
+    for name, path in places.items():
+        text = text.replace(str(path), name)
+    return text.splitlines()

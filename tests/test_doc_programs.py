@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from typer.testing import CliRunner
 
-from cosim.cli import app
+from tests.command_line import invoke
 from tests.integration.conftest import wait_for
 from tests.pages import PAGES, ROOT, blocks, fences, fill, target_exists
 
@@ -70,7 +69,7 @@ def test_every_command_works(
     if "--listen" in words or "--links" in words:
         words.insert(1, "--explain")  # the emulator does not start
     monkeypatch.chdir(run_folder)
-    finished = CliRunner().invoke(app, shorter(words))
+    finished = invoke(*shorter(words))
     assert finished.exit_code == 0, finished.output
     if "--json" in words:
         json.loads(finished.stdout)
@@ -191,7 +190,7 @@ def test_commands_of_the_tutorial_print_the_shown_output(
     step: Step, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
-    done = CliRunner().invoke(app, shlex.split(step.command)[1:])
+    done = invoke(*shlex.split(step.command)[1:])
     assert done.exit_code == 0, done.output
     output = done.output.splitlines()
     for line in filter("...".__ne__, step.shown):

@@ -4,17 +4,7 @@ import numpy as np
 
 from noack.core.core_library import core, ffi
 from noack.core.linear_systems import Vector
-from noack.protocol.wire_format import (
-    HEADER_BYTES,
-    TAG_BYTES,
-    TIMES_NS,
-    Flow,
-    Message,
-    Rejection,
-    Wire,
-    reception_report,
-    rejected_of,
-)
+from noack.protocol import wire_format
 
 NO_VECTOR: Vector = np.zeros(0)  # the vector of an acknowledgement
 
@@ -28,7 +18,7 @@ class Decoder:
 
     def __init__(
         self,
-        flow: Flow,
+        flow: wire_format.Flow,
         dimension: int,
         run_id: int,
         key: bytes,
@@ -37,18 +27,18 @@ class Decoder:
         loop: int = 0,
         encrypted: bool = False,
     ) -> None:
-        self._wire = Wire(run_id, key, encrypted=encrypted)
+        self._wire = wire_format.Wire(run_id, key, encrypted=encrypted)
         self._flow, self._loop = flow, loop
         self._reception = ffi.new(
             "noack_reception *",
             {
                 "flow": flow, "entries": dimension, "newest": -1,
-                "not_before_ns": not_before_ns, "not_after_ns": TIMES_NS - 1,
+                "not_before_ns": not_before_ns, "not_after_ns": wire_format.TIMES_NS - 1,
             },
         )  # fmt: skip
         self._message = ffi.new("noack_message *")
 
-    def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
+    def decode(self, datagram: bytes, *, from_peer: bool = True) -> wire_format.Message | None:
         """Return the message, or None when the datagram was rejected (see ``rejected``).
 
         From any source but the peer's address even an authentic datagram is a replay.
@@ -57,16 +47,20 @@ class Decoder:
         if found == core.NOACK_ENCRYPTED:
             found = core.NOACK_BAD_TAG
             assert self._wire.seal is not None
-            content = self._wire.seal.open(datagram, HEADER_BYTES)
+            content = self._wire.seal.open(datagram, wire_format.HEADER_BYTES)
             if content is not None:
-                readable = datagram[:HEADER_BYTES] + content + datagram[-TAG_BYTES:]
+                readable = (
+                    datagram[: wire_format.HEADER_BYTES]
+                    + content
+                    + datagram[-wire_format.TAG_BYTES :]
+                )
                 found = self._examine(readable, from_peer, opened=True)
         message = self._message
         core.noack_wire_count(self._reception, found, message)
         if found != core.NOACK_ACCEPTED:
             return None
         vector = np.array(ffi.unpack(message.vector, message.entries), np.float64)
-        return Message(self._flow, message.sequence, message.t_ns, vector, self._loop)
+        return wire_format.Message(self._flow, message.sequence, message.t_ns, vector, self._loop)
 
     def _examine(self, datagram: bytes, from_peer: bool, *, opened: bool) -> int:
         return int(
@@ -82,10 +76,10 @@ class Decoder:
         return int(self._reception.accepted)
 
     @property
-    def rejected(self) -> dict[Rejection, int]:
+    def rejected(self) -> dict[wire_format.Rejection, int]:
         """Number of rejected datagrams by reason."""
-        return rejected_of(self._reception)
+        return wire_format.rejected_of(self._reception)
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        return reception_report(self._reception)
+        return wire_format.reception_report(self._reception)

@@ -16,13 +16,12 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 import pytest
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.live.finalize import reopen
 from cosim.record.run_record import RunRecord, load_record
 from noack.core.errors import MachineError
 from noack.protocol.topology import ROLES
+from tests.command_line import invoke
 from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration import conftest as live
 
@@ -205,7 +204,7 @@ def test_a_run_on_a_disk_that_fills_up_can_be_finalised_later(start: Start, smal
     assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
 
     (small / "filler").unlink()
-    assert CliRunner().invoke(app, ["summary", str(run_dir)]).exit_code == 0
+    assert invoke("summary", run_dir).exit_code == 0
     record = load_record(run_dir)
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         rows = record[table]

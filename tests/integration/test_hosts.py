@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks.programs import TwoHosts, two_hosts
 from benchmarks.report import MeasurementError
-from cosim.cli import app
 from cosim.record.run_record import load_record, load_run
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.scenario import phases_ns
+from tests.command_line import invoke
 from tests.integration import conftest as live
 from tests.integration.conftest import Start, ended
 
@@ -173,7 +172,7 @@ def test_rows_of_a_host_that_was_cut_off_are_collected(
     folder = tmp_path / "kept" / run_dir.name
     for process in away:
         assert f"are kept in {folder} " in errors[process]
-    done = CliRunner().invoke(app, ["collect", str(run_dir), "nohost.invalid:kept"])
+    done = invoke("collect", run_dir, "nohost.invalid:kept")
     assert done.exit_code in (1, 2)
     assert done.stderr.startswith("noack: nohost.invalid:kept: ")
     (summary,) = end_well(start(0, "collect", str(run_dir), str(folder), "--json"))

@@ -9,13 +9,7 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.record.run_events import packet_outcomes
 from cosim.record.run_record import RunRecord, load_record
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    NETEM_PACKET,
-    SENSOR_ACKNOWLEDGEMENT,
-    UPDATES,
-)
+from noack.protocol import record_tables
 from noack.protocol.wire_format import Flow, read_header
 from tests.integration import conftest as live
 from tests.integration.conftest import (
@@ -73,15 +67,15 @@ def test_the_run_is_complete_and_replayed_bit_for_bit(
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
     assert_complete(finished.loop)
     assert [claim["verdict"] for claim in finished.loop["claims"]] == ["void"]
-    heads = record[NETEM_PACKET]["head"]
+    heads = record[record_tables.NETEM_PACKET]["head"]
     assert {read_header(head.tobytes()).version for head in heads} == {2}  # encrypted
     answers = finished.loop["acknowledgements"]
     assert answers["sent"] == finished.loop["deliveries"] > 10
     assert 0 <= answers["sent"] - answers["lost"] - answers["received"] <= 2  # in flight
     found = replay(record)
     compared = {leg.leg: leg.compared for leg in found.messages}
-    assert compared["controller → netem"] == len(record[CONTROLLER_DELIVERY])
-    assert compared["netem → sensor"] == len(record[SENSOR_ACKNOWLEDGEMENT])
+    assert compared["controller → netem"] == len(record[record_tables.CONTROLLER_DELIVERY])
+    assert compared["netem → sensor"] == len(record[record_tables.SENSOR_ACKNOWLEDGEMENT])
     logs = [log.read_text() for log in (finished.run_dir / "logs").iterdir()]
     assert not any("Traceback" in text for text in (finished.stderr, *logs))
 
@@ -104,8 +98,8 @@ def test_each_process_receives_from_its_senders_only(finished: Finished) -> None
 def test_forwarded_updates_reach_the_controller_and_the_cap_holds(
     finished: Finished, record: RunRecord
 ) -> None:
-    packets, taken = record[NETEM_PACKET], record[CONTROLLER_DELIVERY]
-    updates = packets[packets["flow"] == UPDATES]
+    packets, taken = record[record_tables.NETEM_PACKET], record[record_tables.CONTROLLER_DELIVERY]
+    updates = packets[packets["flow"] == record_tables.UPDATES]
     forwarded = int((updates["release_ns"] >= 0).sum() + (updates["copy_ns"] >= 0).sum())
     rejected = finished.loop["rejected_datagrams"]["controller"]
     assert rejected["stale"] > 0
@@ -135,7 +129,7 @@ def test_actuations_are_lost_within_their_guarantee(tmp_path: Path) -> None:
     live.assert_complete(finished.loop)
     record = load_record(finished.run_dir)
     found, outcomes = finished.loop["actuations"], packet_outcomes(record, Flow.ACTUATION)
-    assert found["sent"] == len(record[CONTROLLER_STEP])
+    assert found["sent"] == len(record[record_tables.CONTROLLER_STEP])
     assert found["lost"] > 0.2 * found["sent"]
     assert found["longest_loss_burst"] == outcomes.longest_loss_burst() <= 3
     assert found["received"] == outcomes.forwarded.sum()

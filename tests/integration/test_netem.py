@@ -60,23 +60,6 @@ def client() -> Iterator[socket.socket]:
         yield endpoint
 
 
-def test_the_emulator_relays_any_udp_program() -> None:
-    with server() as (there, to), client() as here:
-        arguments = ["--listen", ":0", "--to", to, "--json", "loss", "worst", "mansd", "3", "first"]
-        with emulator(*arguments) as (process, [port]):
-            for number in range(40):
-                here.sendto(b"%d" % number, ("127.0.0.1", port))
-            arrived = [int(there.recv(100)) for _ in range(10)]
-            totals, _ = ended(process)
-    assert arrived == list(range(0, 40, 4))
-    (link,) = json.loads(totals)["links"]
-    forward = link["forward"]
-    assert forward["received"] == 40
-    assert {fate: n for fate, n in forward["fates"].items() if n} == {"dropped": 30, "forced": 10}
-    assert forward["longest_loss_burst"] == 3
-    assert set(forward["unintended"].values()) == {0}
-
-
 def test_several_links_a_capture_and_statistics(tmp_path: Path) -> None:
     links, capture = tmp_path / "links.toml", tmp_path / "all.pcapng"
     lines = tmp_path / "lines.json"

@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun.chunk
-from typer.testing import CliRunner
 
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
-from cosim.cli import app
 from cosim.output.viewer import blueprint
 from cosim.record.run_events import changes_of
 from cosim.record.run_record import RunRecord, load_record
@@ -36,6 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime import run_registry
+from tests.command_line import invoke
 from tests.cosim.output.viewer.test_viewer import read, series
 from tests.integration.conftest import (
     PATIENCE_S,
@@ -166,7 +165,7 @@ def test_a_run_is_changed_twice_and_stopped(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     running = start(*settings(horizon_s=1000.0))
     running.wait_recording()
-    refused = CliRunner().invoke(app, ["summary", str(running.runs / "latest")])
+    refused = invoke("summary", running.runs / "latest")
     assert refused.exit_code == 2
     assert "still under way" in refused.stderr
     run = run_registry.find()

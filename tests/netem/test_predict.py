@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from netem.tc_words import settings_of
-from noack.core.errors import CallerError
 from noack.impairments import loss_prediction
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.impairments.loss_prediction import (
@@ -20,7 +19,7 @@ from noack.impairments.loss_prediction import (
     with_kept_loss,
 )
 from noack.protocol.record_tables import Fate
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 from tests.oracles.link import Link
 
 DECISIONS = 400_000
@@ -103,9 +102,7 @@ def test_many_decisions_have_the_predicted_loss(decide: Any, share_is: Any, word
 def test_a_missing_prediction_has_the_approved_reason() -> None:
     def reason(words: str) -> list[str]:
         if "keep" in words:
-            with pytest.raises(CallerError) as caught:
-                read_files(settings_of(words), Path(), "FILE")
-            return str(caught.value).splitlines()
+            return lines_of_error(lambda: read_files(settings_of(words), Path(), "FILE"))
         prediction = predict(settings_of(words))
         assert prediction.rate is None
         return [prediction.note]

@@ -1,6 +1,5 @@
 """Check the recording on a screenshot of the viewer in a browser."""
 
-import runpy
 import shutil
 import subprocess
 import sys
@@ -57,22 +56,3 @@ def near(image: Image.Image, colour: palette.Colour) -> Any:
     """Return the positions (k, 2) of pixels of this colour, with a tolerance for smoothed edges."""
     pixels = np.asarray(image, dtype=int)
     return np.argwhere(np.abs(pixels - colour).max(axis=2) < 20)
-
-
-@pytest.mark.parametrize("missing", ["recording", "browser"])
-def test_a_missing_file_or_program_gives_one_line(
-    missing: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    path = tmp_path / "recording.rrd"
-    if missing == "browser":
-        path.write_bytes(b"RRF2")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(sys, "argv", [str(TOOL), str(path), str(tmp_path / "picture.png")])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(TOOL), run_name="__main__")
-    assert ended.value.code == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert ("no such recording" if missing == "recording" else "no browser") in line

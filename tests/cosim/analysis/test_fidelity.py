@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner, Result
 
 import cosim.analysis.fidelity
 from cosim.analysis.fidelity import (
@@ -21,7 +20,6 @@ from cosim.analysis.fidelity import (
     fidelity_for_summary,
 )
 from cosim.analysis.summary_model import NoFidelityPart
-from cosim.cli import app
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import RunRecord
@@ -34,6 +32,7 @@ from noack.protocol.record_tables import (
 )
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario_file import load
+from tests.command_line import invoke
 from tests.cosim.record.changed_records import changed
 
 LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
@@ -179,10 +178,6 @@ def test_the_summary_has_the_comparison_or_the_reason(
 COMMANDS = ("replay", "fidelity")
 
 
-def noack(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
@@ -214,15 +209,15 @@ def alter(runs: Path, table: str, column: str, by: float) -> None:
 
 def test_the_last_run_is_replayed_and_compared_with_the_ideal_loop(simulated: Path) -> None:
     for command, text in (("replay", "bit-exact: "), ("fidelity", "held actuation")):
-        done = noack(command, "--runs", simulated)
+        done = invoke(command, "--runs", simulated)
         assert (done.exit_code, done.stderr) == (0, "")
         assert text in done.stdout
-    document = json.loads(noack("replay", "--runs", simulated, "--json").stdout)
+    document = json.loads(invoke("replay", "--runs", simulated, "--json").stdout)
     assert (document["bit_exact"], document["complete"]) == (True, True)
     assert document["first_difference"] is None
     assert document["inputs"] == sum(process["inputs"] for process in document["processes"])
     assert document["changed_since"] == []
-    document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
+    document = json.loads(invoke("fidelity", simulated / "latest", "--json").stdout)
     assert document["explained"] is True
     names = [stage["name"] for stage in document["stages"]]
     assert names == ["sampling", "delay", "held actuation", "residual"]
@@ -234,12 +229,12 @@ def test_a_difference_is_reported_and_fails(runs: Path) -> None:
     environment = json.loads(path.read_text())
     environment["packages"]["numpy"] = "1.0"
     path.write_text(json.dumps(environment))
-    done = noack("replay", "--runs", runs)
+    done = invoke("replay", "--runs", runs)
     assert done.exit_code == 1
     assert "controller_step row 1, x_c_3" in done.stdout
     assert "0x1." in done.stdout
     assert "numpy was 1.0, is " in done.stdout
-    done = noack("replay", "--runs", runs, "--json")
+    done = invoke("replay", "--runs", runs, "--json")
     document = json.loads(done.stdout)
     assert (done.exit_code, document["first_difference"]["column"]) == (1, "x_c_3")
     assert len(document["changed_since"]) == 1
@@ -247,12 +242,12 @@ def test_a_difference_is_reported_and_fails(runs: Path) -> None:
 
 def test_an_empty_record_and_an_unexplained_difference_fail(runs: Path) -> None:
     alter(runs, "plant_step", "x_4", 1.0)
-    done = noack("fidelity", runs / "latest")
-    assert done.exit_code == noack("fidelity", runs / "latest", "--json").exit_code == 1
+    done = invoke("fidelity", runs / "latest")
+    assert done.exit_code == invoke("fidelity", runs / "latest", "--json").exit_code == 1
     assert "too large" in done.stdout
     for path in (runs / "latest/record").glob("*.parquet"):
         rewrite(runs, path.stem, lambda rows: rows.slice(0, 0))
-    done = noack("replay", "--runs", runs)
+    done = invoke("replay", "--runs", runs)
     assert done.exit_code == 1
     assert "nothing to compare" in done.stdout
 
@@ -272,7 +267,7 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 def test_an_invalid_run_directory_gives_one_line(runs: Path, how: str) -> None:
     DAMAGE[how](runs)
     for command in COMMANDS:
-        done = noack(command, "--runs", runs)
+        done = invoke(command, "--runs", runs)
         assert (done.exit_code, done.stdout) == (2, "")
         assert done.stderr.startswith("noack: ")
         assert done.stderr.count("\n") == 1

@@ -4,15 +4,14 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import noack
 from cosim.analysis.margin_search import find_longest_period, find_margin
-from cosim.cli import app
 from cosim.cli.command import load_scenario
 from noack.core.linear_systems import discretise
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
+from tests.command_line import invoke
 
 HELD = {
     "mode": "zoh",
@@ -79,17 +78,17 @@ def test_constraints_that_cap_the_losses_themselves() -> None:
 
 
 def test_events_at_unknown_times() -> None:
-    done = CliRunner().invoke(app, ["margin", "double_integrator", *DEADLINE, "--json"])
+    done = invoke("margin", "double_integrator", *DEADLINE, "--json")
     assert done.exit_code == 0, done.output
     document = json.loads(done.stdout)
     assert (document["shortest_s"], document["period_s"]) == (0.2, 0.8)
     last = document["caps"][-1]
     assert last["verdict"] == "destabilised"
     assert len(last["intervals_s"]) == len(last["pattern"].replace("L", "D").split("D")) - 1
-    shown = CliRunner().invoke(app, ["margin", "double_integrator", *DEADLINE, "--no-period"])
+    shown = invoke("margin", "double_integrator", *DEADLINE, "--no-period")
     assert "with updates 0.2 to 0.8 s apart" in " ".join(shown.output.split())
     words = ["margin", "lane_periodic", "--no-period", "--most", "2"]
-    assert "stable for every pattern with M ≤ 2" in CliRunner().invoke(app, words).output
+    assert "stable for every pattern with M ≤ 2" in invoke(*words).output
 
 
 @pytest.mark.parametrize(
@@ -104,7 +103,7 @@ def test_events_at_unknown_times() -> None:
     ],
 )
 def test_mistakes_and_negative_answers(words: list[str], status: int, message: str) -> None:
-    done = CliRunner().invoke(app, ["margin", *words])
+    done = invoke("margin", *words)
     assert done.exit_code == status, done.output
     assert message in done.output
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from cosim.cli import app
 from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
 from cosim.doctor.machine_measures import (
     Buffer,
@@ -21,6 +20,7 @@ from cosim.doctor.machine_measures import (
     RunRequirements,
     lateness,
 )
+from tests.command_line import invoke
 
 WANTED = RunRequirements(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,
@@ -116,7 +116,7 @@ def test_lateness_statistics_are_those_of_the_sample() -> None:
 
 
 def doctor(*arguments: str) -> Result:
-    return CliRunner().invoke(app, ["doctor", *arguments])
+    return invoke("doctor", *arguments)
 
 
 def test_every_check_gives_a_finding_and_a_taken_port_makes_a_run_impossible(

@@ -9,18 +9,13 @@ from typing import Any, cast
 import pytest
 import zenoh
 
-from cosim.live import coordinator
+from cosim.live import coordinator, remote_access
 from cosim.live.coordinator import AdmissionPass, ChangeRequests, Coordinator
-from cosim.live.remote_access import (
-    ConnectionFloodWatch,
-    listen_address,
-    listening_for,
-    with_clocks,
-)
 from noack.core.errors import CallerError
 from noack.protocol.topology import LOOP_ROLES, RECORDER, ROLES
 from noack.scenario.run_sections import ClocksSection
 from noack.scenario.scenario_file import load
+from tests.approved import compare_lines, lines_of_error
 from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -204,50 +199,29 @@ def test_a_refused_change_has_no_effect_on_the_next_one() -> None:
 
 ROBOT = '[controller]\nssh = "robot"\n'
 UNREACHABLE = "not an address at which other hosts can reach this one"
-LISTEN = 'listen = "192.0.2.1"\n'
 
 
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("192.0.2.1", ("192.0.2.1", 0)),
-        ("192.0.2.1:7400", ("192.0.2.1", 7400)),
-        ("2001:db8::1", ("2001:db8::1", 0)),
-        ("[2001:db8::1]:7400", ("2001:db8::1", 7400)),
-        ("127.0.0.1", ("127.0.0.1", 0)),
-    ],
-)
-def test_an_address_may_lack_its_port(text: str, address: tuple[str, int]) -> None:
-    assert listen_address(text) == address
+def test_a_run_listens_at_addresses_that_others_can_reach() -> None:
+    """A port may be missing."""
 
+    def found(text: str) -> list[str]:
+        try:
+            return ["{} port {}".format(*remote_access.listen_address(json.loads(text)))]
+        except CallerError as error:
+            return [str(error).partition(" (")[0]]
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("0.0.0.0", UNREACHABLE),
-        ("::", UNREACHABLE),
-        ("fe80::1", UNREACHABLE),
-        ("::ffff:1.2.3.4", UNREACHABLE),
-        ("", "--listen: expected an address of this host"),
-        (":7400", "--listen: expected an address of this host"),
-        ("host.invalid", "--listen: host.invalid: no such host"),
-        ("192.0.2.1:port", "--listen: expected HOST:PORT"),
-    ],
-)
-def test_an_address_that_others_cannot_reach_is_refused(text: str, reason: str) -> None:
-    with pytest.raises(CallerError, match=reason):
-        listen_address(text)
+    compare_lines(Path(__file__).with_name("addresses.txt"), found)
 
 
 def test_one_loop_records_the_bounds_of_its_clocks() -> None:
     one = load(Path("scenarios/lane_following.toml"))
-    assert with_clocks(one).clocks == ClocksSection()
+    assert remote_access.with_clocks(one).clocks == ClocksSection()
     strict = one.model_copy(update={"clocks": ClocksSection(largest_error_us=5.0)})
-    assert with_clocks(strict) is strict
+    assert remote_access.with_clocks(strict) is strict
 
 
 def test_a_flood_of_connections_is_reported_at_its_begin_and_end() -> None:
-    watch = ConnectionFloodWatch()
+    watch = remote_access.ConnectionFloodWatch()
 
     def lines(*counts: int) -> list[str]:
         for count in counts:
@@ -279,32 +253,18 @@ def hosts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_processes_without_a_table_stay_here(hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts.write_text(f'listen = "192.0.2.1:7400"\n{ROBOT}')
-    found = listening_for(hosts)
+    found = remote_access.listening_for(hosts)
     assert found.address == ("192.0.2.1", 7400)
     assert found.invitation is None
     assert {role: host.ssh for role, host in found.hosts.items()} == {"controller": "robot"}
     monkeypatch.setenv("PATH", str(hosts.parent))
     with pytest.raises(CallerError, match="no ssh client is installed"):
-        listening_for(hosts)
+        remote_access.listening_for(hosts)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        (ROBOT, "hosts.toml: listen: missing"),
-        (LISTEN, "no process is on another host"),
-        (f'listen = "0.0.0.0"\n{ROBOT}', "hosts.toml: listen: 0.0.0.0 is not an address"),
-        (f'{LISTEN}[recorder]\nssh = "robot"\n{ROBOT}', "the keys here are controller"),
-        (f'{LISTEN}[plant]\nssh = "-oProxyCommand=reboot"\n', "plant.ssh"),
-        (f'{LISTEN}plant = "robot"\n', "plant"),
-        (f'{LISTEN}[plant]\nssh = "a\\u0000b"\n', "has a control character"),
-        (f'{LISTEN}{ROBOT}command = "a\\u0000"\n', "controller.command"),
-        (f'{LISTEN}{ROBOT}runs = "a\\nb"\n', "controller.runs"),
-    ],
-)
-def test_a_mistake_gives_one_line(hosts: Path, text: str, line: str) -> None:
-    hosts.write_text(text)
-    with pytest.raises(CallerError) as caught:
-        listening_for(hosts)
-    assert line in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
+def test_a_mistake_in_a_file_of_hosts_gives_the_approved_line(hosts: Path) -> None:
+    def mistake(line: str) -> list[str]:
+        hosts.write_text(json.loads(line))
+        return lines_of_error(lambda: remote_access.listening_for(hosts), FILE=hosts)
+
+    compare_lines(Path(__file__).with_name("host_mistakes.txt"), mistake)

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
 from cosim.live.run_metrics import RunMetrics
 from cosim.live.run_watcher import Watcher, joint_watcher
 from noack.runtime.control_messages import RunProgress
+from tests.command_line import invoke
 from tests.netem.control.test_emulator_metrics import exposed, values_of
 from tests.noack.runtime.test_log_and_metrics import objects, read, slow_reader
 
@@ -80,7 +79,7 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
     more = ["--no-report", "--runs", str(tmp_path), "--metrics", f":{address[1]}"]
     more += ["--log-format", "jsonl"]
     try:
-        finished = CliRunner().invoke(app, [*words, *more])
+        finished = invoke(*words, *more)
     finally:
         done.set()
         reader.join()
@@ -100,6 +99,6 @@ def test_a_live_run_serves_its_metrics_and_logs_its_events(tmp_path: Path) -> No
 @pytest.mark.parametrize("where", ["x", "127.0.0.1:1:2"])
 def test_a_wrong_address_starts_no_run(where: str, tmp_path: Path) -> None:
     words = ["run", "lane_following", "--runs", str(tmp_path), "--metrics", where]
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert (done.exit_code, list(tmp_path.iterdir())) == (2, [])
     assert done.stderr.splitlines()[-1].startswith("noack: --metrics: expected HOST:PORT")

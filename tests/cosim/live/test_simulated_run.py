@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun.chunk
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from cosim.analysis.network_summary import in_flight
 from cosim.analysis.summary_model import ReplayPart, read_summary
-from cosim.cli import app
 from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.output.viewer import blueprint
@@ -26,18 +25,15 @@ from noack.protocol.record_tables import NETEM_PACKET, tables
 from noack.scenario.resolution import network_tables, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
+from tests.command_line import invoke
 
 PATH = Path(__file__).parents[3] / "scenarios" / "shared_bottleneck.toml"
 LOOPS = 11
 
 
-def noack(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments)])
-
-
 def simulated(folder: Path, *settings: str, options: Sequence[str] = ()) -> Result:
     words = [word for one in settings for word in ("--set", one)]
-    return noack("simulate", PATH, "--runs", folder, "--json", *options, *words)
+    return invoke("simulate", PATH, "--runs", folder, "--json", *options, *words)
 
 
 @pytest.fixture(scope="module")
@@ -85,22 +81,22 @@ def test_the_summary_adds_up(run_dir: Path) -> None:
 def test_commands_read_the_run_and_its_loops(run_dir: Path) -> None:
     loop = (run_dir, "--loop", "periodic")
     for words in ((run_dir,), loop):
-        shown = noack("summary", *words)
+        shown = invoke("summary", *words)
         assert shown.exit_code == 0, shown.output
         assert shown.stdout.count("--loop periodic --verbose") == (words == loop)
-        replayed = noack("replay", *words, "--json")
+        replayed = invoke("replay", *words, "--json")
         assert replayed.exit_code == 0, replayed.output
         assert json.loads(replayed.stdout)["gaps"] == []
-    refused = noack("summary", run_dir, "--loop", "x")
+    refused = invoke("summary", run_dir, "--loop", "x")
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
     assert "--loop x: the run has no such loop; it has pendulum-01, " in refused.stderr
-    shown = noack("summary", run_dir).stdout
+    shown = invoke("summary", run_dir).stdout
     assert "bottleneck" in shown
     assert "guarantee not checkable in 11 of 11 loops: pendulum-01: no certificate: " in shown
-    assert noack("report", *loop).exit_code == 0
+    assert invoke("report", *loop).exit_code == 0
     page = run_dir / "report.html"
     before = page.read_text()
-    assert noack("report", run_dir, "--again").exit_code == 0
+    assert invoke("report", run_dir, "--again").exit_code == 0
     link = '<a href="report-periodic.html">periodic</a>'
     assert link not in before
     assert link in page.read_text()
@@ -110,7 +106,7 @@ def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
     late = simulated(tmp_path, "horizon_s=2", "certificate.network_delay_s=0.001")
     claims = [claim for one in json.loads(late.stdout)["loops"] for claim in one["claims"]]
     reasons = {claim["why"] for claim in claims if claim["verdict"] == "void"}
-    shown = noack("summary", tmp_path / "latest").stdout
+    shown = invoke("summary", tmp_path / "latest").stdout
     assert len(re.findall("^void: ", shown, re.MULTILINE)) == min(len(reasons), 3) > 0
 
 
@@ -118,7 +114,7 @@ def test_the_whole_says_why_claims_are_void(tmp_path: Path) -> None:
 def test_a_missing_recording_is_written_when_it_is_viewed(run_dir: Path, loop: str | None) -> None:
     path = run_dir / ("recording.rrd" if loop is None else f"recording-{loop}.rrd")
     path.unlink(missing_ok=True)
-    done = noack("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
+    done = invoke("view", run_dir, "--json", *(() if loop is None else ("--loop", loop)))
     assert json.loads(done.stdout) == {"recording": str(path), "exists": True}
     assert path.read_bytes().startswith(b"RRF")
 
@@ -141,7 +137,7 @@ def test_a_loop_that_diverges_is_named_and_the_others_go_on(tmp_path: Path) -> N
     # Finalised again, it is the same.
     path = tmp_path / "latest/summary.json"
     path.unlink()
-    shown = noack("summary", path.parent).stdout.splitlines()
+    shown = invoke("summary", path.parent).stdout.splitlines()
     assert json.loads(path.read_text()) == summary
     (row,) = [line for line in shown if line.startswith(" wild")]
     assert written(summary["loops"][2]["sup_e_c_norm"]) in row
@@ -177,11 +173,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
     words = ("simulate", str(ONE_LOOP), "--runs", str(folder), "--json", "--no-report")
-    done = noack(*words, *settings)
+    done = invoke(*words, *settings)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
     assert not (folder / "latest/report.html").exists()
-    assert noack("report", "--runs", str(folder)).exit_code == 0
+    assert invoke("report", "--runs", str(folder)).exit_code == 0
     return folder
 
 

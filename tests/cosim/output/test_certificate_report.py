@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from cosim.analysis.certificates import (
     Certificates,
@@ -15,7 +14,6 @@ from cosim.analysis.certificates import (
     with_weight,
 )
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
-from cosim.cli import app
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.impairments.loss_guarantee import LossHistory
@@ -26,6 +24,7 @@ from noack.theory.bounds.terms import Constants
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import most_events
 from noack.theory.certificates.scenario_certificates import outside_box
+from tests.command_line import invoke
 
 ROOT = Path(__file__).parents[3]
 
@@ -235,7 +234,7 @@ WRONG_SIGN = "model.gain=[[15.0, 5.0]]"
     ],
 )
 def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason: str) -> None:
-    result = CliRunner().invoke(app, ["certify", *words])
+    result = invoke("certify", *words)
     assert result.exit_code == 1
     assert reason in " ".join(result.stdout.split())
     assert "largest certified value" not in result.stdout
@@ -244,7 +243,7 @@ def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason
 def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
     """At 100 Hz the lane has no certificate in the paper's norm."""
     slow = ["--set=plant.rate_hz=100", "--set=controller.rate_hz=100"]
-    shown = CliRunner().invoke(app, ["certify", "lane_following", *slow]).stdout
+    shown = invoke("certify", "lane_following", *slow).stdout
     pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)
     weighted = certificates_of(
@@ -253,7 +252,7 @@ def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
     )  # fmt: skip
     assert weighted.schedule.constants is not None
     words = ["certify", "lane_following", *slow, "--json"]
-    document = json.loads(CliRunner().invoke(app, words).stdout)
+    document = json.loads(invoke(*words).stdout)
     assert document["certificates"][2]["constants"] is None
     chosen = document["in_chosen_norm"]["certificates"][2]["constants"]
     assert chosen["state"] == pytest.approx(weighted.schedule.constants.state, rel=1e-3)

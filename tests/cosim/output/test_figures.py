@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.legend import Legend
-from typer.testing import CliRunner
 
 import noack
 from cosim.analysis.value_reduction import QuantileSketch
-from cosim.cli import app
 from cosim.output import palette
 from cosim.output.figure_description import (
     Axis,
@@ -32,19 +30,16 @@ from cosim.output.figure_files import inline, save_figure
 from cosim.output.run_figures import (
     Trajectory,
     Transmissions,
-    envelopes,
     run_figures,
     states_figure,
 )
 from cosim.output.run_tables import key_numbers
 from cosim.output.timing_figures import later_than
 from cosim.record.run_record import RunRecord
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import CLOCK_TABLES, LOST_NS, OWNER
-from noack.scenario.resolution import resolve
-from noack.scenario.scenario_file import load
+from tests.command_line import invoke
 from tests.cosim.output.conftest import CASES, HOSTILE, scenario_of
 from tests.cosim.record.changed_records import changed
 from tests.cosim.summaries import summary_of
@@ -203,7 +198,7 @@ def test_the_figure_has_the_bound_the_limit_and_a_cross_where_the_bound_is_lost(
 
 def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("double_integrator", {"horizon_s": 0.3}), runs=tmp_path)
-    done = CliRunner().invoke(app, ["report", str(run.directory), "--format", "pdf", "--json"])
+    done = invoke("report", run.directory, "--format", "pdf", "--json")
     assert done.exit_code == 0, done.output
     names = {path.stem for path in (run.directory / "report-figures").iterdir()}
     assert names == {"errors", "input", "inter-event", "losses", "state-norm", "states"}
@@ -232,15 +227,6 @@ def test_the_figures_of_a_report_are_written_as_wide_as_a_paper_wants(tmp_path: 
     ],
 )
 def test_a_wrong_width_is_refused(words: list[str], message: str) -> None:
-    done = CliRunner().invoke(app, ["campaign", "mb_vs_zoh", *words])
+    done = invoke("campaign", "mb_vs_zoh", *words)
     assert done.exit_code == 2
     assert message in done.stderr
-
-
-def test_only_a_far_bound_is_drawn_lighter() -> None:
-    run = simulate(resolve(load(find_shipped("lane_following", "scenarios"))))
-    (panel,) = run_figures(run, envelopes(run))["errors"]().rows[0].panels
-    opacity = {item.label: item.opacity for item in panel.items if isinstance(item, Line)}
-    assert opacity["certified for every plant of the uncertainty box"] < 1
-    assert opacity["bound, given the updates missing now"] == 1
-    assert opacity["threshold"] == 1

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from cosim.analysis.replay.replay_result import difference
 from cosim.analysis.summary_model import RunSummary
-from cosim.cli import app
 from cosim.live import finalize as concluding
 from cosim.output import figure_files, report_page
 from cosim.output.figure_description import Axis, Line, Panel, one_panel
@@ -23,6 +21,7 @@ from cosim.record.run_directory import REPORT_FILE, RunEnding
 from cosim.record.run_record import RunRecord
 from noack.core.errors import ExitStatus
 from noack.scenario.scenario_file import dumps as scenario_toml
+from tests.command_line import invoke
 from tests.cosim.output.conftest import CASES, HOSTILE, make_record, scenario_of
 from tests.cosim.summaries import alone, summary_of
 
@@ -238,14 +237,14 @@ def test_a_failed_report_does_not_fail_the_run(
 
 def test_the_command_writes_a_missing_report_and_others_only_if_asked(dead_run: Path) -> None:
     """Also for a run that has not been finalized."""
-    ran = CliRunner().invoke(app, ["report", str(dead_run), "--json"])
+    ran = invoke("report", dead_run, "--json")
     assert ran.exit_code == 0, ran.output
     path = dead_run / REPORT_FILE
     assert json.loads(ran.stdout) == {"report": str(path)}
     parsed = Page(path.read_text(encoding="utf-8"))
     assert "the launcher ended early" in parsed.text
     path.write_text("as it was")
-    assert CliRunner().invoke(app, ["report", str(dead_run)]).stdout == f"{path}\n"
+    assert invoke("report", dead_run).stdout == f"{path}\n"
     assert path.read_text() == "as it was"
-    assert CliRunner().invoke(app, ["report", str(dead_run), "--again"]).exit_code == 0
+    assert invoke("report", dead_run, "--again").exit_code == 0
     assert Page(path.read_text(encoding="utf-8")).text == parsed.text

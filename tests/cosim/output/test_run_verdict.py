@@ -201,12 +201,3 @@ def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
     assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
     # There is no other value to compare with.
     assert "ideal loop" not in verdict(run.summary)[2].text
-
-
-def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> None:
-    late = {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0, "steps": 100, "late_steps": 7}
-    latency = {"p50": 600.4, "p99": 900.0, "p999": 1.0, "max": 1.0, "updates": 3}
-    live = with_values(outcome.summary, lateness_us={"sensor": late}, latency_us=latency)
-    rows = dict(short_numbers(live))
-    assert rows["most deadlines missed"] == "sensor, 7 of 100"
-    assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"

@@ -10,21 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
-from cosim.output.result_tables import (
-    KEY_VALUE,
-    ResultTable,
-    as_csv,
-    as_latex,
-    latex_text,
-    save_tables,
-)
+from cosim.output import result_tables
 from cosim.output.run_tables import summary_tables
 from noack.core.errors import CallerError
 from tests.approved import compare_text
+from tests.command_line import invoke
 from tests.cosim.output.test_page import Page
 
 APPROVED = Path(__file__).with_name("approved")
@@ -55,7 +47,7 @@ def test_the_terminal_shows_what_was_approved(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.argv", ["noack"])
-    done = CliRunner().invoke(app, [str(run) if word == "RUN" else word for word in words])
+    done = invoke(*(run if word == "RUN" else word for word in words))
     assert done.exit_code == 0, done.output
     compare(f"{name}.txt", done.stdout.replace(str(run), "RUN"))
 
@@ -91,27 +83,29 @@ def rows_of(path: Path) -> list[list[str]]:
     ("\\漢\n--x", r"\textbackslash{}? {-}{-}x"),
 ])  # fmt: skip
 def test_a_text_is_escaped(text: str, latex: str) -> None:
-    assert latex_text(text) == latex
+    assert result_tables.latex_text(text) == latex
 
 
 def test_units_move_to_the_heads_and_numbers_are_aligned() -> None:
-    table = ResultTable("t", "c", ("", "time", "mixed"), [
+    table = result_tables.ResultTable("t", "c", ("", "time", "mixed"), [
         ("a", "0.5 s", "1 s"), ("b", "12 s", "2 ms"), ("c", "−1.25 s", "-"),
     ])  # fmt: skip
-    text = as_latex(table)
+    text = result_tables.as_latex(table)
     assert r"\begin{tabular}{@{}lrr@{}}" in text
     assert r" & time [s] & mixed \tabularnewline" in text
     assert r"a & 0.5\phantom{0} & 1 s \tabularnewline" in text
     assert r"b & 12\phantom{.00} & 2 ms \tabularnewline" in text
     assert r"c & \ensuremath{-}1.25 & -- \tabularnewline" in text
-    assert as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
-    rows = ResultTable("t", "c", KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")])
-    assert as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
+    assert result_tables.as_csv(table) == ",time [s],mixed\na,0.5,1 s\nb,12,2 ms\nc,-1.25,\n"
+    rows = result_tables.ResultTable(
+        "t", "c", result_tables.KEY_VALUE, [("delay", "3 ms"), ("lost", "3 (60 %)")]
+    )
+    assert result_tables.as_csv(rows) == "quantity,value\ndelay [ms],3\nlost,3 (60 %)\n"
 
 
 def test_tables_of_a_run_have_its_numbers(tmp_path: Path) -> None:
     run = noack.simulate(noack.load("lane_following", {"horizon_s": 5.0}))
-    save_tables(summary_tables(run.summary), tmp_path)
+    result_tables.save_tables(summary_tables(run.summary), tmp_path)
     numbers = dict(rows_of(tmp_path / "numbers.csv"))
     assert numbers["transmissions"] == str(run.summary.loops[0].events)
     shortest_s = float(numbers["shortest inter-event time [s]"])
@@ -133,9 +127,7 @@ def test_the_library_writes_the_tables_of_the_command_line(tmp_path: Path) -> No
     ):  # fmt: skip
         files = noack.save_tables(result, tmp_path / name)
         assert [file.name for file in files[:2]] == [f"{name}.tex", f"{name}.csv"]
-    done = CliRunner().invoke(
-        app, ["margin", "lane_periodic", "--most", "2", "--no-period", "--tables", str(tmp_path)]
-    )
+    done = invoke("margin", "lane_periodic", "--most", "2", "--no-period", "--tables", tmp_path)
     assert done.exit_code == 0, done.output
     for ending in ("tex", "csv"):
         own = tmp_path / "margin" / f"margin.{ending}"

@@ -11,14 +11,9 @@ import numpy as np
 import pytest
 
 from cosim.analysis.loop_statistics import missing_rows
+from cosim.record import run_directory
 from cosim.record.collection import collect
 from cosim.record.record_source import with_loop
-from cosim.record.run_directory import (
-    PROCESSES_FILE,
-    REPORTS_FILE,
-    write_environment,
-    write_scenario,
-)
 from cosim.record.run_record import Rows, RunRecord, load_record, write_run
 from cosim.record.spool_conversion import finish_record
 from cosim.simulation.virtual_time import simulate
@@ -48,15 +43,15 @@ def run_dir(whole: RunRecord, tmp_path: Path) -> Path:
     """A run whose record lacks the second half of the controller's ticks, and its report."""
     found = tmp_path / "runs" / "run"
     found.mkdir(parents=True)
-    write_scenario(whole.scenario, found)
-    write_environment(found, "live", RUN)
+    run_directory.write_scenario(whole.scenario, found)
+    run_directory.write_environment(found, "live", RUN)
     reports = {
         role: one | {"process": role, "generation": 0} for role, one in whole.reports.items()
     }
     del reports["controller"]
-    (found / REPORTS_FILE).write_text(json.dumps(reports))
+    (found / run_directory.REPORTS_FILE).write_text(json.dumps(reports))
     joined = {WRITER[role]: {"process": role, "generation": 0} for role in SECRETS}
-    (found / PROCESSES_FILE).write_text(json.dumps(joined))
+    (found / run_directory.PROCESSES_FILE).write_text(json.dumps(joined))
     tables = {table: whole[table] for table in whole.tables}
     tables[CONTROLLER_STEP] = tables[CONTROLLER_STEP][:100]
     write_run(alone(RunRecord(whole.scenario, tables, [], reports)), found)

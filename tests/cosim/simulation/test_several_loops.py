@@ -1,6 +1,5 @@
 """Several loops on one network in virtual time, against the same loops alone and the link's law."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,33 +8,15 @@ import pytest
 from cosim.analysis.replay import replay
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.record.run_record import RecordedRun, RunRecord
-from cosim.shipped_files import find_shipped
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.protocol.record_tables import NETEM_PACKET, NETEM_RELEASE, Fate
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.resolution import resolve
-from noack.scenario.scenario import loops_of
-from noack.scenario.scenario_file import load, validate
+from noack.scenario.scenario_file import validate
 from tests.cosim.record.changed_records import changed
 
 Content = dict[str, Any]
 UDP_AND_IP_BYTES = 28
-DIFFERENT = find_shipped("different_loops", "scenarios")
-"""Loops of different plants, sizes and rates; the double integrator is in another file."""
-
-NETWORKS: dict[str, Sequence[str]] = {
-    "no losses": ('network.loss={ model = "lossless" }',),
-    "numbered losses": ('network.loss={ model = "periodic", period = 3, burst = 2 }',),
-    "most losses and a delay": (
-        'network.loss={ model = "worst_case" }',
-        'network.impairments=[{ kind = "delay", delay_s = 0.011 }]',
-    ),
-    "lost actuations": (
-        'network.loss={ model = "lossless" }',
-        'network.actuation={ mansd = 2, loss = { model = "periodic", period = 4, burst = 1 } }',
-    ),
-}  # fmt: skip
-"""Networks that decide for each flow alone, without a draw."""
 
 
 def same(alone: RunRecord, record: RunRecord) -> None:
@@ -44,16 +25,6 @@ def same(alone: RunRecord, record: RunRecord) -> None:
         for name in alone[table].dtype.names or ():
             if name != "head":
                 assert alone[table][name].tobytes() == record[table][name].tobytes(), (table, name)
-
-
-@pytest.mark.parametrize("network", NETWORKS)
-def test_each_loop_has_the_bits_of_the_loop_alone(network: str) -> None:
-    given = load(DIFFERENT, ["horizon_s=4.0"])
-    other = load(DIFFERENT.with_name("lane_following.toml"), NETWORKS[network]).network
-    scenario = given.model_copy(update={"network": other})
-    run = simulate_loops(scenario)
-    for own, record in zip(loops_of(scenario), run.loops, strict=True):
-        same(simulate(resolve(own)), record)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from netem.fates import FateRecorder
 from netem.tc_words import settings_of
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.control_plane import open_session
-from tests.approved import compare_lines
+from tests.approved import compare_lines, lines_of_error
 from tests.netem.conftest import Emulate
 from tests.netem.control import relays
 from tests.netem.control.relays import FakeRelay, press_q, read_until, terminal
@@ -89,9 +89,7 @@ def test_a_mistake_gets_the_approved_line_and_changes_nothing(
         if not line.startswith("{"):
             assert run(line) == ExitStatus.CALLER
             return capsys.readouterr().err.splitlines()
-        with pytest.raises(CallerError) as caught:
-            client.ask("change", **json.loads(line))
-        return str(caught.value).splitlines()
+        return lines_of_error(lambda: client.ask("change", **json.loads(line)))
 
     compare_lines(Path(__file__).with_name("mistakes.txt"), mistake)
     with open_session(EMULATORS, "lab", listen=False) as connection:

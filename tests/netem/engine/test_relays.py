@@ -4,7 +4,6 @@ import errno
 import os
 import resource
 import socket
-import struct
 import sys
 import time
 from typing import Any
@@ -144,24 +143,6 @@ def test_an_absent_server_is_reported_and_causes_no_later_loss(
     )
 
 
-@pytest.mark.parametrize("delay", ["", "delay 2ms"])
-def test_datagrams_of_any_size_and_their_copies_arrive(delay: str) -> None:
-    forward = settings_of(f"duplicate 100% {delay}")
-    reverse = settings_of(f"duplicate 100% {delay} corrupt 100%")
-    random = np.random.default_rng(0)
-    payloads = [random.bytes(size) for size in (0, 1, 511, 512, 513, 1472, 65_507)]
-    with relayed(forward, reverse) as (server, client, one):
-        for payload in payloads:
-            client.sendto(payload, one.address())
-            (data, path), (copy, _) = one.receive(server, 2)
-            assert data == copy == payload
-            server.sendto(payload, path)
-            for answer, _ in one.receive(client, 2):
-                assert len(answer) == len(payload)
-                flipped = int.from_bytes(answer, "big") ^ int.from_bytes(payload, "big")
-                assert flipped.bit_count() == (1 if payload else 0)
-
-
 def test_a_change_keeps_flows_and_datagrams_in_flight() -> None:
     late, lossy = settings_of("delay 500ms mansd 1"), settings_of("loss worst mansd 1")
     with relayed(late) as (server, client, one):
@@ -275,24 +256,6 @@ def test_all_kernel_drops_are_counted(
         assert getattr(report, side).unintended["lost_in_kernel"] > 150
         assert f"link test, {side}:" in error
     assert "lost in the kernel" in error
-
-
-@pytest.mark.parametrize("segment", [False, True])
-def test_segments_are_separate_datagrams(segment: bool) -> None:
-    """The client sends one message, and the kernel cuts it into segments."""
-    with relayed(THIRD_LOST, segment=segment) as (server, client, one):
-        client.connect(one.address())
-        sent: list[bytes] = []
-        for size, count in ((1000, 60), (1400, 40), (8, 64), (30, 1)):
-            parts = [bytes([number]) * size for number in range(count)]
-            parts[-1] = parts[-1][: size // 2]
-            cut = [(socket.IPPROTO_UDP, UDP_SEGMENT, struct.pack("=H", size))]
-            client.sendmsg([b"".join(parts)], cut)
-            sent += parts
-        one.settle(len(sent))
-        assert one.report().forward.counters.received == len(sent)
-        expected = [data for number, data in enumerate(sent) if number % 3]
-        assert [data for data, _ in drain(server)] == expected
 
 
 class _CountOnly:

@@ -19,15 +19,14 @@ from prometheus_client import Metric
 from prometheus_client.metrics_core import GaugeMetricFamily
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as prometheus_families
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from noack.core.errors import CallerError, ExitStatus
 from noack.runtime.address import Address
 from noack.runtime.command_line import LogFormat, failed, log_event, log_format, print_to_stderr
 from noack.runtime.connections import connection_gate
 from noack.runtime.connections import metrics_server as servers
 from noack.runtime.connections.metrics_server import metrics_server
+from tests.command_line import invoke
 
 Object = dict[str, Any]
 
@@ -79,7 +78,7 @@ def test_an_event_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_mistake_is_an_object() -> None:
-    done = CliRunner().invoke(app, ["run", "nowhere", "--log-format", "jsonl"])
+    done = invoke("run", "nowhere", "--log-format", "jsonl")
     (found,) = objects(done.stderr)
     assert (done.exit_code, found["level"]) == (2, "error")
     assert found["message"].startswith("nowhere: no such file")

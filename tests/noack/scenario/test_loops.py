@@ -1,5 +1,6 @@
 """The loops of a scenario, also of files of their own: what they inherit and what they draw."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from noack.core.errors import CallerError
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario, loop_names, loops_of, phases_ns
 from noack.scenario.scenario_file import load, toml_text, validate
+from tests.approved import compare_lines, lines_of_error
 
 
 def with_loops(content: dict[str, Any], *loops: dict[str, Any]) -> Scenario:
@@ -139,24 +141,13 @@ def test_files_that_the_file_names_are_beside_it(content: dict[str, Any], tmp_pa
         assert len(trigger.sha256) == 64
 
 
-@pytest.mark.parametrize(
-    ("name", "other", "message"),
-    [
-        ("lane_folowing", {}, "nor a shipped scenario; did you mean lane_following?"),
-        ("", {}, 'scenario = "": no such file, nor a shipped scenario'),
-        ("parts/other.toml", {"loops": [{"name": "c"}]},
-         'loops.0.scenario = "parts/other.toml": that file has loops itself'),
-        ("parts/other.toml", {"plant": {"initial_state": [1.0, 2.0]}},
-         "run.toml: loops.0.plant.initial_state: expected 1 entries (one per state), found 2"),
-        ("parts/other.toml", {"trigger": {"policy": "periodic", "perod_s": 0.1}},
-         "other.toml: trigger.perod_s = 0.1: unknown key; did you mean period_s?"),
-    ],
-)  # fmt: skip
-def test_a_mistake_in_a_loops_file_is_named(
-    content: dict[str, Any], tmp_path: Path, name: str, other: dict[str, Any], message: str
+def test_a_mistake_in_a_loops_file_gives_the_approved_lines(
+    content: dict[str, Any], tmp_path: Path
 ) -> None:
-    write(tmp_path, "parts/other.toml", OTHER | other)
-    run = write(tmp_path, "run.toml", content | {"loops": [{"name": "b", "scenario": name}]})
-    with pytest.raises(CallerError) as refused:
-        load(run)
-    assert message in str(refused.value)
+    def mistake(line: str) -> list[str]:
+        name, other = json.loads(line)
+        write(tmp_path, "parts/other.toml", OTHER | other)
+        run = write(tmp_path, "run.toml", content | {"loops": [{"name": "b", "scenario": name}]})
+        return lines_of_error(lambda: load(run), FOLDER=tmp_path)
+
+    compare_lines(Path(__file__).with_name("loop_mistakes.txt"), mistake)

@@ -26,6 +26,7 @@ from noack.protocol.wire_format import datagram_bytes
 from noack.scenario.link_load import link_loads, load_warnings, require_capacity, update_delay
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
+from tests.approved import compare_lines, lines_of_error
 from tests.netem.feature_examples import IMPAIRED, keeps_loss, names_file
 from tests.oracles.link import Datagram, Link
 
@@ -106,27 +107,15 @@ def test_a_mistake_in_a_trace_gets_one_line(
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "jitter_s", "content", "says"),
-    [
-        ("t", 0.0, None, "cannot be read: No such file or directory"),
-        ("t", 0.0, "0.01\nslow\n", "line 2: slow: expected one delay, e.g. 0.0125 or 12.5ms"),
-        ("t", 0.0, "0.01\n1h\n", "line 2: 1h: expected one delay"),
-        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; expected 2 to 1000000"),
-        ("t", 0.0, "0.01\n4000\n", "has a delay beyond 3600 s"),
-        ("t", 0.001, "0.01\n0.02\n", "observed delays are taken as they are, and have no jitter"),
-        ("t.dist", 0.0, "1 2 3", "a distribution table is scaled by the jitter, which is 0"),
-        ("t.dist", 0.001, "1 2\n0.5", "line 2: 0.5: expected whole numbers, 8192 for 1"),
-    ],
-)
-def test_a_mistake_in_a_delay_file_gets_one_line(
-    name: str, jitter_s: float, content: str | None, says: str, tmp_path: Path
-) -> None:
-    if content is not None:
-        (tmp_path / name).write_text(content)
-    with pytest.raises(CallerError) as caught:
-        read_delay(tmp_path, jitter_s=jitter_s, file=name)
-    assert str(caught.value).startswith(f"{name}: {says}")
+def test_a_mistake_in_a_delay_file_gives_the_approved_line(tmp_path: Path) -> None:
+    def mistake(line: str) -> list[str]:
+        name, jitter_s, content = json.loads(line)
+        (tmp_path / name).unlink(missing_ok=True)
+        if content is not None:
+            (tmp_path / name).write_text(content)
+        return lines_of_error(lambda: read_delay(tmp_path, jitter_s=jitter_s, file=name))
+
+    compare_lines(Path(__file__).with_name("delay_mistakes.txt"), mistake)
 
 
 # --- what loops need of a bottleneck --------------------------------------------------------------

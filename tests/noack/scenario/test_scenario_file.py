@@ -1,5 +1,6 @@
 """Every mistake in a scenario gives one line; a file is checked before it is parsed."""
 
+import json
 import os
 import re
 import subprocess
@@ -21,6 +22,7 @@ from noack.scenario.resolution import resolve, resolved_loops
 from noack.scenario.scenario_file import dumps, load, put, validate, value_of
 from noack.settings.section import ScenarioSection
 from noack.settings.user_files import NamedFile
+from tests.approved import compare_lines
 
 SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
 Content = dict[str, Any]
@@ -100,65 +102,21 @@ def test_the_lines_about_mistakes_are_those_that_were_approved(tmp_path: Path) -
     assert "\n".join(found) + "\n" == page.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        (["trigger.beta=-1"], ["--set trigger.beta = -1: should be greater than 0"]),
-        (["network.loss={model='bernoulli'}"], ["--set network.loss.probability: missing "]),
-        (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
-        (["trigger.beta=1"], ["FILE: name = 1: "]),  # the settings themselves are valid
-        # The file alone is valid, but not with these settings.
-        (["model.A=[[1]]"], ['FILE with --set model.A: model.name = "lane_following": ']),
-        (
-            ["horizon_s=3", 'network.loss.model="gilbert_elliott"', "network.mansd=9"],
-            ["FILE with --set network.loss.model: network.loss.probability = 0.8: unknown key; "],
-        ),
-        (["mode=zoh", "observer.kind=kalman"], ["FILE with --set observer.kind: observer."]),
-        (["trigger.beta"], ["--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"]),
-        (["trigger.beta.x=1"], ["--set trigger.beta.x=1: trigger.beta is not a table"]),
-        (['mode="zoh'], ["--set mode: not valid TOML: Unterminated string (at end of document)"]),
-        (
-            ["plant.initial_state.4=1"],
-            ["--set plant.initial_state.4=1: plant.initial_state has the entries 0 to 3, not 4"],
-        ),
-    ],
-)
-def test_an_error_in_a_setting_is_not_attributed_to_the_file(
-    settings: list[str], expected: list[str], tmp_path: Path
-) -> None:
-    name = "1" if expected[0].startswith("FILE: ") else '"lane"'
-    text = LANE.replace('name = "lane"', f"name = {name}", 1)
-    lines = mistakes_with(text, tmp_path, settings)
-    assert len(lines) == len(expected)
-    for line, begins in zip(lines, expected, strict=True):
-        assert line.startswith(begins), line
+def test_a_mistake_in_a_setting_is_not_attributed_to_the_file(tmp_path: Path) -> None:
+    def about(line: str) -> list[str]:
+        return mistakes_with(LANE, tmp_path, line.split(" & "))
+
+    compare_lines(Path(__file__).with_name("setting_mistakes.txt"), about)
+    wrong = LANE.replace('name = "lane"', "name = 1", 1)
+    (line,) = mistakes_with(wrong, tmp_path, ["trigger.beta=1"])  # this setting is valid
+    assert line.startswith("FILE: name = 1: ")
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("name = \n", "Invalid value (at line 1, column 8)"),
-        (
-            "[trigger]\nbeta = 1\nnorm = '='\nbeta = 2\n",
-            "line 4: trigger.beta is already defined in line 2",
-        ),
-        (
-            "[model]\nA = [\n  [1.0],  # [\n]\nB = 1\nA = [\n  [2.0],\n]\n",
-            "line 6: model.A is already defined in line 2",
-        ),
-        ("[trigger]\nbeta = 1\n[trigger]\n", "line 3: trigger is already defined in line 1"),
-        (
-            "[[loops]]\na = 1\n[[loops]]\na = 1\na = 2",
-            "line 5: loops.a is already defined in line 4",
-        ),
-        ("loss = { model = 'a', model = 'b' }", "line 1: loss.model is defined twice"),
-        ("x = [{ a = 1 },\n{ b = 1, b.c = 2 }]", "line 1: x is a table with a key twice"),
-    ],
-)
-def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: Path) -> None:
-    (line,) = mistakes_with(text, tmp_path, ())
-    assert line.startswith("FILE: not valid TOML: ")
-    assert says in line
+def test_invalid_toml_is_reported_with_its_line(tmp_path: Path) -> None:
+    compare_lines(
+        Path(__file__).with_name("toml_mistakes.txt"),
+        lambda text: mistakes_with(json.loads(text), tmp_path, ()),
+    )
 
 
 def test_a_setting_names_an_entry_of_a_list(tmp_path: Path) -> None:
@@ -244,6 +202,7 @@ LIMITED = """
 import resource, sys
 from pathlib import Path
 from noack.scenario.toml_file import read
+from tests.approved import compare_lines
 from noack.core.errors import CallerError
 usage = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 limit = usage + 64 * 2**20

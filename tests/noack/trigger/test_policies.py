@@ -29,6 +29,7 @@ from noack.trigger.deadline import DeadlineSettings
 from noack.trigger.lyapunov import LyapunovSettings
 from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_rule import TriggerDecision, TriggerRule, fill_rule, rule_rows
+from tests.approved import lines_of_error
 from tests.oracles.trigger_rules import Trigger
 from tests.trigger_rules import TABLES, drawn, rule_from
 
@@ -220,10 +221,8 @@ def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path)
     ],
 )  # fmt: skip
 def test_a_mistake_in_the_class_gives_one_line(tmp_path: Path, code: str, expected: str) -> None:
-    with pytest.raises(CallerError) as refused:
-        simulate(scenario(tmp_path, code))
-    assert str(refused.value).startswith(f'trigger.name = "Delta": {expected}')
-    assert "\n" not in str(refused.value)
+    (line,) = lines_of_error(lambda: simulate(scenario(tmp_path, code)))
+    assert line.startswith(f'trigger.name = "Delta": {expected}')
 
 
 def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:

@@ -13,20 +13,19 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from typer.testing import CliRunner
 
 from cosim.analysis.adversary import Worst
 from cosim.analysis.adversary.loop_flows import evaluate
 from cosim.analysis.adversary.objective import Objective, measure_of
 from cosim.analysis.adversary.pattern_search import PatternSearch, search_tree
 from cosim.analysis.adversary.worst_pattern_search import find_worst as find_any
-from cosim.cli import app
 from noack.core.errors import ExitStatus
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
+from tests.command_line import invoke
 from tests.cosim.analysis.adversary.scenarios import every_run, flow_of, scenarios, simulate
 
 MANY = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
@@ -176,7 +175,7 @@ SCENARIO = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
 
 
 def run(*arguments: str) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, ["adversary", str(SCENARIO), "--horizon", "6", *arguments])
+    result = invoke("adversary", SCENARIO, "--horizon", "6", *arguments)
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -206,7 +205,7 @@ def test_a_bound_of_zero_is_searched(start: str) -> None:
     ]  # fmt: skip
     words = [word for one in settings if not one.endswith("=") for word in ("--set", one)]
     arguments = ["adversary", "double_integrator", "--horizon", "0.5", "--nodes", "100"]
-    done = CliRunner().invoke(app, [*arguments, *words, "--json"])
+    done = invoke(*arguments, *words, "--json")
     assert done.exit_code == ExitStatus.OK, done.output
     for worst in json.loads(done.stdout)["worst"].values():
         assert worst["tightness"] is None or worst["tightness"] <= 1 + 1e-9

@@ -12,14 +12,13 @@ import pytest
 from mcap.reader import make_reader
 from pyarrow import csv
 from scipy.io import loadmat
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
 from cosim.output.export.mat_export import save_mat
 from cosim.output.viewer.rerun_program import start_rerun
 from noack.core.errors import CallerError
 from noack.scenario.scenario import phases_ns
+from tests.command_line import invoke
 
 SCENARIO: dict[str, Any] = {
     "horizon_s": 1.0, "changes": [{"at_s": 0.5, "set": {"trigger.beta": 0.05}}],
@@ -144,7 +143,7 @@ def test_several_loops_have_their_names(loops: noack.Run, tmp_path: Path) -> Non
 
 def test_csv_files_have_the_tables(run: noack.Run, tmp_path: Path) -> None:
     words = ["export", str(run.directory), "--format", "csv", "--out", str(tmp_path / "csv")]
-    done = CliRunner().invoke(app, [*words, "--json"])
+    done = invoke(*words, "--json")
     assert done.exit_code == 0, done.output
     names = {Path(file).stem for file in json.loads(done.stdout)["files"]}
     assert names == {*run.tables, "samples", "events"}

@@ -1,8 +1,6 @@
 import contextlib
 import http.client
-import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -414,15 +412,6 @@ T_NS = 4_244_000_000
 def summary_at(at_s: float | None) -> str:
     scenario = resolve(load(find_shipped("double_integrator", "scenarios"), ["horizon_s=0.1"]))
     return summary_of(simulate(scenario), sup_e_c_at_s=at_s).model_dump_json()
-
-
-def test_the_page_sets_the_viewers_time_and_pauses_it() -> None:
-    """The request is a ``SetTimeCursor`` (6): timeline (2), time (3), paused (5)."""
-    found = re.search(rb"Uint8Array\((\[[^]]*\])\)", script_to_open_at(T_NS))
-    assert found is not None
-    timeline, time = b"\x0a\x01t", b"\x08" + bytes.fromhex("809ad9e70f")
-    cursor = b"\x12\x03" + timeline + b"\x1a\x06" + time + b"\x28\x01"
-    assert bytes(json.loads(found[1])) == b"\x32\x0f" + cursor
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,12 @@ from typing import Any
 import pytest
 import tomli_w
 from click.testing import Result
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, grid
 from cosim.studies.campaign.campaign_workers import alone
 from cosim.studies.campaign.chunk_store import Store, run_campaign
+from tests.command_line import invoke
 
 Write = Callable[..., Path]
 Command = Callable[..., Result]
@@ -83,7 +82,7 @@ def run_command(tmp_path: Path) -> Command:
 
     def run(path: Path, *words: str) -> Result:
         options = ("--workers", "1", "--out", str(tmp_path / "out"))
-        return CliRunner().invoke(app, ["campaign", str(path), *options, *words])
+        return invoke("campaign", path, *options, *words)
 
     return run
 

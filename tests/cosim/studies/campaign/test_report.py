@@ -36,7 +36,6 @@ from cosim.studies.campaign.metrics import (
     interval_ranks,
     measured,
 )
-from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
@@ -44,6 +43,7 @@ from noack.scenario.scenario_file import load as load_scenario
 from noack.scenario.scenario_file import validate
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify
+from tests.approved import compare_lines, lines_of_error
 from tests.cosim.studies.campaign.conftest import Command, Few, Write, few_of
 
 ROOT = Path(__file__).parents[4]
@@ -237,25 +237,13 @@ def test_the_least_favourable_grid_point_counts_unless_it_is_left_out(
     assert judged(write, plan, fewer, np.full(4, 9.0)).verdict == "confirmed"
 
 
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        ({"holds": ["transmissions"]}, "write a condition as A < B or A > B"),
-        ({"holds": ["events @ ZOH > 1"]}, "events @ ZOH: should be a number or one of"),
-        ({"holds": ["transmissions @ PB > 1"]}, "no such value; policy has MB, ZOH"),
-        ({"axis": None}, "axis: give an axis, and a value of it after each metric, or neither"),
-        ({"axis": "polic"}, "no such axis"),
-        ({"where": {"beta": 0.2}}, "no such value; beta has 0.1, 0.3"),
-    ],
-)
-def test_a_mistake_is_one_line(
-    write: Write, plan: dict[str, Any], changed: dict[str, Any], expected: str
-) -> None:
-    claim = {key: value for key, value in (MORE | changed).items() if value is not None}
-    with pytest.raises(CallerError) as found:
-        load(write(plan | {"claims": [claim]}))
-    assert "\n" not in str(found.value)
-    assert expected in str(found.value)
+def test_a_mistake_in_a_claim_gives_the_approved_line(write: Write, plan: dict[str, Any]) -> None:
+    def mistake(changed: str) -> list[str]:
+        claim = {key: value for key, value in (MORE | json.loads(changed)).items() if value}
+        file = write(plan | {"claims": [claim]})
+        return lines_of_error(lambda: load(file), FILE=file)
+
+    compare_lines(Path(__file__).with_name("claim_mistakes.txt"), mistake)
 
 
 def test_the_interval_of_a_mean_is_the_textbooks() -> None:

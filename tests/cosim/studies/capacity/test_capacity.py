@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.campaign_summary import summarise
 from cosim.studies.campaign.campaign_workers import alone
@@ -26,6 +24,7 @@ from cosim.studies.capacity.capacity_result import (
 )
 from noack.protocol.record_tables import Fate
 from noack.scenario.scenario_file import load
+from tests.command_line import invoke
 
 FILE = Path(__file__).parents[4] / "scenarios" / "shared_bottleneck.toml"
 PERIOD_S = 0.1
@@ -109,7 +108,7 @@ def test_the_guarantee_is_used_up_by_a_burst_with_a_full_queue() -> None:
 
 
 def capacity(*words: str) -> Result:
-    return CliRunner().invoke(app, ["capacity", *words])
+    return invoke("capacity", *words)
 
 
 def test_the_default_answers_for_the_shipped_mixture_and_says_how_long_it_takes(

@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
-from typer.testing import CliRunner
 
-from cosim.cli import app
 from cosim.simulation.continuous import run_continuous
 from cosim.simulation.exact_simulation import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
@@ -34,6 +32,7 @@ from noack.scenario.scenario_file import dumps, load
 from noack.theory.certificates.conditions import ideal_conditions
 from noack.theory.certificates.scenario_certificates import certify_box
 from tests.approved import compare_lines
+from tests.command_line import invoke
 from tests.cosim.studies.design.conftest import LIMITS
 
 ONE = """
@@ -69,13 +68,13 @@ def run_design(tmp_path: Path) -> Design:
     def run(scenario: Path, *words: str) -> Result:
         defaults = ("--settling", "9", "--quantile", "0.5", "--draws", "20", "--weights",
                     "identity", "--page", str(tmp_path / "p.html"))  # fmt: skip
-        return CliRunner().invoke(app, ["design", str(scenario), *defaults, *words])
+        return invoke("design", scenario, *defaults, *words)
 
     return run
 
 
 def paper_certificate(path: Path) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["certify", str(path), "--json"])
+    result = invoke("certify", path, "--json")
     assert result.exit_code == 0
     found = json.loads(result.stdout)["certificates"]
     return [one for one in found if one["under"] == "paper"][-1]
@@ -98,7 +97,7 @@ def test_check_and_certify_accept_the_written_scenario(
     A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     K = lqr_gain(A, B, np.eye(2), np.array([[2.0 * scale]]))
     np.testing.assert_array_equal(best["K"], K)
-    checked = CliRunner().invoke(app, ["check", str(out), "--json"])
+    checked = invoke("check", out, "--json")
     assert checked.exit_code == 0
     scenario = json.loads(checked.stdout)
     assert scenario["model"]["gain"] == best["K"]

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from typer.testing import CliRunner
 
-from cosim.cli import app, command
+from cosim.cli import command
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.paper import paper_page
@@ -23,6 +22,7 @@ from cosim.studies.paper.paper_evidence import (
 from cosim.studies.paper.paper_page import _rounded, render
 from noack.scenario.named_models import lane_following
 from noack.scenario.resolution import loop_of
+from tests.command_line import invoke
 
 ROOT = Path(__file__).parents[4]
 CAMPAIGN = ROOT / "campaigns" / "paper.toml"
@@ -174,7 +174,7 @@ def test_the_command_runs_the_campaign_and_writes_the_page(
     monkeypatch.setattr(command, "DEFAULT_RUNS", tmp_path / "runs")
     # test_evidence.py computes it
     monkeypatch.setattr(paper_page, "evidence", lambda *_: COMMITTED["evidence"])
-    done = CliRunner().invoke(app, ["paper", "--draws", "5", "--out", str(tmp_path), "--json"])
+    done = invoke("paper", "--draws", "5", "--out", tmp_path, "--json")
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout)
     assert report["draws"] == 5
@@ -189,5 +189,5 @@ def test_a_folder_that_cannot_be_written_gives_one_line_before_any_simulation(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "file").touch()
-    blocked = CliRunner().invoke(app, ["paper", "--out", str(tmp_path / "file")])
+    blocked = invoke("paper", "--out", tmp_path / "file")
     assert (blocked.exit_code, blocked.stderr.count("\n")) == (1, 1)

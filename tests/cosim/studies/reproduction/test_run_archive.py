@@ -12,13 +12,12 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
 import noack
-from cosim.cli import app
 from cosim.studies.run_archive import MANIFEST, write_archive
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import OWNER
+from tests.command_line import invoke
 
 PLANT = """\
 class Lag:
@@ -110,7 +109,7 @@ def test_what_differs_is_named(archive: Path, tmp_path: Path) -> None:
     changed = {"scenario.toml": scenario, "environment.json": json.dumps(environment).encode()}
     path = write(tmp_path / "b.zip", checked(files | changed))
     words = ["reproduce", str(path), "--into", str(tmp_path / "i")]
-    done = CliRunner().invoke(app, [*words, "--json"])
+    done = invoke(*words, "--json")
     assert done.exit_code == 1, done.output
     found = json.loads(done.stdout)
     assert not found["bit_exact"]
@@ -118,9 +117,9 @@ def test_what_differs_is_named(archive: Path, tmp_path: Path) -> None:
     assert found["changes"][0].startswith("numpy was 1.0, is ")
     assert "transmissions" in [row[0] for row in found["numbers"]]
     assert (tmp_path / "i/archived/summary.json").is_file()
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    done = CliRunner().invoke(app, ["reproduce", str(path)])
+    done = invoke("reproduce", path)
     assert "not reproduced" in done.stdout
 
 
@@ -234,7 +233,7 @@ HOSTILE: dict[str, tuple[Callable[[Files, Path], Path], str]] = {
 def test_a_hostile_archive_gives_one_line(case: str, archive: Path, tmp_path: Path) -> None:
     make, message = HOSTILE[case]
     path = make(files_of(archive), tmp_path / "b.zip")
-    done = CliRunner().invoke(app, ["reproduce", str(path), "--into", str(tmp_path / "into")])
+    done = invoke("reproduce", path, "--into", tmp_path / "into")
     assert done.exit_code == 2, done.output
     assert done.stderr.startswith(f"noack: {path}: ")
     assert message in done.stderr

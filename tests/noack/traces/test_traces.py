@@ -1,0 +1,393 @@
+"""Packet traces from CSV, IRTT and captures; wrong files; relative delays of other clocks."""
+
+import gzip
+import io
+import json
+import random
+import struct
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from noack.core.errors import CallerError
+from noack.impairments.kinds.replay import Replay
+from noack.protocol.probe_format import ProbeDatagram, ProbeKind, encode_probe
+from noack.traces.capture_packets import CapturedFlow, captured_packets, find_udp
+from noack.traces.capture_trace import CaptureOptions, SequenceField, read_captures
+from noack.traces.irtt_trace import read_irtt
+from noack.traces.packet_trace import (
+    MAX_PACKETS,
+    PacketTrace,
+    envelope_slope,
+    packet_trace,
+    relative_delays,
+)
+from noack.traces.trace_formats import read_trace
+from tests.approved import compare_lines, lines_of_error
+from tests.oracles.capture_files import LINKS, Sent, pcap_of, pcapng_of
+
+
+def test_units_order_and_lost_packets(tmp_path: Path) -> None:
+    file = tmp_path / "trace.csv"
+    file.write_text(
+        "\ufeffsent_s, note,received_us,sequence\r\n"
+        "1700000000.123456789,a,1700000000123457.9994,12\r\n\r\n"
+        '1700000000.1,"b, c",,10\r\n'
+        "17000000009e-1,x,1.7000000009e15,17\r\n"
+        "1700000000.5,x,-1.0,16\r\n"
+    )
+    trace = read_trace(file)
+    assert trace.sequence.tolist() == [10, 11, 12, 13, 14, 15, 16, 17]
+    assert trace.sent_ns.tolist() == [
+        0, 11_728_394, 23_456_789, 117_592_591, 211_728_394, 305_864_197, 400_000_000, 8 * 10**8,
+    ]  # fmt: skip
+    assert trace.received_ns.tolist() == [-1, -1, 23_457_999, -1, -1, -1, -1, 8 * 10**8]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 10**15), st.integers(-1, 10**15)), min_size=1, max_size=20),
+    st.data(),
+)
+def test_any_records_are_read_exactly(records: list[tuple[int, int]], data: st.DataObject) -> None:
+    numbers = sorted(
+        data.draw(st.sets(st.integers(0, 60), min_size=len(records), max_size=len(records)))
+    )
+    sent = sorted(time_ns for time_ns, _ in records)
+    received = [
+        -1 if delay < 0 else at + delay for at, (_, delay) in zip(sent, records, strict=True)
+    ]
+    order = data.draw(st.permutations(range(len(records))))
+    columns = (np.array(column)[list(order)] for column in (sent, received, numbers))
+    sent_ns, received_ns, sequence = columns
+    trace = packet_trace(sent_ns, received_ns, received_ns < 0, sequence)
+    known = dict(zip(numbers, zip(sent, received, strict=True), strict=True))
+    assert trace.sequence.tolist() == list(range(numbers[0], numbers[-1] + 1))
+    assert (np.diff(trace.sent_ns) >= 0).all()
+    for number, at, until in zip(trace.sequence, trace.sent_ns, trace.received_ns, strict=True):
+        if number in known:
+            assert at == known[number][0] - sent[0]
+            assert until == (-1 if known[number][1] < 0 else known[number][1] - sent[0])
+        else:
+            a = max(one for one in numbers if one < number)
+            b = min(one for one in numbers if one > number)
+            share = Fraction(int(number) - a, b - a)
+            exact = known[a][0] + share * (known[b][0] - known[a][0]) - sent[0]
+            assert until == -1
+            assert 0 <= exact - int(at) < 1
+
+
+def test_a_wrong_file_gives_the_approved_line(tmp_path: Path) -> None:
+    file = tmp_path / "trace.csv"
+
+    def refusal(content: str) -> list[str]:
+        file.write_text(content)
+        return lines_of_error(lambda: read_trace(file), FILE=file)
+
+    compare_lines(
+        Path(__file__).with_name("wrong_traces.txt"), lambda text: refusal(json.loads(text))
+    )
+    for begin, long in (('"', "1\n" * 100_000), ("", "1" * 100_000)):
+        (line,) = refusal(f"sent_ms,received_ms\n{begin}{long}")
+        assert len(line) < 160
+
+
+PERIOD_NS = 20_000_000
+
+
+def measured(count: int, drift_ppm: float, step_ns: int = 0) -> PacketTrace:
+    """Return a trace of two clocks with this drift and a step at three fifths of it."""
+    rng = np.random.default_rng(3)
+    sent = np.arange(count) * PERIOD_NS
+    delay = 5e6 + rng.exponential(2e6, count) + np.where(rng.random(count) < 0.01, 1e9, 0)
+    shift = np.where(np.arange(count) >= 0.6 * count, step_ns, 0)
+    received = sent + delay + drift_ppm * 1e-6 * sent + shift - 10**12
+    lost = rng.random(count) < 0.1
+    return packet_trace(sent, received.astype(np.int64), lost, clocks_differ=True)
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=3, max_size=40))
+def test_the_envelope_is_the_optimum_of_a_linear_program(delays: list[int]) -> None:
+    t, y = np.arange(len(delays)) * 10, np.array(delays)
+    slope = envelope_slope(t, y)
+    points = np.column_stack((t, np.ones(len(t))))
+    best = linprog(-points.sum(axis=0), A_ub=points, b_ub=y, bounds=(None, None))
+    offset = (y - slope * t).min()
+    assert (y - slope * t - offset).sum() == pytest.approx(y.sum() + best.fun, rel=1e-6, abs=1e-3)
+
+
+@pytest.mark.parametrize("drift_ppm", [-80.0, 0.0, 35.0])
+def test_a_drift_is_found_and_removed(drift_ppm: float) -> None:
+    trace = relative_delays(measured(3000, drift_ppm))
+    (line,) = [line for line in trace.notes if "ppm" in line]
+    # 60 s; the envelope's ends lie within 0.1 ms above the smallest delay.
+    assert float(line.split()[4]) == pytest.approx(drift_ppm, abs=3)
+    delay_ns = trace.delay_ns[~trace.lost]
+    assert delay_ns.min() == 0
+    reference = measured(3000, 0).delay_ns[~trace.lost]
+    assert np.abs(delay_ns - reference).max() < 0.2e6
+
+
+@pytest.mark.parametrize("step_ns", [-200_000_000, 100_000_000])
+def test_a_step_of_a_clock_is_found(step_ns: int) -> None:
+    trace = relative_delays(measured(3000, 20, step_ns))
+    (line,) = [line for line in trace.notes if "a clock was set" in line]
+    assert float(line.split()[5]) == pytest.approx(step_ns / 1e6, abs=2)
+    assert 35 < float(line.split(" s: ")[0].split()[-1]) < 37
+    assert not any("ppm" in line for line in trace.notes)
+
+
+def test_an_unknown_name_of_a_trace_gets_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="rural: no such file, nor a shipped trace; there are"):
+        Replay(file="rural").without_files(tmp_path, "")
+
+
+def test_nothing_received() -> None:
+    trace = packet_trace(np.arange(3), np.zeros(3, np.int64), np.ones(3, bool))
+    assert relative_delays(trace).lost.all()
+
+
+COUNT = 700
+
+
+def document(count: int = COUNT) -> dict[str, Any]:
+    lost = {3: True, 5: "true_up", 6: "true_down", 7: "true_down"}
+    trips = []
+    for k in range(count):
+        send = {"wall": 1508180723502727340 + k, "monotonic": 1000 + k * 20_000_000}
+        receive = {} if k in lost else {"wall": 1, "monotonic": send["monotonic"] + 30_000_000 + k}
+        trips.append({
+            "seqno": k, "lost": lost.get(k, "false" if k % 2 else False),
+            "timestamps": {
+                "client": {"receive": receive, "send": send},
+                "server": {"receive": {}, "send": {}}, "late": False,
+            },
+            "delay": {}, "ipdv": {},
+        })  # fmt: skip
+    return {
+        "version": {"irtt": "0.9.0"}, "system_info": {"hostname": 'a "round_trips\\" host é'},
+        "stats": {"rtt": {"n": 1}}, "round_trips": trips,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("indent", [None, 4])
+@pytest.mark.parametrize("compress", [False, True])
+def test_round_trips_are_read(indent: int | None, compress: bool, tmp_path: Path) -> None:
+    data = json.dumps(document(), indent=indent, ensure_ascii=False).encode()
+    path = tmp_path / "irtt.json"
+    path.write_bytes(gzip.compress(data) if compress else data)
+    trace = read_trace(path)
+    assert np.flatnonzero(trace.lost).tolist() == [3, 5, 6, 7]
+    assert trace.sent_ns.tolist() == [k * 20_000_000 for k in range(COUNT)]
+    kept = [k for k in range(COUNT) if k not in (3, 5, 6, 7)]
+    assert trace.delay_ns[kept].tolist() == [30_000_000 + k for k in kept]
+    assert trace.notes[1:] == ("lost forward: 1", "lost in reverse: 2", "lost on an unknown way: 1")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("round_trips"), 'has no list "round_trips"'),
+        (lambda d: d["round_trips"][4].pop("seqno"), "round trip 5: expected seqno, lost"),
+        (lambda d: d["round_trips"][8].update(seqno=2**62), "round trip 9: has a number"),
+        (lambda d: d["round_trips"][8].update(seqno=7), "round trip 9: has a sequence number that"),
+        (lambda d: d["round_trips"][0].update(ipdv="x" * 200_000), "more than 65536 characters"),
+    ],
+)
+def test_wrong_documents(change: Any, message: str) -> None:
+    content = document(20)
+    content["system_info"] = {}
+    change(content)
+    with pytest.raises(ValueError, match=message):
+        read_irtt(io.BytesIO(json.dumps(content).encode()), MAX_PACKETS)
+
+
+def test_cut_and_damaged_files(tmp_path: Path) -> None:
+    data = json.dumps(document()).encode()
+    path = tmp_path / "irtt.json"
+    for wrong in (data[:-2000], gzip.compress(data)[:-2000], gzip.compress(data)[:40] + b"x" * 99):
+        path.write_bytes(wrong)
+        with pytest.raises(CallerError, match=r"ends within|cannot be decompressed"):
+            read_trace(path)
+
+
+# --- captures -------------------------------------------------------------------------------------
+
+T_NS, CAPTURE_PERIOD_NS = 1_700_000_000 * 10**9, 20_000_000
+AT_SERVER = {"source": "10.0.0.9", "source_port": 7000, "destination": "10.0.0.2", "interface": 1}
+
+
+def trace_of(*files: bytes, **options: object) -> PacketTrace:
+    return read_captures(list(map(io.BytesIO, files)), CaptureOptions(**options))  # type: ignore[arg-type]
+
+
+def network(count: int = 200, seed: int = 1) -> tuple[list[Sent], list[Sent], dict[int, int]]:
+    """Return what is sent and what arrives (lost, reordered, duplicated), and the delays."""
+    rng = random.Random(seed)
+    sent = [Sent(T_NS + k * CAPTURE_PERIOD_NS, struct.pack(">Q", k)) for k in range(count)]
+    delays = {
+        k: rng.randrange(5 * CAPTURE_PERIOD_NS) + 1 for k in range(count) if rng.random() > 0.3
+    }
+    arrived = [sent[k]._replace(t_ns=sent[k].t_ns + delay) for k, delay in delays.items()]
+    arrived += [one._replace(t_ns=one.t_ns + 10**9) for one in arrived[::7]]
+    return sent, sorted(arrived), delays
+
+
+def delays_in(trace: PacketTrace) -> dict[int, int]:
+    return {int(k): int(delay) for k, delay in enumerate(trace.delay_ns) if delay >= 0}
+
+
+@pytest.mark.parametrize("offset_ns", [0, 10**12, -(10**12)])
+def test_two_captures_give_the_losses_and_relative_delays(offset_ns: int) -> None:
+    sent, arrived, delays = network()
+    other = Sent(T_NS, b"other")._replace(destination_port=53)
+    shifted = [one._replace(t_ns=one.t_ns + offset_ns, **AT_SERVER) for one in arrived]
+    trace = trace_of(pcap_of(other, *sent), pcapng_of(*shifted))
+    smallest = min(delays.values())
+    assert delays_in(trace).keys() == delays.keys()
+    # The drift of so short a record is small against its delays, but not exactly 0.
+    for k, delay_ns in delays_in(trace).items():
+        assert abs(delay_ns - (delays[k] - smallest)) < 500e-6 * 200 * CAPTURE_PERIOD_NS + 2
+    assert any("--flow chooses" in line for line in trace.notes)
+    if offset_ns == 0:
+        assert (
+            delays_in(trace_of(pcap_of(*sent), pcapng_of(*shifted), clocks_differ=False)) == delays
+        )
+
+
+def test_one_capture_of_both_ends_is_matched_in_the_right_direction() -> None:
+    sent, arrived, delays = network()
+    forwarded = [one._replace(**AT_SERVER) for one in arrived]
+    # An echo with the same payloads goes back over both interfaces.
+    back = {"source": "198.51.100.7", "source_port": 6000, "destination": "192.0.2.1"}
+    echoes = [one._replace(t_ns=one.t_ns + 5, destination_port=5000, **back) for one in arrived]
+    trace = trace_of(pcapng_of(*sorted([*sent, *forwarded, *echoes])))
+    assert delays_in(trace) == delays
+
+
+def test_numbers_at_a_known_place_that_wrap_around() -> None:
+    period_ns = 20_000_137
+    arrivals = [
+        Sent(
+            T_NS + k * period_ns + (k % 10) * 10**6, b"xx" + struct.pack("<H", (65_500 + k) % 2**16)
+        )
+        for k in range(200) if k % 5
+    ]  # fmt: skip
+    arrivals[3], arrivals[4] = arrivals[4], arrivals[3]
+    trace = trace_of(
+        pcap_of(*arrivals, b_short := Sent(T_NS, b"")),
+        sequence_at=SequenceField.parse("2:2:little"),
+    )
+    assert b_short.payload == b""
+    lost = [k % 5 == 0 for k in range(1, 200)]
+    assert trace.lost.tolist() == lost
+    expected = np.array([(k % 10 - 1) * 10**6 for k in range(1, 200)])
+    assert np.abs(trace.delay_ns - expected)[~trace.lost].max() < 1000
+    assert "20.0001 ms" in " ".join(trace.notes)
+
+
+def probes(count: int) -> list[Sent]:
+    return [
+        Sent(
+            T_NS + k * CAPTURE_PERIOD_NS + k % 3,
+            encode_probe(
+                ProbeDatagram(
+                    ProbeKind.PROBE, 7, 0, k, k * CAPTURE_PERIOD_NS, 0, CAPTURE_PERIOD_NS, count
+                ),
+                150,
+            ),
+        )
+        for k in range(count)
+    ]
+
+
+def test_a_probe_captured_at_the_receiver_has_its_sending_times() -> None:
+    arrived = [one for k, one in enumerate(probes(100)) if k % 4]
+    end = Sent(
+        T_NS, encode_probe(ProbeDatagram(ProbeKind.END, 7, 0, 100, 0, 0, CAPTURE_PERIOD_NS, 100))
+    )
+    trace = trace_of(pcap_of(end, *arrived, end))
+    assert len(trace) == 99
+    assert trace.lost.tolist() == [k % 4 == 0 for k in range(1, 100)]
+    assert trace.delay_ns.max() <= 2
+
+
+def test_a_capture_of_the_sender_alone_is_refused() -> None:
+    with pytest.raises(ValueError, match="sender's end only"):
+        trace_of(pcapng_of(*(one._replace(direction=2) for one in probes(9))))
+
+
+def test_captures_that_do_not_say_what_was_lost() -> None:
+    sent, arrived, _ = network()
+    same = [one._replace(payload=b"same") for one in sent]
+    for files, message in (
+        ([pcap_of(*same), pcap_of(*arrived)], "199 of 200 datagrams have the payload of another"),
+        ([pcap_of(*sent), pcap_of(*same)], "none of the complete datagrams"),
+        ([pcap_of(*sent, snap_bytes=30)], "no datagrams of `noack measure`"),
+        ([pcap_of(*sent)], "has one end only"),
+        ([pcap_of()], "has no UDP datagrams"),
+        ([pcap_of(*sent, link_type=101)[:-3]], "has one end only"),
+        ([b"\n\r\r\n\0\0\0\0"], "has no UDP datagrams: the capture is cut off before the end"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            trace_of(*files)
+
+
+families = st.one_of(
+    *(
+        st.builds(
+            Sent,
+            t_ns=st.integers(0, 2**32 * 10**9 - 1),
+            payload=st.binary(max_size=30),
+            source=st.ip_addresses(v=version).map(str),
+            destination=st.ip_addresses(v=version).map(str),
+            source_port=st.integers(0, 65_535),
+            destination_port=st.integers(0, 65_535),
+            interface=st.just(0),
+            direction=st.just(0),
+        )
+        for version in (4, 6)
+    )
+)
+
+
+def read(data: bytes) -> list[tuple[int, CapturedFlow, bytes, bool]]:
+    found = []
+    for packet in captured_packets(io.BytesIO(data)):
+        datagram = find_udp(packet.interface, packet.link_type, packet.data)
+        assert datagram is not None
+        found.append((packet.t_ns, *datagram))
+    return found
+
+
+@given(
+    st.lists(families, max_size=4), st.sampled_from(LINKS), st.sampled_from("<>"),
+    st.integers(0, 2), st.sampled_from(["pcap", "micro", "pcapng"]),
+)  # fmt: skip
+def test_every_datagram_is_found_again(
+    sent: list[Sent], link_type: int, order: str, vlans: int, form: str
+) -> None:
+    if form == "pcapng":
+        data = pcapng_of(*sent, link_type=link_type, order=order, vlans=vlans)
+    else:
+        data = pcap_of(*sent, link_type=link_type, order=order, vlans=vlans, nano=form == "pcap")
+    for one, (t_ns, flow, payload, is_complete) in zip(sent, read(data), strict=True):
+        assert t_ns == (one.t_ns // 1000 * 1000 if form == "micro" else one.t_ns)
+        assert payload == one.payload
+        assert is_complete
+        source = f"[{one.source}]" if ":" in one.source else one.source
+        destination = f"[{one.destination}]" if ":" in one.destination else one.destination
+        assert str(flow) == (
+            f"{source}:{one.source_port} → {destination}:{one.destination_port} on interface 0"
+        )
+
+
+def test_a_block_that_is_too_short_is_named_in_plain_words() -> None:
+    section = bytes.fromhex("0a0d0d0a 1c000000 4d3c2b1a 0100 0000 ffffffffffffffff 1c000000")
+    with pytest.raises(ValueError, match=r"^after packet 0: a block is too short"):
+        list(captured_packets(io.BytesIO(section + bytes.fromhex("06000000 0c000000 0c000000"))))
