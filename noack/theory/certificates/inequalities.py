@@ -309,7 +309,7 @@ class ErrorInequalities:
             return _columns(0.0, gain, gain, 0.0, 0.0, 0.0)
         driven = [gain * size for size in own.driven]
         if own.longest_s > 0:
-            for place, kernel in enumerate(self._plant.driven.get(output, ())):
+            for place, kernel in enumerate(self._plant.driven[output]):
                 followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
                 driven[place] = np.minimum(driven[place], followed)
         return _columns(0.0, gain, gain, *driven)
