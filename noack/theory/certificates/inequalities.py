@@ -179,9 +179,9 @@ class ErrorInequalities:
 
     @property
     def methods(self) -> Sequence[BoundMethod]:
-        """The methods by which e_c can be bounded."""
+        """The methods by which e_c can be bounded; the first one is usually the tighter one."""
         if self._conditions.delay_s > 0 and self._error.decays:
-            return [*BoundMethod]
+            return [BoundMethod.DRIFTING, BoundMethod.MISSING]
         return [BoundMethod.MISSING]
 
     def constants(self, spacing_s: Vector, method: BoundMethod) -> LoopConstants:
