@@ -4,13 +4,16 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
+import numpy as np
+
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, Rows, as_html, as_text, number
 from noack.impairments.markov_chain import NotPredictableError
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
-from noack.theory.bounds.enclosure import NotDecayingError
+from noack.theory.bounds.enclosure import NotDecayingError, norm_bounds, response
+from noack.theory.bounds.gains import error_gains, sum_of_sups
 from noack.theory.certificates.assumptions import assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
 from noack.theory.certificates.conditions import (
@@ -58,6 +61,7 @@ class Certificates:
         scenario: the resolved scenario.
         late_periods: allowed lateness in steps of the plant.
         weight: W, if noack chose it.
+        given: W of the scenario, if it has one and noack chose another.
 
     Raises:
         CallerError: its updates are acknowledged, its plant or controller is nonlinear, or its
@@ -79,7 +83,13 @@ class Certificates:
     the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
     unpredictable: str | None
 
-    def __init__(self, scenario: Scenario, late_periods: int, weight: Matrix | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        late_periods: int,
+        weight: Matrix | None = None,
+        given: Matrix | None = None,
+    ) -> None:
         scenario.coverage.require_constant()
         scenario.coverage.require_certifiable()
         self.setpoint, void = scenario.controller.setpoint, void_at_setpoint(scenario)
@@ -96,6 +106,7 @@ class Certificates:
             for under, of in conditions.items()
             for scope in self._scopes
         ]
+        self._given = np.eye(loop_of(scenario).n) if given is None else given
         self.theorem_2 = _theorem_2(scenario, self.paper)
         self.unlimited, self.unpredictable = self._unlimited()
 
@@ -121,6 +132,23 @@ class Certificates:
     def schedule_box(self) -> ScenarioCertificate | None:
         """For every plant in the box, under the scenario's schedule; None if there is no box."""
         return next(iter(self._of(SCHEDULE)[1:]), None)
+
+    @property
+    def error_in_given_norm(self) -> float | None:
+        """Bound of ‖e_c‖ in the scenario's own norm V, while the trigger uses the chosen W.
+
+        It is that for the schedule, in units of its threshold: errors of events are bounded in the
+        trigger's norm, and followed from there by ‖V e^{(H+αI)τ} W^{−1}‖. None if W is the
+        scenario's own, if there is no certificate, and under disturbances.
+        """
+        found = self.schedule.constants
+        if self.weight is None or found is None or self.schedule.persistent_constants is not None:
+            return None
+        error = error_gains(loop_of(self.scenario), found.rate_per_s)
+        kernel = response(error.scaled_H, error.inverse_weight).through(self._given)
+        now = float(norm_bounds(self._given, error.inverse_weight[None])[0])
+        missing = sum_of_sups(kernel, found.missing_events, found.inter_event_s or 0.0)
+        return min(now * found.delta, (now + float(missing)) * found.overshoot)
 
     @property
     def limits(self) -> NetworkLimits:
@@ -153,6 +181,7 @@ class Certificates:
             "scenario": self.scenario.name,
             "setpoint": self.setpoint,
             "weight": None if self.weight is None else self.weight.tolist(),
+            "error_in_given_norm": self.error_in_given_norm,
             "paper": {
                 "assumptions": [a._asdict() for a in assumptions(self.scenario)],
                 "theorem_2": None if self.theorem_2 is None else self.theorem_2._asdict(),
@@ -256,7 +285,8 @@ def certificates_of(
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, allowed, progress)
-    return Certificates(weighted, allowed, W)
+    given = getattr(resolved.trigger, "weight", None)
+    return Certificates(weighted, allowed, W, None if given is None else np.array(given))
 
 
 def in_chosen_norm(

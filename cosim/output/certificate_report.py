@@ -49,7 +49,7 @@ def print_certificates(
         console.print(sentence, markup=False, highlight=False)
     exists = found.schedule.constants is not None
     if found.weight is not None and exists:
-        _print_weight(console, found.weight)
+        _print_weight(console, found, found.weight)
     if not exists and chosen is None:
         console.print(
             "[yellow]no certificate for the schedule[/], nor in another norm: raise "
@@ -59,10 +59,17 @@ def print_certificates(
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")
         console.print(terminal_table(next(certificate_tables(chosen))))
-        _print_weight(console, chosen.weight)
+        _print_weight(console, chosen, chosen.weight)
 
 
-def _print_weight(console: Console, weight: Matrix) -> None:
+def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:
+    if (bound := chosen.error_in_given_norm) is not None:
+        level = chosen.schedule.level
+        console.print(
+            f"In your norm, with the chosen one in the trigger: ‖e_c‖ ≤ {bound:.4g} {level} "
+            "for the schedule, the scenario's plant",
+            markup=False, highlight=False,
+        )  # fmt: skip
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
     console.print(
         f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",

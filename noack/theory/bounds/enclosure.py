@@ -137,9 +137,10 @@ def take_rows(values: Stack, places: NDArray[np.intp]) -> Stack:
     return np.take_along_axis(values, places, axis=-1)
 
 
-def constant_kernel(value: float) -> KernelBounds:
-    """Return the kernel of a constant response."""
-    values, tail = np.full(1, value), np.array(value)
+def constant_kernel(value: float | Stack) -> KernelBounds:
+    """Return the kernel of a constant response, (…)."""
+    tail = np.asarray(value, dtype=np.float64)
+    values = tail[..., None]
     return KernelBounds(
         np.array([0.0, 1.0]), values, values, tail, np.array(math.inf), np.array(0.0)
     )

@@ -33,6 +33,7 @@ from noack.core.linear_systems import (
     spectral_abscissa,
 )
 from noack.scenario.resolution import LoopMatrices
+from noack.theory.bounds.contraction import spectral_norm
 from noack.theory.bounds.enclosure import (
     KernelBounds,
     Outputs,
@@ -46,6 +47,7 @@ from noack.theory.bounds.enclosure import (
 )
 
 Counts = NDArray[np.int64]
+_ROUNDING = 1 + 1e-9
 
 
 class NormalForcing(NamedTuple):
@@ -499,18 +501,20 @@ class PlantGains:
 
     @cached_property
     def driven(self) -> Mapping[Output, tuple[KernelBounds, KernelBounds]]:
-        """‖C e^{(H+αI)τ} B U‖ and ‖C e^{(H+αI)τ} L_E‖ for every output C e_c; none in a hold.
+        """‖C e^{(H+αI)τ} B U‖ and ‖C e^{(H+αI)τ} L_E‖ for every output C e_c.
 
         Raises:
             NotDecayingError: α is not below the decay rate of e^{Hτ}.
         """
         error, columns = self.error, self.columns
-        if not error.scaled_H.any():
-            return {}
-        by_input, mismatched = (
-            response(error.scaled_H, driven).through_each(error.stacked)
-            for driven in (columns.input_error, columns.mismatch)
-        )
+
+        def kernels(driven: Matrix) -> Mapping[Output, KernelBounds]:
+            if error.scaled_H.any():
+                return response(error.scaled_H, driven).through_each(error.stacked)
+            norms = {C: spectral_norm(M @ driven) * _ROUNDING for C, M in error.outputs.items()}
+            return {output: constant_kernel(norm) for output, norm in norms.items()}
+
+        by_input, mismatched = kernels(columns.input_error), kernels(columns.mismatch)
         return {output: (by_input[output], mismatched[output]) for output in error.outputs}
 
     @cached_method

@@ -179,9 +179,9 @@ class ErrorInequalities:
 
     @property
     def methods(self) -> Sequence[BoundMethod]:
-        """The methods by which e_c can be bounded."""
+        """The methods by which e_c can be bounded; the first one is usually the tighter one."""
         if self._conditions.delay_s > 0 and self._error.decays:
-            return [*BoundMethod]
+            return [BoundMethod.DRIFTING, BoundMethod.MISSING]
         return [BoundMethod.MISSING]
 
     def constants(self, spacing_s: Vector, method: BoundMethod) -> LoopConstants:
@@ -309,7 +309,7 @@ class ErrorInequalities:
             return _columns(0.0, gain, gain, 0.0, 0.0, 0.0)
         driven = [gain * size for size in own.driven]
         if own.longest_s > 0:
-            for place, kernel in enumerate(self._plant.driven.get(output, ())):
+            for place, kernel in enumerate(self._plant.driven[output]):
                 followed = own.longest_s * sum_of_sups(kernel, events, spacing_s)
                 driven[place] = np.minimum(driven[place], followed)
         return _columns(0.0, gain, gain, *driven)

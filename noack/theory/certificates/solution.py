@@ -229,7 +229,7 @@ def _longest_s(
 
 
 class _Smallest(NamedTuple):
-    """The constants of all parts of several loops, with the method that bounds x tighter."""
+    """The constants of all parts of several loops, with the first method that has a certificate."""
 
     parts: Sequence[LoopConstants]
     drifts: NDArray[np.bool_]
@@ -258,11 +258,10 @@ class _Smallest(NamedTuple):
 
 
 def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smallest:
-    """Return the constants of all parts with the method for e_c that bounds x tighter."""
+    """Return the constants of all parts with the first method for e_c that has a certificate."""
     none = np.full(len(spacing_s), np.inf)
     best = _Smallest((), none > 0, none < 0, none, spacing_s > 0)
-    sizes = none
-    for method in BoundMethod:
+    for method in steps[0].methods:
         if not all(method in step.methods for step in steps):
             continue
         parts = [step.constants(spacing_s, method) for step in steps]
@@ -270,17 +269,17 @@ def _smallest(steps: Sequence[ErrorInequalities], spacing_s: Vector) -> _Smalles
         for part in parts:
             gain = np.where(exists & ~part.exists, part.loop_gain, gain)
             exists = exists & part.exists
-        size = np.where(exists, sum(part.state for part in parts), np.inf)
-        better = exists & ((size < sizes) | ~best.exists)
-        drifts = np.where(better, method is BoundMethod.DRIFTING, best.drifts)
+        is_new = exists & ~best.exists
+        drifts = np.where(is_new, method is BoundMethod.DRIFTING, best.drifts)
         if best.parts:
             parts = [
-                LoopConstants(*(np.where(better, *pair) for pair in zip(one, other, strict=True)))
+                LoopConstants(*(np.where(is_new, *pair) for pair in zip(one, other, strict=True)))
                 for one, other in zip(parts, best.parts, strict=True)
             ]
-        sizes = np.where(better, size, sizes)
-        gain = np.where(better | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
+        gain = np.where(is_new | best.exists, best.loop_gain, np.minimum(gain, best.loop_gain))
         best = best._replace(
             parts=parts, drifts=drifts, exists=best.exists | exists, loop_gain=gain
         )
+        if best.exists.all():
+            break
     return best

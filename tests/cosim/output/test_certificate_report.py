@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from cosim.analysis.certificates import (
     Certificates,
@@ -95,6 +96,15 @@ def test_the_chosen_weight_makes_the_model_contract_and_keeps_the_volume() -> No
         constants(one.paper) for one in (weighted, certificates_of(loaded, late_periods=0))
     )
     assert better.delta <= 5.0
+    # In the Euclidean norm: an event's error, at most β in the chosen one, followed by e^{Hτ}.
+    found, G = constants(weighted.schedule), loop_of(weighted.scenario).H + 0.25 * np.eye(2)
+    assert found.inter_event_s is not None
+    gains = [np.linalg.norm(expm(G * t) @ np.linalg.inv(W), 2) for t in np.arange(0.0, 20.0, 0.01)]
+    ages = [int(100 * found.inter_event_s * j) for j in range(found.missing_events)]
+    followed = found.overshoot * (gains[0] + sum(max(gains[age:]) for age in ages))
+    expected = min(followed, gains[0] * found.delta)
+    assert weighted.error_in_given_norm == pytest.approx(expected, rel=1e-2)
+    assert certificates_of(loaded, late_periods=0).error_in_given_norm is None
     assert better.inter_event_s >= plain.inter_event_s
 
 
@@ -226,7 +236,7 @@ WRONG_SIGN = "model.gain=[[15.0, 5.0]]"
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["reactor_petc"], "loop gain of the errors"),
+        (["lane_periodic"], "loop gain of the errors"),
         (
             ["unstable_pendulum", f"--set={WRONG_SIGN}", "--set=model.allow_unstable=true"],
             "the loop's u is +Kx, and −K would stabilise it",
@@ -241,14 +251,14 @@ def test_a_loop_without_any_certificate_has_the_reasons(words: list[str], reason
 
 
 def test_a_norm_with_certificates_is_found_and_can_be_pasted() -> None:
-    """At 100 Hz the lane has no certificate in the paper's norm."""
-    slow = ["--set=plant.rate_hz=100", "--set=controller.rate_hz=100"]
+    """At 62.5 Hz the lane has no certificate in the paper's norm."""
+    slow = ["--set=plant.rate_hz=62.5", "--set=controller.rate_hz=62.5"]
     shown = invoke("certify", "lane_following", *slow).stdout
     pasted = shown[shown.index("\nweight = [") :].splitlines()[1:]
     rows = "".join(line.strip() for line in pasted)
     weighted = certificates_of(
         load(ROOT / "scenarios/lane_following.toml",
-             ["plant.rate_hz=100", "controller.rate_hz=100", f"trigger.{rows}"])
+             ["plant.rate_hz=62.5", "controller.rate_hz=62.5", f"trigger.{rows}"])
     )  # fmt: skip
     assert weighted.schedule.constants is not None
     words = ["certify", "lane_following", *slow, "--json"]
