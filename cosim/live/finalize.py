@@ -95,7 +95,7 @@ def finalize(
         helpers.start()
         with work_bar("the record of the run") as show:
             each = partial(helpers.each, show=show)
-            run = finish_record(run_dir, each) if unfinished else load_run(run_dir)
+            run = finish_record(run_dir, each, helpers.early) if unfinished else load_run(run_dir)
         summary, over_time = _judged(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
@@ -210,7 +210,8 @@ def _steps(run: RecordedRun) -> int:
 def _blocks(run: RecordedRun) -> Iterator[range]:
     """Yield the loops that are judged together: as many as fit into memory, at the end fewer."""
     loops, first = len(run.loops), 0
-    most = min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1))
+    # A power of 2, as in the row groups of early tables.
+    most = 2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1)).bit_length() - 1)
     while first < loops:
         width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), most, loops - first)
         yield range(first, first + width)
