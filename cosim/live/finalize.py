@@ -14,7 +14,12 @@ from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, clai
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
+from cosim.analysis.network_summary import (
+    LoopOverTime,
+    loop_over_time,
+    summarise_run,
+    worst_loop,
+)
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
@@ -105,7 +110,10 @@ def finalize(
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
                 require_viewer()
                 if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
-                    helpers.call(_record_stored, run_dir, summary, over_time)
+                    # The worst loop is the only one whose summary is shown.
+                    worst = [summary.loops[worst_loop(summary.loops).number]]
+                    brief = summary.model_copy(update={"loops": worst})
+                    helpers.call(_record_stored, run_dir, brief, over_time)
                 else:
                     _write_recording(run, summary, run_dir, None, over_time)
         if report:
@@ -431,7 +439,12 @@ def import_libraries() -> None:
     import cosim.record.table_files  # imports pyarrow
 
     if is_installed():
+        import matplotlib.figure  # noqa: F401  # for the map of many loops
+        import pyarrow as pa
+
         import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
+
+        pa.array(np.zeros(1))  # the first one looks for pandas
 
 
 def _write_recording(
