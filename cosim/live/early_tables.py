@@ -16,16 +16,13 @@ import numpy as np
 
 from cosim.live.process_pool import be_idle
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
-from cosim.record.run_directory import SCENARIO_FILE
-from cosim.record.run_record import vector_names
+from cosim.record.run_record import scenarios_of, vector_names
 from cosim.record.spool_conversion import spool_parts
 from cosim.record.table_files import table_writer
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import RECORDER
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.resolution import has_loop, run_tables
-from noack.scenario.scenario import loop_names
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 _SLICE_BYTES = 32 * 1024 * 1024
 _MOST_SLICES = 32
@@ -43,29 +40,30 @@ def write_early(run_dir: Path) -> Mapping[str, int]:
         ValueError: rows of a loop are not in order, or a table is long.
         OSError: a file cannot be read or written.
     """
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    folder, names, loops = (
-        run_dir / SPOOL / EARLY,
-        vector_names(scenario),
-        len(loop_names(scenario)),
-    )
-    ended = folder / EARLY_ENDED
-    folder.mkdir()
+    ended = run_dir / SPOOL / EARLY / EARLY_ENDED
     with ExitStack() as stack:
-        tables: list[_EarlyTable] = []
-        for table, dtype in run_tables(scenario).items():
-            spool = run_dir / SPOOL / f"{table}.{RECORDER}"
-            if has_loop(table) and spool.exists():
-                path = folder / f"{table}.parquet"
-                write = stack.enter_context(table_writer(path, dtype, names))
-                tables.append(_EarlyTable(spool, dtype, loops, write))
         with ThreadPoolExecutor(1, initializer=be_idle) as thread:
+            tables = thread.submit(_opened, run_dir, stack).result()
             thread.submit(_follow, tables, ended).result()
         ended.unlink()
         for one in tables:
             while one.advance(ended=True):
                 pass
     return {one.table: one.bytes for one in tables}
+
+
+def _opened(run_dir: Path, stack: ExitStack) -> "list[_EarlyTable]":
+    """Open the tables of the loops, in a new folder."""
+    scenario, loops = scenarios_of(run_dir)
+    folder, names = run_dir / SPOOL / EARLY, vector_names(scenario)
+    folder.mkdir()
+    tables = []
+    for table, dtype in run_tables(scenario).items():
+        spool = run_dir / SPOOL / f"{table}.{RECORDER}"
+        if has_loop(table) and spool.exists():
+            file = table_writer(folder / f"{table}.parquet", dtype, names)
+            tables.append(_EarlyTable(spool, dtype, len(loops), stack.enter_context(file)))
+    return tables
 
 
 def _follow(tables: "Sequence[_EarlyTable]", ended: Path) -> None:

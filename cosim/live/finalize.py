@@ -49,15 +49,13 @@ from cosim.record.run_directory import (
     read_object,
     refuse_links,
 )
-from cosim.record.run_record import RecordedRun, RunRecord, load_run
+from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_of
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
-from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -95,7 +93,7 @@ def finalize(
         # A recorder that completed its recording writes the reports afterwards.
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
-        scenario = load(scenario_file, most_bytes=MOST_RECORDED_BYTES)
+        scenario, _ = scenarios_of(run_dir)
         helpers = stack.enter_context(closing(prepared or EndHelpers(scenario)))
         helpers.start()
         with work_bar("the record of the run") as show:
@@ -277,12 +275,7 @@ def _judged_loops(
 
 def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
     """Return what to expect of some loops of a run that may still go on."""
-    return _expectations(_stored_loops(run_dir)[block.start : block.stop])
-
-
-@cache
-def _stored_loops(run_dir: Path) -> Sequence[Scenario]:
-    return resolved_loops(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+    return _expectations(scenarios_of(run_dir)[1][block.start : block.stop])
 
 
 def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:

@@ -16,13 +16,14 @@ import numpy as np
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, Segment, joined
-from cosim.record.run_directory import RECORD, SCENARIO_FILE
+from cosim.record.run_directory import RECORD
 from cosim.record.run_record import (
     Notice,
     RecordedRun,
     load_run,
     read_notices,
     record_folder,
+    scenarios_of,
     vector_names,
 )
 from noack.core.errors import MachineError, PeerError, why
@@ -33,7 +34,6 @@ from noack.runtime.control_messages import LogLine, parse_message
 from noack.runtime.spool import EARLY, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
 from noack.scenario.resolution import has_loop, run_tables
 from noack.scenario.scenario import loop_names
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
     from cosim.record import table_files
@@ -143,7 +143,7 @@ def finish_record(
         MachineError: the record cannot be written; the spool is kept.
     """
     add_kept_reports(run_dir)
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    scenario, _ = scenarios_of(run_dir)
     sizes = {table: _bytes_of(run_dir, table) for table in run_tables(scenario)}
     ready = dict((early or {}).items() & sizes.items())
     tables = sorted(sizes.keys() - ready, key=sizes.__getitem__, reverse=True)
@@ -167,7 +167,7 @@ def convert_table(run_dir: Path, table: str) -> None:
     """
     from cosim.record.table_files import write_table  # imports pyarrow
 
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    scenario, _ = scenarios_of(run_dir)
     dtype = run_tables(scenario)[table]
     rows = _by_loop(run_dir, table, dtype, len(loop_names(scenario)))
     write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))
