@@ -39,7 +39,7 @@ from cosim.record.align import (
 )
 from cosim.record.run_events import NEVER_NS, PacketOutcome, changes_of, packet_outcomes
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, row_norms
+from noack.core.linear_systems import Matrix, all_entries, row_norms
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -367,7 +367,7 @@ class SampleFactsReader:
 
 def shares_update(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     """Return where sensor and controller share an update, and ‖e_c‖ is finite, (k,)."""
-    finite = np.isfinite(joined.e_c_norm) & np.isfinite(joined.x_s).all(axis=1)
+    finite = np.isfinite(joined.e_c_norm) & all_entries(np.isfinite(joined.x_s))
     return np.asarray(finite & in_common(scenario, joined))
 
 

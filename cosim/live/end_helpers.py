@@ -14,12 +14,13 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Thread
+from threading import Thread, current_thread
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from cosim.live.process_pool import at_idle_priority, process_starts, processes
+from cosim.live.process_pool import at_idle_priority, called, process_starts, processes
 from cosim.record.run_directory import RunEnding
 from noack.core.process_limits import cores
+from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
 from noack.scenario.scenario import Scenario, loop_names
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ _GRACE_S = 2.0
 """Wall time for what is being prepared when the run ends."""
 _LOOPS_AT_ONCE = 16
 """The end of a run waits for the preparation of so many loops at most."""
+_POLL_S = 0.005
 
 
 class EndHelpers:
@@ -52,6 +54,12 @@ class EndHelpers:
         self._due: deque[Callable[[], object]] = deque()
         """What is still to be prepared."""
         self._found: dict[int, Expectations] = {}
+        self._ended: Path | None = None
+        """Says that the run has ended to who writes tables; see ``cosim.live.early_tables``."""
+        self._writer: Thread | None = None
+        """Waits for them."""
+        self.early: Mapping[str, int] = {}
+        """The tables that are written, with the bytes of their spool."""
 
     def prepare(self, run_dir: Path) -> None:
         """Prepare the end of a run of many loops from now on."""
@@ -62,6 +70,7 @@ class EndHelpers:
             block = self._loops[first:][:_LOOPS_AT_ONCE]
             self._due.append(partial(self._prepare_loops, run_dir, block))
         self._due.append(lambda: self._idle("import_libraries"))
+        self._due.append(partial(self._write_early, run_dir))
         for _ in range(self.count):
             self._threads.append(Thread(target=self._prepare_all, daemon=True))
             self._threads[-1].start()
@@ -79,6 +88,18 @@ class EndHelpers:
         found = cast("Sequence[Expectations]", self._idle("expectations_of", run_dir, block))
         self._found |= zip(block, found, strict=True)
 
+    def _write_early(self, run_dir: Path) -> None:
+        self._ended, self._writer = run_dir / SPOOL / EARLY / EARLY_ENDED, current_thread()
+        written = self.submit(called, "cosim.live.early_tables", "write_early", run_dir).result()
+        self.early = cast("Mapping[str, int]", written)
+
+    @property
+    def _is_writing(self) -> bool:
+        """Whether a process writes the rest of the tables, no longer at idle priority."""
+        if self._ended is None or self._writer is None:
+            return False
+        return self._writer.is_alive() and not self._ended.exists()
+
     def _idle(self, function: str, *arguments: object) -> object:
         """Let a process call a function of the end of the run at idle priority."""
         return self.submit(at_idle_priority, "cosim.live.finalize", function, *arguments).result()
@@ -95,8 +116,13 @@ class EndHelpers:
         """
         self._due.clear()
         until_s = time.monotonic() + _GRACE_S
-        for thread in self._threads:
-            thread.join(max(until_s - time.monotonic(), 0.0))
+        with suppress(OSError):  # nobody writes tables, or not yet
+            if self._ended is not None:
+                self._ended.touch()
+        while any(thread.is_alive() for thread in self._threads):
+            if time.monotonic() > until_s and not self._is_writing:
+                break
+            time.sleep(_POLL_S)
         if any(thread.is_alive() for thread in self._threads):
             self._abort()
             for thread in self._threads:

@@ -14,7 +14,12 @@ from cosim.analysis.claims.claim_evaluation import RunClaims, certify_late, clai
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.loop_statistics import list_violations
-from cosim.analysis.network_summary import LoopOverTime, loop_over_time, summarise_run
+from cosim.analysis.network_summary import (
+    LoopOverTime,
+    loop_over_time,
+    summarise_run,
+    worst_loop,
+)
 from cosim.analysis.replay.machine_replay import SharedMachines
 from cosim.analysis.replay.run_replay import replay, stored_verdict
 from cosim.analysis.run_summary import Outcome, linearisation, summarise
@@ -44,15 +49,13 @@ from cosim.record.run_directory import (
     read_object,
     refuse_links,
 )
-from cosim.record.run_record import RecordedRun, RunRecord, load_run
+from cosim.record.run_record import RecordedRun, RunRecord, load_run, scenarios_of
 from cosim.record.spool_conversion import finish_record
 from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.core.file_access import write_whole
 from noack.core.process_limits import cores
 from noack.runtime.spool import SPOOL
-from noack.scenario.resolution import resolved_loops
 from noack.scenario.scenario import Scenario
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 from noack.theory.bounds.terms import NetworkConditions
 from noack.theory.certificates.assumptions import Assumption, assumptions
 from noack.theory.certificates.certified_bounds import ScenarioCertificate
@@ -90,12 +93,12 @@ def finalize(
         # A recorder that completed its recording writes the reports afterwards.
         is_shown = not unfinished or (run_dir / REPORTS_FILE).is_file()
         is_shown = is_shown and (run_dir / RECORDING_FILE).is_file()
-        scenario = load(scenario_file, most_bytes=MOST_RECORDED_BYTES)
+        scenario, _ = scenarios_of(run_dir)
         helpers = stack.enter_context(closing(prepared or EndHelpers(scenario)))
         helpers.start()
         with work_bar("the record of the run") as show:
             each = partial(helpers.each, show=show)
-            run = finish_record(run_dir, each) if unfinished else load_run(run_dir)
+            run = finish_record(run_dir, each, helpers.early) if unfinished else load_run(run_dir)
         summary, over_time = _judged(run, ending, helpers)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
@@ -105,7 +108,10 @@ def finalize(
             with _is_optional(run_dir / RECORDING_FILE), suppress(*quiet):
                 require_viewer()
                 if len(run.loops) > 1 and helpers.count:  # they have imported the viewer
-                    helpers.call(_record_stored, run_dir, summary, over_time)
+                    # The worst loop is the only one whose summary is shown.
+                    worst = [summary.loops[worst_loop(summary.loops).number]]
+                    brief = summary.model_copy(update={"loops": worst})
+                    helpers.call(_record_stored, run_dir, brief, over_time)
                 else:
                     _write_recording(run, summary, run_dir, None, over_time)
         if report:
@@ -210,7 +216,8 @@ def _steps(run: RecordedRun) -> int:
 def _blocks(run: RecordedRun) -> Iterator[range]:
     """Yield the loops that are judged together: as many as fit into memory, at the end fewer."""
     loops, first = len(run.loops), 0
-    most = min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1))
+    # A power of 2, as in the row groups of early tables.
+    most = 2 ** (min(_LOOPS_AT_ONCE, max(_ROWS_AT_ONCE // _steps(run), 1)).bit_length() - 1)
     while first < loops:
         width = min(max((loops - first) // (2 * cores()), _LEAST_LOOPS), most, loops - first)
         yield range(first, first + width)
@@ -268,12 +275,7 @@ def _judged_loops(
 
 def expectations_of(run_dir: Path, block: range) -> Sequence[Expectations]:
     """Return what to expect of some loops of a run that may still go on."""
-    return _expectations(_stored_loops(run_dir)[block.start : block.stop])
-
-
-@cache
-def _stored_loops(run_dir: Path) -> Sequence[Scenario]:
-    return resolved_loops(load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES))
+    return _expectations(scenarios_of(run_dir)[1][block.start : block.stop])
 
 
 def _expectations(scenarios: Sequence[Scenario]) -> Sequence[Expectations]:
@@ -430,7 +432,12 @@ def import_libraries() -> None:
     import cosim.record.table_files  # imports pyarrow
 
     if is_installed():
+        import matplotlib.figure  # noqa: F401  # for the map of many loops
+        import pyarrow as pa
+
         import cosim.output.viewer.run_recording  # noqa: F401  # imports rerun
+
+        pa.array(np.zeros(1))  # the first one looks for pandas
 
 
 def _write_recording(

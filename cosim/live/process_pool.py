@@ -82,15 +82,21 @@ def process_starts() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def at_idle_priority(module: str, function: str, *arguments: object) -> object:
-    """Import a module and call its function on a core that nothing else needs.
+def called(module: str, function: str, *arguments: object) -> object:
+    """Import a module and call its function; the caller need not import it."""
+    return getattr(import_module(module), function)(*arguments)
 
-    A thread does both: without permission of the system, it could not leave that priority again.
+
+def at_idle_priority(*call: object) -> object:
+    """Call a function by name, see :func:`called`, on a core that nothing else needs.
+
+    A thread does so: without permission of the system, it could not leave that priority again.
     """
-    with ThreadPoolExecutor(1, initializer=_be_idle) as thread:
-        return thread.submit(lambda: getattr(import_module(module), function)(*arguments)).result()
+    with ThreadPoolExecutor(1, initializer=be_idle) as thread:
+        return thread.submit(called, *call).result()  # type: ignore[arg-type]
 
 
-def _be_idle() -> None:
+def be_idle() -> None:
+    """Let this thread use a core that nothing else needs."""
     if sys.platform == "linux":
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

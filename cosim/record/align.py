@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from cosim.record.record_source import joined
 from cosim.record.run_events import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.core.linear_systems import ModelFlow, Propagator, row_norms
+from noack.core.linear_systems import (
+    ModelFlow,
+    Propagator,
+    all_entries,
+    largest_sizes,
+    row_norms,
+)
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -91,7 +97,7 @@ def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     """
     known = scenario.network.initial_sync == "known_state"
     first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * GENERATION)
-    return np.asarray(~np.isnan(joined.x_c).any(axis=1) & (joined.received >= first))
+    return np.asarray(all_entries(~np.isnan(joined.x_c)) & (joined.received >= first))
 
 
 def initial_track(scenario: Scenario) -> ControllerTrack:
@@ -207,6 +213,9 @@ def _at(
             x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
         return x_c, received
     propagate = flow.propagate
+    if not dt_ns.any():  # mostly: the controller's model is advanced to each of these times
+        x_c[known] = track.x_c[index[known]]
+        return x_c, received
     for step_ns in np.unique(dt_ns[known]):
         which = known & (dt_ns == step_ns)
         x_c[which] = propagate.rows(track.x_c[index[which]], int(step_ns))
@@ -305,7 +314,7 @@ def identity_residual(scenario: Scenario, aligned: AlignedRun, missed: Reals) ->
     """
     if scenario.protocol.acknowledges or not len(aligned.t_ns):
         return np.full(len(aligned.t_ns), np.nan)
-    residual = np.abs(aligned.x_c - aligned.x_s - missed).max(axis=1)
+    residual = largest_sizes(aligned.x_c - aligned.x_s - missed)
     return np.where(in_common(scenario, aligned), residual, np.nan)
 
 

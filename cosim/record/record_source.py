@@ -8,6 +8,7 @@ phase; its flows are numbered as if the loop were alone; and its inputs are numb
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -51,6 +52,13 @@ def joined(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     raw = np.dtype((np.void, dtype.itemsize))
     found = np.concatenate([np.zeros(0, raw), *(rows.view(raw) for rows in parts)])
     return found.view(dtype)
+
+
+def parts_by_loop(rows: Rows, numbers: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
+    """Yield consecutive rows of the same loop, with its number, from the number of each row."""
+    begins = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] + 1)).tolist()
+    for begin, end in pairwise([*begins, len(rows)]):
+        yield int(numbers[begin]), rows[begin:end]
 
 
 class RecordSource(ABC):

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
-from noack.core.linear_systems import Matrix, ModelFlow, Vector, row_norms
+from noack.core.linear_systems import Matrix, ModelFlow, Vector, all_entries, row_norms
 from noack.disturbances.step import StepDisturbance
 from noack.protocol.record_tables import (
     CONTROLLER_SETTING,
@@ -273,15 +273,14 @@ def divergence(
     peaks: list[tuple[float, float]] = []  # each ‖x‖ above all before, with its time
     place = 0
     for t_s, x in parts:
-        lost = np.flatnonzero(~np.isfinite(x).all(axis=1))
+        lost = np.flatnonzero(~all_entries(np.isfinite(x)))
         if len(lost):
             at_s = float(t_s[lost[0]])
             return Divergence(at_s, f"diverged: x is not finite at {at_s:g} s")
         norms = row_norms(x)
-        index = place + np.arange(len(norms))
-        early = float(norms[index < tenth].max(initial=early))
-        middle = float(norms[index < seventh].max(initial=middle))
-        last = float(norms[index >= ninth].max(initial=last))
+        early = float(norms[: max(tenth - place, 0)].max(initial=early))
+        middle = float(norms[: max(seventh - place, 0)].max(initial=middle))
+        last = float(norms[max(ninth - place, 0) :].max(initial=last))
         before = np.maximum.accumulate(np.append(highest, norms))
         above = np.flatnonzero(norms > before[:-1])
         peaks += zip(t_s[above].tolist(), norms[above].tolist(), strict=True)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, overload
 
@@ -334,10 +334,14 @@ class StoredLoops(Sequence[RunRecord]):
     """The loops of a run directory, each read when it is used."""
 
     def __init__(
-        self, run_dir: Path, network: RunRecord, stored: "table_files.StoredTables"
+        self,
+        run_dir: Path,
+        network: RunRecord,
+        stored: "table_files.StoredTables",
+        loops: Sequence[Scenario],
     ) -> None:
         self._kind, self._stored, self._scenario = network.kind, stored, network.scenario
-        self._loops, self._phases_ns = resolved_loops(network.scenario), phases_ns(network.scenario)
+        self._loops, self._phases_ns = loops, phases_ns(network.scenario)
         self._entries, self._notices = report_entries(run_dir), read_notices(run_dir / RECORD)
         self._newest: RunRecord | None = None
         """The loop that was used last."""
@@ -392,6 +396,22 @@ class StoredLoops(Sequence[RunRecord]):
         return NetworkRows(self._stored, self._phases_ns)
 
 
+def scenarios_of(run_dir: Path) -> tuple[Scenario, Sequence[Scenario]]:
+    """Return the scenario of a run directory, and that of each loop; those of the last one stay.
+
+    Raises:
+        CallerError: it cannot be read.
+    """
+    path = run_dir / SCENARIO_FILE
+    return _scenarios_of(path, path.stat().st_mtime_ns if path.exists() else 0)
+
+
+@lru_cache(maxsize=1)
+def _scenarios_of(path: Path, _changed_ns: int) -> tuple[Scenario, Sequence[Scenario]]:
+    scenario = load(path, most_bytes=MOST_RECORDED_BYTES)
+    return scenario, resolved_loops(scenario)
+
+
 def load_run(run_dir: Path) -> RecordedRun:
     """Read the record of a run directory.
 
@@ -406,14 +426,14 @@ def load_run(run_dir: Path) -> RecordedRun:
         raise CallerError(
             f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    scenario, loops = scenarios_of(run_dir)
     most_rows = _ROWS_PER_STEP * steps_of(scenario) + _MORE_ROWS
     stored = table_files.StoredTables(folder, run_tables(scenario), most_rows)
     reports, earlier = valid_reports(report_entries(run_dir), stored, network_tables())
     notices = [notice for notice in read_notices(folder) if LOOP not in notice]
     kind = kind_of(run_dir)
     network = RunRecord(scenario, stored, notices, reports, kind, earlier, roles=NETWORK_ROLES)
-    return RecordedRun(network, StoredLoops(run_dir, network, stored))
+    return RecordedRun(network, StoredLoops(run_dir, network, stored, loops))
 
 
 def load_record(run_dir: Path, loop: str | None = None) -> RunRecord:

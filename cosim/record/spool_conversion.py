@@ -7,7 +7,7 @@ merged in bounded memory; of several loops, as many are sorted at once as fit in
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,13 +16,14 @@ import numpy as np
 from cosim.lazy_modules import lazy_modules
 from cosim.record.processes import add_kept_reports
 from cosim.record.record_source import BATCH_ROWS, Rows, Segment, joined
-from cosim.record.run_directory import RECORD, SCENARIO_FILE
+from cosim.record.run_directory import RECORD
 from cosim.record.run_record import (
     Notice,
     RecordedRun,
     load_run,
     read_notices,
     record_folder,
+    scenarios_of,
     vector_names,
 )
 from noack.core.errors import MachineError, PeerError, why
@@ -30,10 +31,9 @@ from noack.core.file_access import remove_folder
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.control_messages import LogLine, parse_message
-from noack.runtime.spool import SPOOL, batch_bytes, batches_in, spool_files, stored_lines
+from noack.runtime.spool import EARLY, SPOOL, batch_bytes, batches_in, spool_files, stored_lines
 from noack.scenario.resolution import has_loop, run_tables
 from noack.scenario.scenario import loop_names
-from noack.scenario.scenario_file import MOST_RECORDED_BYTES, load
 
 with lazy_modules():  # pyarrow takes 0.1 s: a run does not wait for it
     from cosim.record import table_files
@@ -44,16 +44,19 @@ _SEGMENT_BYTES = 1024 * 1024
 def spool_segments(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Segment]:
     """Yield the segments of a table in a spool."""
     for path in spool_files(spool, table):
-        for begin, end, rows in _parts(path, dtype):
+        for begin, end, rows in spool_parts(path, dtype):
             if len(rows):
                 read = partial(_read, path, begin, end, dtype)
                 yield Segment(int(rows["input"].min()), int(rows["input"].max()), read)
 
 
-def _parts(
+def spool_parts(
     path: Path, dtype: np.dtype[np.void], begin: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, Rows]]:
-    """Yield begin, end and rows of consecutive batches of a file, about a segment at a time."""
+    """Yield begin, end and rows of consecutive batches of a file, about a segment at a time.
+
+    The last one may be incomplete: it is left out.
+    """
     with path.open("rb", buffering=0) as file:
         end = file.seek(0, os.SEEK_END) if end is None else end
         while begin < end:
@@ -73,7 +76,7 @@ def _parts(
 
 
 def _read(path: Path, begin: int, end: int, dtype: np.dtype[np.void]) -> Rows:
-    return joined([rows for _, _, rows in _parts(path, dtype, begin, end)], dtype)
+    return joined([rows for _, _, rows in spool_parts(path, dtype, begin, end)], dtype)
 
 
 def merged(segments: Iterable[Segment], dtype: np.dtype[np.void]) -> Iterator[Rows]:
@@ -123,22 +126,32 @@ _BLOCK_BYTES = 32 * 1024 * 1024
 Each = Callable[[Callable[[str], None], Sequence[str]], Iterable[None]]
 
 
-def finish_record(run_dir: Path, each: Each = map) -> RecordedRun:
+def finish_record(
+    run_dir: Path, each: Each = map, early: Mapping[str, int] | None = None
+) -> RecordedRun:
     """Convert a run's spool to its record, and remove the spool.
 
     All spools are merged, without duplicate rows. An interrupted attempt can be repeated.
-    ``each(function, tables)`` calls a function for each table, the largest first; several
-    processes may do so at once.
+
+    Args:
+        run_dir: the run directory.
+        each: ``each(function, tables)`` calls a function for each table, the largest first; several
+            processes may do so at once.
+        early: the tables that are in Parquet files of the spool, with the bytes of their spool.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
     add_kept_reports(run_dir)
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
-    tables = sorted(run_tables(scenario), key=partial(_bytes_of, run_dir), reverse=True)
+    scenario, _ = scenarios_of(run_dir)
+    sizes = {table: _bytes_of(run_dir, table) for table in run_tables(scenario)}
+    ready = dict((early or {}).items() & sizes.items())
+    tables = sorted(sizes.keys() - ready, key=sizes.__getitem__, reverse=True)
     notices = _notices(run_dir / RECORD, run_dir / SPOOL, len(loop_names(scenario)))
     try:
         with record_folder(run_dir / RECORD, notices):
+            for file in [f"{table}.parquet" for table in ready]:
+                (run_dir / SPOOL / EARLY / file).replace(run_dir / RECORD / file)
             [*each(partial(convert_table, run_dir), tables)]
     except OSError as error:
         raise _kept(run_dir, error) from None
@@ -154,7 +167,7 @@ def convert_table(run_dir: Path, table: str) -> None:
     """
     from cosim.record.table_files import write_table  # imports pyarrow
 
-    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
+    scenario, _ = scenarios_of(run_dir)
     dtype = run_tables(scenario)[table]
     rows = _by_loop(run_dir, table, dtype, len(loop_names(scenario)))
     write_table(run_dir / RECORD / f"{table}.parquet", rows, dtype, vector_names(scenario))

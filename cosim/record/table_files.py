@@ -5,9 +5,10 @@ them.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from cosim.record.record_source import (
     Segment,
     joined,
     packed,
+    parts_by_loop,
     with_columns,
 )
 from noack.core.cached_method import cached_method
@@ -64,8 +66,8 @@ class StoredTables(RecordSource):
             table: TableFile(folder / f"{table}.parquet", dtype, most_rows)
             for table, dtype in types.items()
         }
-        self._newest: dict[str, tuple[int, Rows]] = {}
-        """The group of several loops that was read last, by table."""
+        self._newest: dict[str, dict[int, Rows]] = {}
+        """The groups of several loops that were read last, by table and place."""
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
@@ -81,12 +83,16 @@ class StoredTables(RecordSource):
             return
         groups = self._groups_with(table, number, number)
         alone = [place for place, is_alone in groups.items() if is_alone]
-        own = self._files[table].batches(dtype, alone)
+        own, known = self._files[table].batches(dtype, alone), self._newest.pop(table, {})
+        # The loops are usually read in turn: the next one is in the same groups.
+        newest = self._newest[table] = {one: known[one] for one in groups if one in known}
         for place, is_alone in groups.items():
             if is_alone:
                 yield next(own)
             else:
-                rows = self._mixed(table, place)
+                if place not in newest:
+                    (newest[place],) = self._files[table].batches(groups=[place])
+                rows = newest[place]
                 yield packed(rows.compress(rows[LOOP] == number), dtype)
 
     def of_loops(
@@ -94,28 +100,35 @@ class StoredTables(RecordSource):
     ) -> Iterator[tuple[int, Rows]]:
         """Yield place and rows of each of some loops, as rows of its type; a group is read once."""
         within = [*self._groups_with(table, loops[0], loops[-1])]
-        own = self._files[table].batches(with_columns(self.types[table], (LOOP,)), within)
-        numbers = np.concatenate([np.zeros(0, np.int64), *(rows[LOOP] for rows in own)])
-        in_order = bool((np.diff(numbers) >= 0).all())  # otherwise damaged
         for dtype in dict.fromkeys(types):
-            rows = joined([*self._files[table].batches(dtype, within)], dtype)
-            for place in [place for place, own in enumerate(types) if own == dtype]:
-                if in_order:
-                    begin, end = np.searchsorted(numbers, (loops[place], loops[place] + 1))
-                    yield place, rows[begin:end]
-                else:
-                    yield place, rows.compress(numbers == loops[place])
+            found: dict[int, list[Rows]] = {
+                number: [] for number, own in zip(loops, types, strict=True) if own == dtype
+            }
+            own = self._files[table].batches(with_columns(self.types[table], (LOOP,)), within)
+            for numbers, rows in zip(own, self._files[table].batches(dtype, within), strict=True):
+                for number, part in parts_by_loop(rows, numbers[LOOP]):
+                    if number in found:
+                        found[number].append(part)
+            for number, parts in found.items():
+                yield loops.index(number), joined(parts, dtype)
 
     def count_of_loop(self, table: str, number: int) -> int:
         """Return the number of rows of a loop; of a table without loops, of all rows."""
         if LOOP not in (self.types[table].names or ()):
             return self.count(table)
-        return sum(
-            self._files[table].groups[place].rows
-            if is_alone
-            else int((self._mixed(table, place)[LOOP] == number).sum())
-            for place, is_alone in self._groups_with(table, number, number).items()
-        )
+        return int(self._counts_of_loops(table)[number])
+
+    @cached_method
+    def _counts_of_loops(self, table: str) -> NDArray[np.int64]:
+        """Return the number of rows of each loop, by its number."""
+        counts, groups = np.zeros(MAX_LOOPS + 1, np.int64), self._files[table].groups
+        for group in groups:
+            counts[group.first] += group.rows * (group.first == group.last)
+        mixed = [place for place, group in enumerate(groups) if group.first != group.last]
+        dtype = with_columns(self.types[table], (LOOP,))
+        for rows in self._files[table].batches(dtype, mixed):
+            counts += np.bincount(rows[LOOP], minlength=len(counts))
+        return counts
 
     def _groups_with(self, table: str, first: int, last: int) -> dict[int, bool]:
         """Return the groups that may have rows of some loops: whether they have those of one."""
@@ -124,14 +137,6 @@ class StoredTables(RecordSource):
             for place, group in enumerate(self._files[table].groups)
             if group.first <= last and first <= group.last
         }
-
-    def _mixed(self, table: str, place: int) -> Rows:
-        """Read a group with rows of several loops; the loops are usually read in turn."""
-        newest, rows = self._newest.get(table, (-1, None))
-        if newest != place or rows is None:
-            (rows,) = self._files[table].batches(groups=[place])
-            self._newest[table] = place, rows
-        return rows
 
     @cached_method
     def highest_input(self, table: str) -> int:
@@ -200,13 +205,18 @@ class TableFile:
                 yield self._rows(file, group, self._dtype if dtype is None else dtype)
 
     def whole(self) -> pa.Table:
-        """Return the table as it is, with all columns of the file."""
+        """Return the table, loop after loop, with all columns of the file."""
         with self._open() as file:
             table = file.read()
             table.validate(full=True)
         for column, _ in _columns(self._dtype):
             _require_whole(self._path, column, table.column(column))
-        return table
+        in_turn = all(one.last <= after.first for one, after in pairwise(self.groups))
+        if in_turn or LOOP not in table.column_names:
+            return table
+        table = table.combine_chunks()
+        numbers = _values(self._path, LOOP, table[LOOP], self._dtype[LOOP])
+        return table.take(_array(np.argsort(numbers, kind="stable")))
 
     def segments(self) -> Iterator[Segment]:
         """Yield the groups as segments."""
@@ -250,10 +260,11 @@ def _group(group: Any, places: Mapping[str, int]) -> _Group:
     return _Group(group.num_rows, int(loops.min), int(loops.max), highest)
 
 
-def write_table(
-    path: Path, batches: Iterable[Rows], dtype: RowType, names: Mapping[str, Sequence[str]]
-) -> None:
-    """Write a table's file from batches of rows, those of each loop in turn.
+@contextmanager
+def table_writer(
+    path: Path, dtype: RowType, names: Mapping[str, Sequence[str]]
+) -> Iterator[Callable[[Rows], None]]:
+    """Write a table's file group by group, with what is yielded; it appears at the end.
 
     ``names`` are those of states and inputs, if they are the same in all loops.
 
@@ -271,8 +282,20 @@ def write_table(
         new_file(path, make_folder=False) as file,
         pq.ParquetWriter(file, schema, column_encoding=encodings, **options) as writer,
     ):
+        yield lambda rows: writer.write_table(pa.table(_arrays(rows), schema=schema))
+
+
+def write_table(
+    path: Path, batches: Iterable[Rows], dtype: RowType, names: Mapping[str, Sequence[str]]
+) -> None:
+    """Write a table's file from batches of rows, those of each loop in turn.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with table_writer(path, dtype, names) as write:
         for rows in _regrouped(batches, dtype):
-            writer.write_table(pa.table(_arrays(rows), schema=schema))
+            write(rows)
 
 
 def arrow_table(rows: Rows) -> pa.Table:

@@ -35,6 +35,7 @@ from cosim.analysis.claims.observed_conditions import (
 from cosim.record.run_events import updates_in
 from cosim.record.run_record import Rows, RunRecord
 from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import largest_sizes
 from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CLOCK_TABLES,
@@ -167,7 +168,7 @@ class Inputs:
     def steps(self, rows: Rows) -> None:
         """Add rows of the plant's steps."""
         with np.errstate(invalid="ignore"):
-            sizes = np.abs(rows["u"]).max(axis=1)
+            sizes = largest_sizes(rows["u"])
         # The age of an input that was predicted counts from the time that it is for.
         ahead_ns = np.zeros(len(rows), np.int64)
         if "entry" in (rows.dtype.names or ()):

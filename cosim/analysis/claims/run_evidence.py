@@ -44,7 +44,7 @@ from cosim.record.align import (
     identity_residual,
 )
 from cosim.record.run_record import RunRecord
-from noack.core.linear_systems import Matrix, Propagator, row_norms, spectral_abscissa
+from noack.core.linear_systems import Matrix, Propagator, all_entries, row_norms, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE
 from noack.protocol.topology import LOOP_ROLES
 from noack.scenario.scenario import Scenario
@@ -119,7 +119,7 @@ class Samples:
         """Where the plant's own state is known, (k,)."""
         if self.true_x is self.joined.x:
             return np.ones(len(self.true_x), dtype=bool)
-        return np.asarray(np.isfinite(self.true_x).all(axis=1))
+        return np.asarray(all_entries(np.isfinite(self.true_x)))
 
 
 @dataclass(eq=False)

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from cosim.lab.chart import data_options
 
 import noack
 from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import Shown, exploration_figure
-from cosim.lab.chart import data_options
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.core.errors import CallerError

@@ -1,7 +1,7 @@
 """The records of a live run of several loops, from a spool with the rows of a simulated one."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -11,15 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cosim.live.early_tables import write_early
 from cosim.record.run_directory import REPORTS_FILE, write_environment, write_scenario
 from cosim.record.run_record import RecordedRun, Rows, load_run
 from cosim.record.spool_conversion import Segment, finish_record, merged
-from cosim.record.table_files import StoredTables, write_table
+from cosim.record.table_files import StoredTables, TableFile, write_table
 from cosim.simulation.virtual_time import simulate_loops
 from noack.core.errors import MachineError
 from noack.protocol.machine_interface import Notice
 from noack.protocol.record_tables import LOOP, NETEM_PACKET, PLANT_STEP
-from noack.runtime.spool import SPOOL, SpoolWriter, notices_of
+from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL, SpoolWriter, notices_of
 from noack.scenario.resolution import network_tables, run_tables
 from noack.scenario.scenario_file import validate
 
@@ -70,13 +71,23 @@ def spool(run_dir: Path, table: str, rows: Rows, *, writer: str = "recorder") ->
     out.close()
 
 
-def same_rows(run_dir: Path, shared: RecordedRun) -> None:
-    found = finish_record(run_dir)
+def same_rows(
+    run_dir: Path, shared: RecordedRun, early: Mapping[str, int] | None = None
+) -> list[str]:
+    """Finish a record and compare its rows; return the tables that were still to be written."""
+    written: list[str] = []
+
+    def each(function: Callable[[str], None], tables: Sequence[str]) -> Iterable[None]:
+        written.extend(tables)
+        return map(function, tables)
+
+    found = finish_record(run_dir, each, early)
     for record, expected in zip(
         (found.network, *load_run(run_dir).loops), (shared.network, *shared.loops), strict=True
     ):
         for table in expected.tables:
             assert record[table].tobytes() == expected[table].tobytes(), table
+    return written
 
 
 def opened(shared: RecordedRun, run_dir: Path) -> Path:
@@ -130,6 +141,49 @@ def test_an_interrupted_attempt_is_repeated_and_later_rows_are_added(
     for table, found in later.items():  # a process that was frozen spools its rows after the end
         spool(run_dir, table, found, writer="frozen")
     same_rows(run_dir, shared)
+
+
+@pytest.mark.parametrize("kind", ["in order", "a batch twice", "rows afterwards"])
+def test_tables_written_during_the_run_have_the_same_rows(
+    shared: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    run_dir, rows = opened(shared, tmp_path / "run"), mixed_rows(shared)
+    out, batches = SpoolWriter(run_dir / SPOOL, "recorder"), iter(range(0, 350, 50))
+    out.prepare(rows)
+
+    def more(_: float) -> None:
+        """Spool what comes while the writer waits, and then say that the run has ended."""
+        if (first := next(batches, None)) is None:
+            (run_dir / SPOOL / EARLY / EARLY_ENDED).touch()
+            return
+        until = 10**6 if first == 300 and kind != "rows afterwards" else first + 50
+        for table, found in rows.items():
+            for _ in range(1 + (kind == "a batch twice" and first == 200)):
+                out.append(table, first, found[first:until].tobytes())
+
+    monkeypatch.setattr("cosim.live.early_tables.time.sleep", more)
+    monkeypatch.setattr("cosim.live.early_tables._SLICE_BYTES", 10_000)
+    monkeypatch.setattr("cosim.live.early_tables.BATCH_ROWS", 50)
+    early = None
+    if kind == "a batch twice":
+        with pytest.raises(ValueError, match="not in order"):
+            write_early(run_dir)
+        assert not [*(run_dir / SPOOL / EARLY).iterdir()]
+        for table, found in rows.items():
+            spool(run_dir, table, found[250:], writer="sensor")
+    else:
+        early = write_early(run_dir)
+        assert {file.stem for file in (run_dir / SPOOL / EARLY).iterdir()} == early.keys()
+    if kind == "rows afterwards":
+        for table, found in rows.items():
+            spool(run_dir, table, found[350:], writer="frozen")
+    out.close()
+    written = same_rows(run_dir, shared, early)
+    assert (PLANT_STEP in written) == (kind != "in order")
+    file = TableFile(run_dir / f"record/{PLANT_STEP}.parquet", rows[PLANT_STEP].dtype)
+    assert len(file.groups) > 2 * LOOPS or kind != "in order"
+    numbers = file.whole()[LOOP].to_pylist()
+    assert numbers == sorted(rows[PLANT_STEP][LOOP].tolist())
 
 
 def _fail(*_: object) -> None:
