@@ -3,11 +3,15 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from cosim.interactive.draft import differences, leaf, value_text
 from cosim.interactive.exploration import Exploration
 from noack.core.number_format import number
 
 _MOST_SETTINGS, _LONGEST = 4, 28
+_NEARLY = 1.001
+_END = "‖x‖ at the end"
 _NOT_COMPARED = ("name", "ports", "recovery", "realtime")
 """Tables and keys that do not change what the loop does."""
 
@@ -32,16 +36,27 @@ class Comparison(NamedTuple):
 
 def compare(reference: Reference, run: Exploration) -> Comparison:
     """Compare a run with a reference."""
-    until_s = min(float(one.t_s[-1]) for one in (reference.run, run))
-    other, now = (one.until(until_s) for one in (reference.run, run))
-    until = "" if other is reference.run and now is run else f", until {number(until_s, 3)} s"
+    last_s = [float(one.t_s[-1]) for one in (reference.run, run)]
+    until_s = min(last_s)
+    until = f", until {number(until_s, 3)} s" if max(last_s) > until_s * _NEARLY else ""
+    before, after = (_measured(one, until_s) for one in (reference.run, run))
     rows = (
-        _counts("transmissions", len(other.event_s), len(now.event_s)),
-        _counts("lost", other.lost, now.lost),
-        _sizes("‖x‖ at the end", float(other.x_norm[-1]), float(now.x_norm[-1])),
-        _sizes("largest ‖e_c‖", other.largest_e_c, now.largest_e_c),
+        *(_counts(name, before[name], after[name]) for name in ("transmissions", "lost")),
+        *(_sizes(name, before[name], after[name]) for name in (_END, "largest ‖e_c‖")),
     )
-    return Comparison(f"compared with {reference.name}{until}", _settings(other, run), rows)
+    return Comparison(f"compared with {reference.name}{until}", _settings(reference.run, run), rows)
+
+
+def _measured(run: Exploration, until_s: float) -> dict[str, float]:
+    """Return the numbers of a run up to a time."""
+    sent, drawn = run.event_s <= until_s, run.t_s <= until_s
+    errors = run.e_c_norm[drawn & run.controller_knows & np.isfinite(run.e_c_norm)]
+    return {
+        "transmissions": int(sent.sum()),
+        "lost": int((sent & ~run.delivered).sum()),
+        _END: float(np.interp(until_s, run.t_s, run.x_norm)),
+        "largest ‖e_c‖": float(errors.max(initial=0.0)) if len(errors) else math.nan,
+    }
 
 
 def _settings(other: Exploration, run: Exploration) -> str:
@@ -66,10 +81,10 @@ def _text(value: object) -> str:
     return value_text(value) if isinstance(value, str | int | float | list | dict) else "–"
 
 
-def _counts(name: str, before: int, after: int) -> tuple[str, str, str, str]:
+def _counts(name: str, before: float, after: float) -> tuple[str, str, str, str]:
     change = after - before
-    words = f"{abs(change)} {'more' if change > 0 else 'fewer'}" if change else "the same"
-    return name, str(before), str(after), words
+    words = f"{abs(change):g} {'more' if change > 0 else 'fewer'}" if change else "the same"
+    return name, f"{before:g}", f"{after:g}", words
 
 
 def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:

@@ -189,21 +189,11 @@ def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLin
 
 
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:
-    """Return in words whether a run is unstable, and why nothing is guaranteed; empty if stable."""
-    parts = []
-    if run.diverged_at_s is not None:
-        parts.append(
-            f"The loop is unstable under these losses: it diverged at {run.diverged_at_s:.3g} s."
-        )
-    elif run.x_norm[-1] > run.x_norm[0]:
-        first, last = (number(float(run.x_norm[i]), 3) for i in (0, -1))
-        parts.append(f"‖x‖ grows from {first} to {last}.")
-    if run.cut:
-        parts.append(f"{run.cut[0].upper()}{run.cut[1:]}.")
-    if parts and guarantee is not None and guarantee.verdict != CERTIFIED:
-        parts.append(f"It has no certificate: {guarantee.reason}.")
-        if margin is not None and margin.defined:
-            parts.append(f"Margin: {margin.verdict}.")
-    elif parts and guarantee is not None:
-        parts.append("It is certified all the same: the bound allows this.")
-    return " ".join(parts)
+    """Return in words whether a run is unstable, and what is guaranteed; empty if stable."""
+    if run.diverged_at_s is None and not run.cut and run.x_norm[-1] <= run.x_norm[0]:
+        return ""
+    ending, kept, _ = verdict_of(run, guarantee)
+    parts = [ending.text, *([kept.text] if guarantee is not None else [])]
+    if margin is not None and margin.defined:
+        parts.append(f"margin: {margin.verdict}")
+    return "; ".join(parts)

@@ -52,11 +52,6 @@ _TONES = {GOOD: "good", DOUBTFUL: "doubt", BAD: "bad"}
 _POLL_S = 0.25
 _GESTURE_S = 1.0
 """Changes of one key follow each other within this time while a slider is dragged."""
-_PLACES = {
-    "note": "role=status", "pending": "role=status", "compare": "role=region aria-label=comparison",
-    "facts": "",
-}  # fmt: skip
-"""Places beside the figure, with their roles."""
 
 
 async def show_page(services: LabServices) -> None:
@@ -136,8 +131,7 @@ class _Page:
             self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE,
                                       on_change=self._switch).props("no-caps dense")  # fmt: skip
             with ui.element("div").classes("lab-of lab-of-live"):
-                self._live = LiveSource(self._services, self._replay)
-                self._live.on_start(lambda: self._session.draft)
+                self._live = LiveSource(self._services, lambda: self._session.draft, self._replay)
             with ui.element("div").classes("lab-of lab-of-recorded"):
                 self._recorded = RecordedSource(self._services, self._calls, self._show)
             self._keep = ui.button(_KEEP, icon="compare", on_click=self._keep_run).props(
@@ -156,8 +150,8 @@ class _Page:
                 ui.element("section").props("id=lab-verdict aria-label=verdict")
                 with ui.element("a").props("id=lab-report hidden target=_blank"):
                     ui.label("report of this run (all figures and tables)")
-                for name, role in _PLACES.items():
-                    ui.element("div").props(f"id=lab-{name} {role}")
+                for name in ("note role=status", "pending role=status", "compare", "facts"):
+                    ui.element("div").props(f"id=lab-{name}")
                 for source in (self._live, self._recorded):
                     with ui.element("div").classes(f"lab-of-{source.name} w-full"):
                         source.build_details()
@@ -165,8 +159,7 @@ class _Page:
     async def begin(self) -> None:
         """Draw for the first time."""
         await self._client.connected()
-        self._is_dark, slow = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
-        self._live.shows_viewer = not slow
+        self._is_dark = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
         self._text.show_dark(dark=self._is_dark)
         steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
         await self._stage.show(source=EXPLORE, steps=steps)
@@ -219,8 +212,9 @@ class _Page:
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": shown.state}
         name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
+        pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._stage.show(
-            pending=self._session.pending if self._source == EXPLORE else "",
+            pending=pending.get(self._source, ""),
             progress=self._live.progress if live else None, report=name and report_address(name),
             **parts,
         )  # fmt: skip
@@ -241,7 +235,7 @@ class _Page:
         """Return what is wrong with the settings, or what the drawing leaves out."""
         session = self._session
         if self._source != EXPLORE:
-            return self._recorded.note if self._source == RECORDED else ""
+            return ""
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.note
@@ -289,7 +283,6 @@ class _Page:
 
     async def _switch(self, event: ValueChangeEventArguments[str]) -> None:
         self._source = event.value
-        self._live.remove_old_viewer()
         if self._source == RECORDED:
             self._recorded.refresh()
         await self._show()
@@ -353,6 +346,7 @@ class _Page:
     async def _open(self, draft: Draft) -> None:
         self._session.results = self._session.before = None
         self._session.draft = draft
+        self._unsettled.add("")
         self._scenarios.set_value(draft.base)
         self._sources.set_value(EXPLORE)
         await self._session.change(draft)
