@@ -20,7 +20,6 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
-from cosim.interactive.comparison import Reference, compare
 from cosim.interactive.controls import (
     Controls,
     by_field,
@@ -34,6 +33,7 @@ from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draf
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
 from cosim.interactive.scenario_guarantee import verdict_of
+from cosim.lab.comparison import Reference, compare
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
 from cosim.lab.sources import LiveSource, RecordedSource, report_address
@@ -140,7 +140,7 @@ class _Page:
             ui.checkbox("compare", value=True, on_change=self._compare).props("dense")
             with ui.element("label").props("hidden"):
                 ui.label("drawn state ").classes("inline")
-                ui.element("select").props("id=lab-state")
+                ui.element("select").props('id=lab-state aria-label="drawn state"')
 
     def _build_stage(self) -> None:
         with ui.element("div").classes("lab-stage").props("id=lab-stage"):

@@ -10,8 +10,8 @@ import pytest
 import noack
 from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
-from cosim.interactive.comparison import Reference, compare
 from cosim.interactive.exploration_figure import Shown, exploration_figure
+from cosim.lab.comparison import Reference, compare
 from cosim.lab.stage import figure_part
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario

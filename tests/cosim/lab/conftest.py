@@ -102,7 +102,7 @@ class Page:
 
     def click(self, text: str, kind: str) -> None:
         found = (
-            f"[...document.querySelectorAll('{kind}')].filter(e => "
+            f"[...document.querySelectorAll('{kind}')].filter(e => e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
         self.wait(f"{found}.length > 0")
