@@ -1,13 +1,27 @@
-"""Two runs side by side: which settings differ, and what follows, in words and numbers."""
+"""What is said of an explored run: its verdict, and what distinguishes it from another one."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
+from cosim.analysis.summary_model import ExitPart
 from cosim.interactive.draft import differences, leaf, value_text
 from cosim.interactive.exploration import Exploration
-from noack.core.number_format import number
+from cosim.interactive.scenario_guarantee import CERTIFIED, VOID, Guarantee
+from cosim.output.run_verdict import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    NEUTRAL,
+    VerdictLine,
+    ending_line,
+    state_text,
+    transmission_line,
+)
+from noack.core.errors import ExitStatus
+from noack.core.number_format import number, percent
+from noack.runtime.life_cycle import HORIZON
 
 _MOST_SETTINGS, _LONGEST = 4, 28
 _NEARLY = 1.001
@@ -96,3 +110,45 @@ def _sizes(name: str, before: float, after: float) -> tuple[str, str, str, str]:
         ratio = number(after / before, 3)
         words = "nearly the same" if ratio == "1" else f"{ratio} times as large"
     return name, texts[0], texts[1], words
+
+
+def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLine, ...]:
+    """Return the verdict of an explored run, in the three lines that a live run ends with.
+
+    Without ``guarantee`` the certificate is still being computed.
+    """
+    horizon_s, reached_s = run.scenario.horizon_s, float(run.t_s[-1])
+    status, reason = ExitStatus.OK, HORIZON
+    if run.diverged_at_s is not None:
+        status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
+    elif run.cut:
+        status, reason = ExitStatus.INTERRUPTED, run.cut
+    largest, last = float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
+    state = state_text(largest, last, None) if run.diverged_at_s is None else ""
+    events = len(run.event_s)
+    return (
+        ending_line(ExitPart(status=status, reason=reason), reached_s, horizon_s, state),
+        _guarantee_line(run, guarantee),
+        transmission_line(events, events - run.lost),
+    )
+
+
+def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLine:
+    if guarantee is None:
+        return VerdictLine("guarantee: being computed", NEUTRAL)
+    if guarantee.verdict != CERTIFIED:
+        why = guarantee.reason if guarantee.verdict != VOID else f"{VOID}: {guarantee.reason}"
+        return VerdictLine(f"guarantee not checkable: {why}", DOUBTFUL)
+    with np.errstate(all="ignore"):
+        used = [
+            values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
+            for values, bound in (
+                (np.where(run.controller_knows, run.e_c_norm, 0.0), guarantee.e_c),
+                (run.x_norm, guarantee.x),
+            )
+        ]
+    above = np.nanmax(np.stack([*used, np.zeros_like(run.t_s)]), axis=0) > 1
+    if above.any():
+        return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", BAD)
+    share = percent(float(np.nanmax(np.append(used[0], 0.0))))
+    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", GOOD)

@@ -32,8 +32,7 @@ from cosim.interactive.controls import (
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
-from cosim.interactive.scenario_guarantee import verdict_of
-from cosim.lab.comparison import Reference, compare
+from cosim.lab.comparison import Reference, compare, verdict_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
 from cosim.lab.sources import LiveSource, RecordedSource, report_address

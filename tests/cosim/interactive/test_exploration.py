@@ -11,7 +11,7 @@ import noack
 from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import Shown, exploration_figure
-from cosim.lab.comparison import Reference, compare
+from cosim.lab.comparison import Reference, compare, verdict_of
 from cosim.lab.stage import figure_part
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
@@ -114,16 +114,16 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
 def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
     run = exploration.explore(noack.load("lane_weighted"))
     certified = guarantee.certify(run.scenario)
-    ending, kept, sent = (line.text for line in guarantee.verdict_of(run, certified))
+    ending, kept, sent = (line.text for line in verdict_of(run, certified))
     assert ending.startswith("completed 20 s: stable, ‖x‖ fell from 3.0")
     share = float(kept.removeprefix("guarantee kept: ‖e_c‖ was at most ").split(" %")[0])
     bound = np.interp(run.t_s, certified.t_s, certified.e_c)
     assert share == pytest.approx(100 * np.max(run.e_c_norm / bound), rel=0.02, abs=0.06)
     assert sent.startswith(f"{len(run.event_s)} transmissions, ")
     low = replace(certified, e_c=1e-3 * certified.e_c)
-    assert guarantee.verdict_of(run, low)[1].text.startswith("guarantee broken since ")
+    assert verdict_of(run, low)[1].text.startswith("guarantee broken since ")
     missing = guarantee.certify(noack.load("lane_vehicle"))
-    said = guarantee.verdict_of(run, missing)[1].text
+    said = verdict_of(run, missing)[1].text
     assert said == f"guarantee not checkable: {missing.reason}"
 
 
