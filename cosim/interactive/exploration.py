@@ -5,7 +5,7 @@ takes some milliseconds. Otherwise the machines run in virtual time, which takes
 second. A run that is recorded, or that is being recorded, is drawn from its record.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -40,7 +40,6 @@ _MOST_EVENT_POINTS = 600
 
 _MOST_EVENTS = 3000
 """A run with more events is drawn up to there, so that dragging stays quick."""
-_NEARLY = 1e-3
 _SHORT = 0.5
 """Inter-event times shrink to 0 if the second half of the events takes less than this share of the
 time of the first."""
@@ -107,23 +106,6 @@ class Exploration:
     def lost(self) -> int:
         """Number of transmissions that were not delivered."""
         return int(np.sum(~self.delivered))
-
-    @property
-    def largest_e_c(self) -> float:
-        """The largest ‖e_c‖ from the controller's first update on; NaN before it."""
-        known = self.e_c_norm[self.controller_knows & np.isfinite(self.e_c_norm)]
-        return float(known.max()) if len(known) else np.nan
-
-    def until(self, t_s: float) -> "Exploration":
-        """Return the run up to a time; itself if it does not go on much longer."""
-        if self.t_s[-1] <= t_s * (1 + _NEARLY):
-            return self
-        drawn, sent = self.t_s <= t_s, self.event_s <= t_s
-        return replace(
-            self, t_s=self.t_s[drawn], x=self.x[drawn], x_s=self.x_s[drawn], x_c=self.x_c[drawn],
-            e_s_norm=self.e_s_norm[drawn], e_c_norm=self.e_c_norm[drawn], threshold=None,
-            event_s=self.event_s[sent], delivered=self.delivered[sent],
-        )  # fmt: skip
 
     @cached_property
     def x_norm(self) -> Vector:

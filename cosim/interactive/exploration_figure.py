@@ -61,7 +61,7 @@ def exploration_figure(shown: Shown) -> FigureDescription:
     for (title, items, y), height_in in zip(parts, _HEIGHTS_IN, strict=True):
         drawn = [item for item in items if _has_points(item)]
         names = [*dict.fromkeys(item.label for item in drawn)]
-        legend = [name for name in names if name not in known]
+        legend = sorted((name for name in names if name not in known), key=KEPT.__eq__)
         known |= {*names}
         x = time_axis(horizon_s, numbers=len(rows) == len(parts) - 1)
         panel = Panel(title=title, items=drawn, x=x, y=y, legend=legend)

@@ -1,4 +1,4 @@
-"""What is guaranteed for a scenario: certificate, margin, the verdict, and a warning in words."""
+"""What is guaranteed for a scenario: certificate, margin, and a warning in words."""
 
 from dataclasses import dataclass
 
@@ -6,22 +6,10 @@ import numpy as np
 
 from cosim.analysis.certificates import constant_rows
 from cosim.analysis.margin_search import find_margin
-from cosim.analysis.summary_model import ExitPart
 from cosim.interactive.exploration import Exploration
-from cosim.output.run_verdict import (
-    BAD,
-    DOUBTFUL,
-    GOOD,
-    NEUTRAL,
-    VerdictLine,
-    ending_line,
-    state_text,
-    transmission_line,
-)
-from noack.core.errors import CallerError, ExitStatus
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.core.number_format import number, percent
-from noack.runtime.life_cycle import HORIZON
+from noack.core.number_format import number
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.certificates.assumptions import AssumptionStatus
@@ -142,50 +130,6 @@ def margin_of(scenario: Scenario) -> Margin:
         for cap in found.caps
     )  # fmt: skip
     return Margin(found.verdict, rows, defined=True)
-
-
-def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLine, ...]:
-    """Return the verdict of an explored run, in the three lines that a live run ends with.
-
-    Without ``guarantee`` the certificate is still being computed.
-    """
-    horizon_s, reached_s = run.scenario.horizon_s, float(run.t_s[-1])
-    status, reason = ExitStatus.OK, HORIZON
-    if run.diverged_at_s is not None:
-        status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
-    elif run.cut:
-        status, reason = ExitStatus.INTERRUPTED, run.cut
-    largest, last = float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
-    state = state_text(largest, last, None) if run.diverged_at_s is None else ""
-    events = len(run.event_s)
-    return (
-        ending_line(ExitPart(status=status, reason=reason), reached_s, horizon_s, state),
-        _guarantee_line(run, guarantee),
-        transmission_line(events, events - run.lost),
-    )
-
-
-def _guarantee_line(run: Exploration, guarantee: Guarantee | None) -> VerdictLine:
-    if guarantee is None:
-        return VerdictLine("guarantee: being computed", NEUTRAL)
-    if guarantee.verdict != CERTIFIED:
-        why = (
-            guarantee.reason if guarantee.verdict == NOT_COVERED else f"{VOID}: {guarantee.reason}"
-        )
-        return VerdictLine(f"guarantee not checkable: {why}", DOUBTFUL)
-    with np.errstate(all="ignore"):
-        used = [
-            values / np.exp(np.interp(run.t_s, guarantee.t_s, np.log(bound)))
-            for values, bound in (
-                (np.where(run.controller_knows, run.e_c_norm, 0.0), guarantee.e_c),
-                (run.x_norm, guarantee.x),
-            )
-        ]
-    above = np.nanmax(np.stack([*used, np.zeros_like(run.t_s)]), axis=0) > 1
-    if above.any():
-        return VerdictLine(f"guarantee broken since {run.t_s[above][0]:.3f} s", BAD)
-    share = percent(float(np.nanmax(np.append(used[0], 0.0))))
-    return VerdictLine(f"guarantee kept: ‖e_c‖ was at most {share} of its bound", GOOD)
 
 
 def warning(run: Exploration, guarantee: Guarantee | None, margin: Margin | None) -> str:

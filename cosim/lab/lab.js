@@ -285,14 +285,5 @@ function labBegin() {
     labDrawer(false);
     document.querySelector('.lab-drawer-button').focus();
   });
-  return [matchMedia('(prefers-color-scheme: dark)').matches, labDrawsByProcessor()];
-}
-
-/* Whether the browser has no graphics card to draw with. */
-function labDrawsByProcessor() {
-  const gl = document.createElement('canvas').getContext('webgl2');
-  const info = gl?.getExtension('WEBGL_debug_renderer_info');
-  const name = gl?.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-  gl?.getExtension('WEBGL_lose_context')?.loseContext();
-  return !name || /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+  return matchMedia('(prefers-color-scheme: dark)').matches;
 }

@@ -20,7 +20,6 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments, ValueChangeEventArguments
 from pyarrow import csv
 
-from cosim.interactive.comparison import Reference, compare
 from cosim.interactive.controls import (
     Controls,
     by_field,
@@ -33,7 +32,7 @@ from cosim.interactive.controls import (
 from cosim.interactive.draft import Draft, DraftError, draft_of_query, open_draft
 from cosim.interactive.exploration import Exploration
 from cosim.interactive.exploration_figure import CERTIFICATE, Shown, exploration_figure
-from cosim.interactive.scenario_guarantee import verdict_of
+from cosim.lab.comparison import Reference, compare, verdict_of
 from cosim.lab.lab_services import ANSWER_S, LabServices, PageCalls, Session
 from cosim.lab.settings_panel import TextPanel, controls_part, form_part, value_text
 from cosim.lab.sources import LiveSource, RecordedSource, report_address
@@ -52,11 +51,6 @@ _TONES = {GOOD: "good", DOUBTFUL: "doubt", BAD: "bad"}
 _POLL_S = 0.25
 _GESTURE_S = 1.0
 """Changes of one key follow each other within this time while a slider is dragged."""
-_PLACES = {
-    "note": "role=status", "pending": "role=status", "compare": "role=region aria-label=comparison",
-    "facts": "",
-}  # fmt: skip
-"""Places beside the figure, with their roles."""
 
 
 async def show_page(services: LabServices) -> None:
@@ -136,8 +130,7 @@ class _Page:
             self._sources = ui.toggle([EXPLORE, LIVE, RECORDED], value=EXPLORE,
                                       on_change=self._switch).props("no-caps dense")  # fmt: skip
             with ui.element("div").classes("lab-of lab-of-live"):
-                self._live = LiveSource(self._services, self._replay)
-                self._live.on_start(lambda: self._session.draft)
+                self._live = LiveSource(self._services, lambda: self._session.draft, self._replay)
             with ui.element("div").classes("lab-of lab-of-recorded"):
                 self._recorded = RecordedSource(self._services, self._calls, self._show)
             self._keep = ui.button(_KEEP, icon="compare", on_click=self._keep_run).props(
@@ -146,7 +139,7 @@ class _Page:
             ui.checkbox("compare", value=True, on_change=self._compare).props("dense")
             with ui.element("label").props("hidden"):
                 ui.label("drawn state ").classes("inline")
-                ui.element("select").props("id=lab-state")
+                ui.element("select").props('id=lab-state aria-label="drawn state"')
 
     def _build_stage(self) -> None:
         with ui.element("div").classes("lab-stage").props("id=lab-stage"):
@@ -156,8 +149,8 @@ class _Page:
                 ui.element("section").props("id=lab-verdict aria-label=verdict")
                 with ui.element("a").props("id=lab-report hidden target=_blank"):
                     ui.label("report of this run (all figures and tables)")
-                for name, role in _PLACES.items():
-                    ui.element("div").props(f"id=lab-{name} {role}")
+                for name in ("note role=status", "pending role=status", "compare", "facts"):
+                    ui.element("div").props(f"id=lab-{name}")
                 for source in (self._live, self._recorded):
                     with ui.element("div").classes(f"lab-of-{source.name} w-full"):
                         source.build_details()
@@ -165,8 +158,7 @@ class _Page:
     async def begin(self) -> None:
         """Draw for the first time."""
         await self._client.connected()
-        self._is_dark, slow = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
-        self._live.shows_viewer = not slow
+        self._is_dark = await ui.run_javascript("labBegin()", timeout=ANSWER_S)
         self._text.show_dark(dark=self._is_dark)
         steps = [{"title": one.title, "text": one.text, "drag": one.drag} for one in STEPS]
         await self._stage.show(source=EXPLORE, steps=steps)
@@ -219,8 +211,9 @@ class _Page:
             parts["facts"] = [[heading, [*map(list, rows)]] for heading, rows in facts.items()]
             parts["states"] = {"names": run.state_names, "chosen": shown.state}
         name = self._live.report if live else self._recorded.chosen * (self._source == RECORDED)
+        pending = {EXPLORE: self._session.pending, RECORDED: self._recorded.note}
         await self._stage.show(
-            pending=self._session.pending if self._source == EXPLORE else "",
+            pending=pending.get(self._source, ""),
             progress=self._live.progress if live else None, report=name and report_address(name),
             **parts,
         )  # fmt: skip
@@ -241,7 +234,7 @@ class _Page:
         """Return what is wrong with the settings, or what the drawing leaves out."""
         session = self._session
         if self._source != EXPLORE:
-            return self._recorded.note if self._source == RECORDED else ""
+            return ""
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.note
@@ -289,7 +282,6 @@ class _Page:
 
     async def _switch(self, event: ValueChangeEventArguments[str]) -> None:
         self._source = event.value
-        self._live.remove_old_viewer()
         if self._source == RECORDED:
             self._recorded.refresh()
         await self._show()
@@ -353,6 +345,7 @@ class _Page:
     async def _open(self, draft: Draft) -> None:
         self._session.results = self._session.before = None
         self._session.draft = draft
+        self._unsettled.add("")
         self._scenarios.set_value(draft.base)
         self._sources.set_value(EXPLORE)
         await self._session.change(draft)

@@ -28,7 +28,7 @@ from cosim.interactive.exploration_figure import (
 )
 from cosim.interactive.scenario_guarantee import certify, margin_of
 from cosim.lab.live_run import LiveRun
-from cosim.lab.run_views import live_view
+from cosim.lab.run_views import live_view, recorded_view
 from cosim.record.run_directory import SUMMARY_FILE
 from noack.core.errors import NoackError
 from noack.scenario.scenario import Scenario
@@ -119,10 +119,10 @@ class LabServices:
         return self.live
 
     async def _watch(self, live: LiveRun) -> None:
-        """Read what a live run has recorded, again and again, for an eighth of the time at most."""
+        """Read what a live run has recorded, again and again, for a quarter of the time at most."""
         took_s = 0.0
         while not live.is_over:
-            await asyncio.sleep(max(_LOOK_S, 7 * took_s))
+            await asyncio.sleep(max(_LOOK_S, 3 * took_s))
             if live.state != "running" or live.run_dir is None or not live.watched:
                 continue
             live.watched, began_s = False, time.perf_counter()
@@ -130,6 +130,9 @@ class LabServices:
                 live.seen = await self.compute(live_view, live.run_dir) or live.seen
                 live.version += 1
             took_s = time.perf_counter() - began_s
+        if live.verdict and live.run_dir is not None:
+            live.seen = (await self.compute(recorded_view, live.run_dir, None)).run
+            live.version += 1
 
     def recorded(self) -> list[str]:
         """Return the names of the run directories, the newest first."""

@@ -39,13 +39,19 @@ class LiveSource:
 
     name = "live"
 
-    def __init__(self, services: LabServices, replay: Callable[[str], Awaitable[None]]) -> None:
-        self._services, self._replay = services, replay
+    def __init__(
+        self,
+        services: LabServices,
+        draft: Callable[[], Draft],
+        replay: Callable[[str], Awaitable[None]],
+    ) -> None:
+        self._services, self._draft, self._replay = services, draft, replay
         self._live: LiveRun | None = None
         """The run that is shown, with its version and the number of its lines that are shown."""
         self._version = self._lines = 0
-        self._viewer, self._is_offered, self.shows_viewer = "", False, False
-        self._start = ui.button("run live", icon="play_arrow").props("no-caps dense")
+        self._start = ui.button("run live", icon="play_arrow", on_click=self._begin).props(
+            "no-caps dense"
+        )
         self._stop = ui.button("stop", icon="stop", on_click=self._end).props(
             "outline no-caps dense"
         )
@@ -67,15 +73,11 @@ class LiveSource:
             ]
         self._log = ui.log(max_lines=MOST_LINES).classes("w-full h-40 lab-log")
         self._log.props('tabindex=0 role=region aria-label="log of the run"')
+        self._viewer = ui.button("show the rerun viewer", on_click=self._show_viewer).props(
+            'outline no-caps dense title="In a browser without a graphics card it takes the '
+            'processor from the loop."'
+        )
         self._frame = ui.element("div").classes("w-full")
-
-    def on_start(self, draft: Callable[[], Draft]) -> None:
-        """Say which draft a run takes when it starts."""
-
-        async def begin() -> None:
-            await self._begin(draft())
-
-        self._start.on_click(begin)
 
     @property
     def run(self) -> Exploration | None:
@@ -125,9 +127,8 @@ class LiveSource:
         if live is None or (self._live, self._version) == (live, live.version):
             return False
         if self._live is not live:
-            self._live, self._lines, self._viewer = live, 0, ""
+            self._live, self._lines = live, 0
             self._log.clear()
-            self._frame.clear()
         self._version = live.version
         for line in live.lines[max(self._lines - live.first_line, 0) :]:
             self._log.push(line)
@@ -136,21 +137,13 @@ class LiveSource:
             (self._start, live.is_over),
             (self._stop, not live.is_over),
             *((one, live.state == "running") for one in self._kill),
+            (self._viewer, live.state == "running" and live.viewer is not None),
         ):
             button.set_enabled(enabled)
         self._again.set_visibility(bool(self.report))
-        if live.viewer and live.viewer != self._viewer:
-            self._viewer = live.viewer
-            self._offer_viewer(live.viewer)
         if live.state != "running":
-            self.remove_old_viewer()
+            self._frame.clear()  # its server ends with the loop
         return True
-
-    def remove_old_viewer(self) -> None:
-        """Remove the viewer of a loop that has ended: loaded again it would find no server."""
-        if self._is_offered or (self._live is not None and self._live.is_over):
-            self._is_offered = False
-            self._frame.clear()
 
     async def change(self, draft: Draft, keys: set[str]) -> None:
         """Pass new values of sliders on to the running loop, if that can change them."""
@@ -166,7 +159,8 @@ class LiveSource:
         except NoackError as error:
             ui.notify(str(error), type="warning")
 
-    async def _begin(self, draft: Draft) -> None:
+    async def _begin(self) -> None:
+        draft = self._draft()
         try:
             if draft.value("ports") is not None:
                 draft = draft.without("ports")  # fixed ports may be taken by another run
@@ -195,23 +189,11 @@ class LiveSource:
 
         return kill
 
-    def _offer_viewer(self, address: str) -> None:
-        if self.shows_viewer:
-            self._show_viewer(address)
-            return
-        self._is_offered = True
-        with self._frame:
-            ui.label("This browser draws without a graphics card: the viewer would take the "
-                     "processor from the loop and from this page.")  # fmt: skip
-            ui.button("show the viewer here", on_click=lambda: self._show_viewer(address)).props(
-                "outline no-caps dense"
-            )
-
-    def _show_viewer(self, address: str) -> None:
-        self._is_offered = False
+    def _show_viewer(self) -> None:
+        address = self._live.viewer if self._live else None
         self._frame.clear()
         with self._frame:
-            ui.link("open the viewer in a tab of its own", address, new_tab=True)
+            ui.link("open the viewer in a tab of its own", address or "", new_tab=True)
             ui.element("iframe").props(f'src="{address}" title="rerun viewer"').classes(
                 "w-full lab-viewer"
             )

@@ -51,35 +51,26 @@ class Stage:
             self._shown.clear()
 
 
-class _Columns:
-    """Columns of numbers; one that several items share is sent once."""
-
-    def __init__(self) -> None:
-        self._places: dict[int, int] = {}
-        self._columns: list[Vector] = []
+class _Columns(dict[int, tuple[int, Vector]]):
+    """The columns of a figure, by identity, each with its number: a shared one is sent once."""
 
     def add(self, values: Vector) -> int:
         """Return the number of a column."""
-        if id(values) not in self._places:
-            self._places[id(values)] = len(self._columns)
-            self._columns.append(values)
-        return self._places[id(values)]
-
-    def content(self) -> Json:
-        """Return all columns as one array of 32-bit numbers, little endian, in Base64."""
-        with np.errstate(over="ignore"):
-            numbers = np.concatenate(self._columns).astype("<f4")
-        return {
-            "lengths": [*map(len, self._columns)],
-            "numbers": base64.b64encode(numbers.tobytes()).decode(),
-        }
+        return self.setdefault(id(values), (len(self), values))[0]
 
 
 def figure_part(figure: FigureDescription) -> Json:
-    """Return a figure with one panel in each row for the browser."""
+    """Return a figure with one panel in each row for the browser.
+
+    All columns are one array of 32-bit numbers, little endian, in Base64.
+    """
     columns = _Columns()
     panels = [_panel(row.panels[0], row.height_in, columns) for row in figure.rows]
-    return {"panels": panels, "description": figure.description, **columns.content()}
+    values = [column for _, column in columns.values()]
+    with np.errstate(over="ignore"):
+        numbers = base64.b64encode(np.concatenate(values).astype("<f4").tobytes()).decode()
+    return {"panels": panels, "description": figure.description,
+            "lengths": [*map(len, values)], "numbers": numbers}  # fmt: skip
 
 
 def _panel(panel: Panel, height: float, columns: _Columns) -> Json:

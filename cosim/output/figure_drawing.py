@@ -354,9 +354,11 @@ def _finish_axis(axes: Axes, which: Literal["x", "y"], described: Axis, has_numb
     if not has_numbers:
         axis.set_tick_params(which="both", labelbottom=False, labelleft=False)
     if described.about is not None and described.logarithmic:
-        _limit_log_axis(axes, described.about, described.decades)
+        values = np.concatenate([np.asarray(line.get_ydata(), np.float64) for line in axes.lines])
+        if (ends := log_ends(values, described.about, described.decades)) is not None:
+            axes.set_ylim(*ends)
     elif described.about is not None:
-        _limit_axis(axes, described.about)
+        axes.set_ylim(*near_ends(axes.get_ylim(), described.about))
     if described.ends.count(None) == 1:
         _set_ends(axes, which, described)
 
@@ -371,18 +373,6 @@ def _for_font(text: str) -> str:
 
 def _set_ends(axes: Axes, which: Literal["x", "y"], described: Axis) -> None:
     (axes.set_xlim if which == "x" else axes.set_ylim)(*described.ends)
-
-
-def _limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
-    """Show all curves, but at most ``decades`` below and above the largest measured value."""
-    values = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines]
-    if (ends := log_ends(np.concatenate(values), measured, decades)) is not None:
-        axes.set_ylim(*ends)
-
-
-def _limit_axis(axes: Axes, measured: Reals) -> None:
-    """Show the measured values whole; bands only as far as they are near them."""
-    axes.set_ylim(*near_ends(axes.get_ylim(), measured))
 
 
 class _Numbers(LogFormatter):

@@ -1,15 +1,18 @@
 """What the lab page draws, compared with the simulators that it is computed from."""
 
+import base64
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from cosim.lab.chart import data_options
 
 import noack
 from cosim.interactive import ensemble, exploration
 from cosim.interactive import scenario_guarantee as guarantee
 from cosim.interactive.exploration_figure import Shown, exploration_figure
+from cosim.lab.comparison import Reference, compare, verdict_of
+from cosim.lab.stage import figure_part
 from cosim.simulation.continuous import run_continuous
 from cosim.studies.campaign.random_draws import drawn_scenario
 from noack.core.errors import CallerError
@@ -35,7 +38,13 @@ def test_a_run_is_drawn_as_simulated_with_both_sides_of_each_event() -> None:
     figure = exploration_figure(shown)
     errors = figure.rows[1].panels[0].legend or ()
     assert "certified bound" in errors
-    assert data_options(figure)["legend"][1]["data"] == [{"name": name} for name in errors]
+    part = figure_part(figure)
+    assert [entry["label"] for entry in part["panels"][1]["legend"]] == [*errors]
+    numbers = np.frombuffer(base64.b64decode(part["numbers"]), "<f4")
+    ends = np.cumsum(part["lengths"])
+    item = next(one for one in part["panels"][2]["items"] if one["label"] == "‖x‖")
+    sent = np.split(numbers, ends[:-1])[item["y"]]
+    np.testing.assert_allclose(sent, shown.run.x_norm, rtol=1e-6)
 
 
 def test_a_run_that_diverges_is_drawn_up_to_that_time_and_widens_the_band() -> None:
@@ -100,3 +109,30 @@ def test_a_certificate_has_bounds_over_time_or_a_reason() -> None:
     assert missing.verdict == guarantee.NOT_COVERED
     assert "not linear" in missing.reason
     assert np.isnan(missing.e_c).all()
+
+
+def test_a_verdict_says_what_became_of_the_run_and_of_its_guarantee() -> None:
+    run = exploration.explore(noack.load("lane_weighted"))
+    certified = guarantee.certify(run.scenario)
+    ending, kept, sent = (line.text for line in verdict_of(run, certified))
+    assert ending.startswith("completed 20 s: stable, ‖x‖ fell from 3.0")
+    share = float(kept.removeprefix("guarantee kept: ‖e_c‖ was at most ").split(" %")[0])
+    bound = np.interp(run.t_s, certified.t_s, certified.e_c)
+    assert share == pytest.approx(100 * np.max(run.e_c_norm / bound), rel=0.02, abs=0.06)
+    assert sent.startswith(f"{len(run.event_s)} transmissions, ")
+    low = replace(certified, e_c=1e-3 * certified.e_c)
+    assert verdict_of(run, low)[1].text.startswith("guarantee broken since ")
+    missing = guarantee.certify(noack.load("lane_vehicle"))
+    said = verdict_of(run, missing)[1].text
+    assert said == f"guarantee not checkable: {missing.reason}"
+
+
+def test_a_comparison_ends_where_one_of_the_runs_does() -> None:
+    short, whole = (
+        exploration.explore(noack.load("lane_following", {"horizon_s": horizon_s}))
+        for horizon_s in (5.0, 20.0)
+    )
+    found = compare(Reference("the whole", whole), short)
+    assert found.title == "compared with the whole, until 5 s"
+    assert found.settings == "Settings that differ: horizon_s 20.0 → 5.0."
+    assert {row[3] for row in found.rows} <= {"the same", "nearly the same"}

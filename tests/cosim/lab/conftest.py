@@ -16,7 +16,7 @@ import pytest
 from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
 
-SLIDERS = "document.querySelectorAll('.q-slider').length"
+SLIDERS = "document.querySelectorAll('.lab-slider').length"
 _TWO_FRAMES = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 TEXT = "document.body.innerText"
 
@@ -102,7 +102,7 @@ class Page:
 
     def click(self, text: str, kind: str) -> None:
         found = (
-            f"[...document.querySelectorAll('{kind}')].filter(e => "
+            f"[...document.querySelectorAll('{kind}')].filter(e => e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
         self.wait(f"{found}.length > 0")
@@ -128,24 +128,30 @@ class Page:
     def unfold(self, title: str) -> None:
         """Open a part of the settings."""
         found = (
-            "[...document.querySelectorAll('.q-expansion-item .q-item')].filter(e => "
+            "[...document.querySelectorAll('summary, .q-expansion-item .q-item')].filter(e => "
             f"e.innerText.replace('keyboard_arrow_down', '').trim() === {json.dumps(title)})"
         )
         self.wait(f"{found}.length > 0")
         self.js(f"{found}[0].click()")
 
-    def fill(self, label: str, text: str) -> None:
+    def fill(self, key: str, text: str) -> None:
         """Type a text into a field of the form."""
-        found = f"document.querySelector('input[aria-label={json.dumps(label)}]')"
+        found = f"document.getElementById({json.dumps(f'lab-field-{key}')})"
         self.wait(f"!!{found}")
         self.js(f"{found}.focus(), {found}.select()")
         self.call("Input.insertText", text=text)
 
+    def resize(self, width: int, height: int) -> None:
+        """Give the window another size."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
+                  deviceScaleFactor=1, mobile=False)  # fmt: skip
+        self.js(_TWO_FRAMES)
+
     def drag(self, label: str, to: float) -> None:
         """Drag the slider with a label to a share of its length."""
         place = (
-            f"(() => {{ const s = [...document.querySelectorAll('.q-slider')].find(e => "
-            f"e.previousElementSibling.innerText.startsWith({json.dumps(label)})); "
+            f"(() => {{ const s = [...document.querySelectorAll('.lab-slider')].find(e => "
+            f"e.innerText.startsWith({json.dumps(label)})).querySelector('input'); "
             "s.scrollIntoView({ block: 'center' }); const r = s.getBoundingClientRect(); "
             "return [r.x, r.y + r.height / 2, r.width]; })()"
         )

@@ -9,6 +9,9 @@ from urllib.request import urlopen
 
 import pytest
 
+import noack
+from cosim.simulation.continuous import run_continuous
+from noack.scenario.resolution import resolve
 from tests.cosim.lab.conftest import TEXT, Page, Served
 from tests.integration import conftest as live
 from tools.screenshot_recording import Browser
@@ -16,12 +19,17 @@ from tools.screenshot_recording import Browser
 pytest.importorskip("nicegui", reason="the extra `lab` is not installed")
 
 
+VERDICT = "document.getElementById('lab-verdict').innerText"
+COMPARED = "document.getElementById('lab-compare').innerText"
+PIXELS = "LAB.figure.panels.map(one => one.canvas.toDataURL()).join()"
+
+
 def test_dragging_changes_the_run_and_the_address(browser: Browser, address: str) -> None:
     page = Page(browser, address)
-    page.wait(f"{TEXT}.includes('certified: every loss pattern')")
+    page.wait(f"{VERDICT}.includes('guarantee kept: ‖e_c‖ was at most')")
     page.drag("maximum consecutive losses", 1.0)
     page.wait("location.search.includes('network.mansd=20')")
-    page.wait(f"{TEXT}.includes('no certificate') || {TEXT}.includes('certified: ')")
+    page.wait(f"{VERDICT}.includes('guarantee kept') || {VERDICT}.includes('not checkable')")
     page.drag("loss probability", 0.0)
     page.wait(f"{TEXT}.includes('lost\\n0')")
     page.wait(r"/loss\.probability=0(\.0)?(&|$)/.test(location.search)")
@@ -39,23 +47,64 @@ def test_dragging_changes_the_run_and_the_address(browser: Browser, address: str
     page.wait(f"{TEXT}.includes('an address opens shipped scenarios')")
 
 
+def counts(scenario: str, **settings: object) -> list[str]:
+    """Return the numbers of transmissions and losses, from the exact simulation."""
+    run = run_continuous(resolve(noack.load(scenario, settings)))
+    return [str(len(run.event_s)), str(int((~run.delivered).sum()))]
+
+
+def test_a_kept_run_is_drawn_beside_the_next_one_and_the_difference_is_said(
+    browser: Browser, address: str
+) -> None:
+    page = Page(browser, address)
+    page.drag("β, threshold at the start", 1.0)  # of itself compared with what was before
+    page.wait(f"{COMPARED}.includes('trigger.beta 0.5 → 5.0')")
+    page.press_button("keep for comparison")
+    page.wait(f"{COMPARED}.includes('the kept run') && {COMPARED}.includes('are the same')")
+    before = page.js(PIXELS)
+    page.drag("β, threshold at the start", 0.0)
+    page.wait(f"{COMPARED}.includes('trigger.beta 5.0 → 0.05')")
+    assert page.js(PIXELS) != before
+    rows = [row.split("\t") for row in page.js(COMPARED).split("\n") if "\t" in row]
+    kept, now = (
+        counts("lane_following", **{"horizon_s": 4.0, "trigger.beta": beta}) for beta in (5.0, 0.05)
+    )
+    assert [row[1:3] for row in rows[1:3]] == [list(pair) for pair in zip(kept, now, strict=True)]
+    assert rows[1][3] == f"{int(now[0]) - int(kept[0])} more"
+    assert rows[3][0] == "‖x‖ at the end"
+    assert rows[4][0] == "largest ‖e_c‖"
+    drawn = page.js(PIXELS)
+    page.js("document.querySelector('.lab-bar [role=checkbox]').click()")
+    page.wait(f"document.getElementById('lab-compare').hidden && {PIXELS} !== {json.dumps(drawn)}")
+
+
 def test_a_mistake_in_the_form_is_shown_at_its_field(browser: Browser, address: str) -> None:
     page = Page(browser, address)
     page.unfold("all settings (form)")
     page.unfold("trigger")
-    page.fill("beta", "abc")
-    wrong = "[...document.querySelectorAll('.q-field--error')].map(e => e.innerText).join('|')"
-    page.wait(f"{wrong}.includes('should be a valid number')")
-    assert page.js(f"{wrong}.startsWith('beta')")
-    assert page.js("document.querySelector('input[aria-label=beta]').value") == "abc"
-    page.fill("beta", "0.25")
+    page.fill("trigger.beta", "abc")
+    wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map(e => e.id + ': ' + "
+    wrong += "e.nextSibling.innerText).join('|')"
+    page.wait(f"{wrong} === 'lab-field-trigger.beta: should be a valid number'")
+    assert page.js("document.getElementById('lab-field-trigger.beta').value") == "abc"
+    page.fill("trigger.beta", "0.25")
     page.wait(f"{wrong} === '' && location.search.includes('trigger.beta=0.25')")
     # A slider moves the field, too.
     page.drag("β, threshold at the start", 1.0)
-    page.wait("document.querySelector('input[aria-label=beta]').value === '5.0'")
+    page.wait("document.getElementById('lab-field-trigger.beta').value === '5.0'")
 
 
-TABS = ("explore", "run live", "recorded runs", "tutorial")
+SOURCES = ("explore", "live", "recorded")
+WIDTHS = (390, 600, 801, 1000, 1400)
+SMALL = """(() => {
+  const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+  while (texts.nextNode()) {
+    const {parentElement: at, data} = texts.currentNode;
+    if (!data.trim() || !at.checkVisibility?.() || at.closest('script, style')) continue;
+    if (parseFloat(getComputedStyle(at).fontSize) < 13) found.push(data.trim());
+  }
+  return found;
+})()"""
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"], "iframes": False}
 EDITOR = {"light": "=== 'rgb(255, 255, 255)'", "dark": "!== 'rgb(255, 255, 255)'"}
 
@@ -73,13 +122,12 @@ def violations(page: Page) -> list[str]:
 
 
 @pytest.mark.parametrize(("scheme", "size"), [("light", (1280, 900)), ("dark", (390, 844))])
-def test_controls_have_names_and_text_has_contrast(
+def test_text_is_large_and_has_contrast_and_nothing_is_wider_than_the_page(
     browser: Browser, address: str, scheme: str, size: tuple[int, int]
 ) -> None:
     page = Page(browser, address, size=size, scheme=scheme)
     page.js("document.head.insertAdjacentHTML('beforeend', '<style>*{transition:none !important}')")
-    if size[0] < 800:
-        page.press_button("settings")
+    page.js("localStorage.removeItem('lab-drawer'), labDrawer(true, false), labToggleGuide()")
     for part in ("all settings (form)", "trigger", "all settings (TOML)"):
         page.unfold(part)
     page.wait("!!document.querySelector('.cm-content[aria-label]')")
@@ -87,27 +135,32 @@ def test_controls_have_names_and_text_has_contrast(
         f"getComputedStyle(document.querySelector('.cm-editor')).backgroundColor {EDITOR[scheme]}"
     )
     page.wait(f"{TEXT}.includes('assumed (')")
-    for tab in TABS:
-        page.click(tab, ".q-tab")
-        page.wait(f"document.querySelector('.q-tab--active').innerText.trim() === {tab!r}")
-        assert violations(page) == [], tab
-        assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), tab
-    page.fill("beta", "abc")
-    page.wait("!!document.querySelector('.q-field--error')")
+    for source in SOURCES:
+        page.click(source, "button")
+        page.wait(f"document.body.dataset.labSource === {source!r}")
+        assert violations(page) == [], source
+        assert page.js(SMALL) == [], source
+        for width in WIDTHS:
+            page.resize(width, size[1])
+            assert page.js("document.scrollingElement.scrollWidth <= innerWidth"), (source, width)
+            place = page.js("document.getElementById('lab-figure').getBoundingClientRect().top")
+            assert place < 260, (source, width)  # it is the first thing below the bar
+        page.resize(*size)
+    page.fill("trigger.beta", "abc")
+    page.wait("!!document.querySelector('[aria-invalid=true]')")
     assert violations(page) == []
 
 
 FOCUSED = """(() => {
-  const at = document.activeElement, shown = at.closest('.q-slider, .q-field') || at;
+  const at = document.activeElement, shown = at.closest('.q-field') || at;
   const seen = [at, shown].some(e => getComputedStyle(e).boxShadow.includes('rgb(199, 119, 0)'));
-  const label = at.closest('label')?.querySelector('.q-field__label')?.innerText;
-  const name = at.closest('.q-slider')?.ariaLabel || at.ariaLabel || label;
-  return [name || at.innerText.split('\\n').pop(), seen, at === document.body];
+  const label = at.labels?.[0]?.innerText || at.closest('label')?.innerText.split('\\n')[0];
+  return [at.ariaLabel || label || at.innerText.split('\\n').pop(), seen, at === document.body];
 })()"""
 
 
-def test_the_keyboard_reaches_and_moves_everything(browser: Browser, address: str) -> None:
-    page = Page(browser, address)
+def reached_by_tab(page: Page) -> list[str]:
+    """Return the names of what the tabulator key reaches."""
     reached: list[str] = []
     for _ in range(60):
         page.press("Tab", 9)
@@ -119,26 +172,52 @@ def test_the_keyboard_reaches_and_moves_everything(browser: Browser, address: st
         if name == "loss probability":
             page.press("ArrowLeft", 37)
             page.wait("location.search.includes('network.loss.probability=0.79')")
-    sliders = page.js("[...document.querySelectorAll('.q-slider')].map(e => e.ariaLabel)")
-    labels = page.js("[...document.querySelectorAll('.q-field__label')].map(e => e.innerText)")
-    assert {*sliders, "scenario", "drawn state", "explore", "files", "dark or light"} <= {*reached}
-    assert {one for one in labels if one != "run"} <= {*reached}
+    return reached
+
+
+def test_the_keyboard_reaches_and_moves_everything(browser: Browser, address: str) -> None:
+    page = Page(browser, address)
+    page.js("localStorage.clear()")
+    reached = reached_by_tab(page)
+    labels = page.js("[...document.querySelectorAll('#lab-controls label')].map(e => e.innerText)")
+    assert {*labels, "settings", "tutorial", "scenario", "files", "dark or light"} <= {*reached}
+    assert {*SOURCES[:1], "keep for comparison", "compare", "drawn state"} <= {*reached}
+
+
+def test_the_drawer_opens_and_closes_by_the_keyboard_and_stays_so(
+    browser: Browser, address: str
+) -> None:
+    button = "document.querySelector('.lab-drawer-button')"
+    page = Page(browser, address, size=(390, 844))
+    assert page.js(f"{button}.ariaExpanded") == "false"  # a small screen shows the figure first
+    for state in ("true", "false"):
+        page.js(f"{button}.focus()")
+        page.press("Enter", 13)
+        page.wait(f"{button}.ariaExpanded === '{state}'")
+        page.go(address)
+        assert page.js(f"{button}.ariaExpanded") == state  # it is remembered
+        assert page.js("document.getElementById('lab-drawer').inert") == (state == "false")
+    page.js("labToggleGuide()")
+    page.wait("document.activeElement.innerText === 'next'")
+    page.press("Enter", 13)
+    page.wait(f"{TEXT}.includes('2 of 5: ') && location.search.includes('probability=0.5')")
+    page.press("Escape", 27)
+    page.wait(f"document.activeElement === {button} && {button}.ariaExpanded === 'false'")
+    page.js("localStorage.clear()")
 
 
 def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     browser: Browser, address: str, folder: Path
 ) -> None:
     page = Page(browser, address)
-    page.click("recorded runs", ".q-tab")
+    page.click("recorded", "button")
     page.wait(f"{TEXT}.includes('No run has ended in the folder runs yet')")
-    page.click("run live", ".q-tab")
-    page.wait(f"{TEXT}.includes('start as five processes on this machine')")
+    page.click("live", "button")
+    page.wait(f"{VERDICT}.includes('five processes on this machine')")
     page.click("run live", "button")
-    page.wait(f"{TEXT}.includes('ended: 4.0 of 4 s')")
-    verdict = "document.querySelector('[aria-label=verdict]').innerText"
-    page.wait("!!document.querySelector('[aria-label=verdict]')")
-    lines = page.js(verdict).split("\n")
-    assert "show the viewer here" not in page.js(TEXT)  # its server has ended with the loop
+    page.wait(f"{VERDICT}.startsWith('completed 4 s') && {TEXT}.includes('this run (recorded)')")
+    assert "the ideal loop with the settings of this page" in page.js(COMPARED)
+    lines = [line for line in page.js(VERDICT).split("\n") if line]
     assert lines[0].startswith("completed 4 s: stable, ‖x‖ fell from ")
     assert lines[1].startswith("guarantee ")
     assert " transmissions (ideal loop: " in lines[2]
@@ -146,11 +225,9 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
     (run,) = [path for path in (folder / "runs").iterdir() if not path.is_symlink()]
     report = page.js("[...document.links].find(e => e.innerText.startsWith('report')).href")
     assert report == f"{address.partition('?')[0]}report/{run.name}"
-    page.press_button("figures of this run")
-    page.wait("!!document.querySelector('iframe.lab-report')")
-    assert page.js("document.querySelector('iframe.lab-report').src") == report
-    page.click("replay", "button")
-    page.wait(f"{TEXT}.includes('bit-exact')")
+    page.press_button("replay this run")
+    page.wait(f"{TEXT}.includes('bit-exact') && {TEXT}.includes('this run (recorded)')")
+    assert page.js(VERDICT).split("\n")[0] == lines[0]
     # The report comes without scripts, and only for whom the page's address is known.
     page.call("Page.navigate", url=report)
     page.wait(f"{TEXT}.includes('completed 4 s') && origin === 'null'")
@@ -161,21 +238,19 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
         refused.value.close()
     # A new page selects the newest run.
     page.go(address)
-    page.click("recorded runs", ".q-tab")
+    page.click("recorded", "button")
     page.wait(
-        f"[...document.querySelectorAll('.q-select')].at(-1).innerText.includes({run.name!r})"
+        f"[...document.querySelectorAll('.q-select')].some(e => e.innerText.includes({run.name!r}))"
     )
 
 
 def test_a_click_reaches_the_run_while_the_viewer_draws(browser: Browser, address: str) -> None:
     page = Page(browser, address.partition("?")[0] + "?scenario=lane_following&horizon_s=600")
-    page.click("run live", ".q-tab")
+    page.click("live", "button")
     page.press_button("run live")
     page.wait(f"{TEXT}.includes('of 600 s')")
     log = "document.querySelector('.lab-log').innerText"
-    # This browser has no graphics card, so it does not draw the viewer unless asked.
-    assert not page.js("!!document.querySelector('iframe')")
-    page.press_button("show the viewer here")
+    page.press_button("show the rerun viewer")
     page.wait("!!document.querySelector('iframe')")
     viewer = page.js("document.querySelector('iframe').src")
     page.press_button("kill controller")
@@ -192,7 +267,7 @@ def test_ctrl_c_during_a_live_run_is_quiet_and_keeps_the_record(
 ) -> None:
     with Served(tmp_path) as server:
         page = Page(browser, server.address)
-        page.click("run live", ".q-tab")
+        page.click("live", "button")
         page.click("run live", "button")
         page.wait(f"{TEXT}.includes('all processes run')")
         page.drag("loss probability", 0.9)  # the draws are computed, too

@@ -48,13 +48,13 @@ def session_of(name: str, drawn: list[Session], calls: object = None, **settings
     for key, value in settings.items():
         draft = draft.with_value(key.replace("__", "."), value)
 
-    async def on_drawn() -> None:
+    async def on_rest() -> None:
         drawn.append(found)
         # What is there is not waited for any more.
         assert not known(found, CERTIFICATE) or "certificate" not in found.pending
         await asyncio.sleep(0)  # as the browser's answer is awaited
 
-    found = Session(cast("PageCalls", calls or Inline()), draft, on_drawn)
+    found = Session(cast("PageCalls", calls or Inline()), draft, on_rest, on_rest)
     return found
 
 
