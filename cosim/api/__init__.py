@@ -9,6 +9,9 @@ from importlib.metadata import version
 from cosim.analysis.certificates import Certificates as Certificates
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
+from cosim.api.new_loops import gain as gain
+from cosim.api.new_loops import linearise as linearise
+from cosim.api.new_loops import new as new
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run
