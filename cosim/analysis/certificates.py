@@ -4,7 +4,9 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
-from noack.core.errors import CallerError
+import numpy as np
+
+from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, Rows, as_html, as_text, number
 from noack.impairments.markov_chain import NotPredictableError
@@ -232,6 +234,8 @@ def with_weight(
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
+        except np.linalg.LinAlgError as error:  # extremely stiff models
+            raise CallerError(f"weight chosen: {one_line(error)}") from None
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
     return resolved.model_copy(
         update={"trigger": trigger.model_copy(update={"weight": rows})}

@@ -9,9 +9,6 @@ from importlib.metadata import version
 from cosim.analysis.certificates import Certificates as Certificates
 from cosim.api.explorer import Explorer as Explorer
 from cosim.api.explorer import explore as explore
-from cosim.api.new_loops import gain as gain
-from cosim.api.new_loops import linearise as linearise
-from cosim.api.new_loops import new as new
 from cosim.api.runs import Run as Run
 from cosim.api.runs import compare as compare
 from cosim.api.runs import open_run as open_run
@@ -28,6 +25,9 @@ from cosim.api.studies import certify as certify
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
+from cosim.studies.new_loop.linear_model import gain as gain
+from cosim.studies.new_loop.linear_model import linearise as linearise
+from cosim.studies.new_loop.new_scenario import new as new
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 

@@ -1,9 +1,9 @@
 """``noack linearise``, ``gain``, ``new``: from a plant to a scenario."""
 
 import json as json_format
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from typer import Argument, Option
 
@@ -13,15 +13,13 @@ from noack.core.errors import CallerError, MachineError, why
 from noack.core.file_access import new_file
 
 with lazy_modules():
-    from cosim.api import new_loops
-    from cosim.studies.new_loop import linear_model, loop_gain, new_scenario
+    from cosim.studies.new_loop import linear_model, new_scenario
     from noack.scenario import scenario_file
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from noack.settings.section import Table
 
+Number = TypeVar("Number", float, complex)
 PlantArgument = Annotated[
     str,
     Argument(
@@ -46,7 +44,7 @@ def linearise(
     """Print the linear model of a plant, its error, its eigenvalues and its controllable part.
 
     A plant with a derivative is differentiated; another one is moved, and the matrix logarithm of a
-    step is taken. For a plant in Python this runs its code.
+    step is taken. This runs the code of a plant in Python.
 
     Options:
         at: x at the point, e.g. 0,0,0.1,0; by default 0.
@@ -59,12 +57,11 @@ def linearise(
         noack linearise pole.py:Pole --out pole.json   a class of yours; write the model
         noack linearise four_tank --set plant.system.voltages_v=[4.0,4.0] --json   as JSON
     """
-    found = linear_model.linear_model(
-        plant, at=_numbers("--at", at), held=_numbers("--input", held),
+    found = linear_model.linearise(
+        plant, at=_numbers("--at", at), input=_numbers("--input", held),
         settings=_settings(settings), within=within,
     )  # fmt: skip
-    _write(out, found.to_json())
-    cli.show(json, found.to_json, _print_model, found)
+    _show(found, out, json=json)
 
 
 @cli.command(cli.FILES, 14)
@@ -92,13 +89,11 @@ def gain(
         noack gain pole.json --out pole.json   add a gain to a model that linearise wrote
         noack gain cart_pole --poles=-2,-3,-4,-5 --json   given poles, as JSON
     """
-    given = _settings(settings)
-    model = linear_model.linear_model(plant, settings=given)
-    found = loop_gain.loop_gain(
-        model, q=_numbers("--q", q), r=_numbers("--r", r), poles=_poles(poles)
-    )
-    _write(out, found.to_json())
-    cli.show(json, found.to_json, _print_gain, found)
+    found = linear_model.gain(
+        plant, q=_numbers("--q", q), r=_numbers("--r", r),
+        poles=_numbers("--poles", poles, complex), settings=_settings(settings),
+    )  # fmt: skip
+    _show(found, out, json=json)
 
 
 @cli.command(cli.FILES, 16)
@@ -128,14 +123,14 @@ def new(
         raise CallerError(f"{file}: the name of a scenario file ends in .toml")
     if file.exists():
         raise CallerError(f"{file}: exists; give another name, or remove it first")
-    given = _settings(settings)
     with cli.status("linearising") as status:
-        found = new_scenario.new_scenario(
-            new_loops.model_or_gain(plant, given), file, initial_state=_numbers("--x0", x0),
-            settings=given, report=status.update,
+        found = new_scenario.new(
+            plant, file, initial_state=_numbers("--x0", x0), settings=_settings(settings),
+            report=status.update,
         )  # fmt: skip
     found.save(file)
-    cli.show(json, found.to_json, _print_new, found, file)
+    following = f"wrote {file}; now noack check, certify, simulate or run {file}"
+    cli.print_lines(json, found.to_json(), *found.notes, following)
 
 
 def _settings(given: Sequence[str] | None) -> "Table":
@@ -149,48 +144,27 @@ def _settings(given: Sequence[str] | None) -> "Table":
     return found
 
 
-def _numbers(option: str, text: str | None) -> list[float] | None:
+def _numbers(
+    option: str, text: str | None, kind: Callable[[str], Number] = float
+) -> list[Number] | None:
     if text is None:
         return None
     try:
-        return [float(one) for one in text.strip("[]() ").split(",")]
+        return [kind(one) for one in text.replace(" ", "").strip("[]()").split(",")]
     except ValueError:
-        raise CallerError(f"{option} {text}: give numbers with commas, e.g. 0,0.1") from None
+        raise CallerError(f"{option} {text}: give numbers with commas, e.g. -1,-0.5") from None
 
 
-def _poles(text: str | None) -> list[complex] | None:
-    if text is None:
-        return None
-    try:
-        return [complex(one.replace(" ", "")) for one in text.strip("[]").split(",")]
-    except ValueError:
-        raise CallerError(
-            f"--poles {text}: give numbers with commas, e.g. -1,-2+1j,-2-1j"
-        ) from None
-
-
-def _write(out: Path | None, document: "Table") -> None:
-    if out is None:
-        return
-    if out.suffix != ".json":
-        raise CallerError(f"--out {out}: the name ends in .json")
-    try:
-        with new_file(out, make_folder=False) as file:
-            file.write(json_format.dumps(document, indent=2).encode())
-    except (OSError, ValueError) as error:
-        raise MachineError(f"{out}: cannot be written: {why(error)}") from None
-
-
-def _print_model(console: "Console", found: "linear_model.LinearModel") -> None:
-    for line in (repr(found), *found.sentences()):
-        console.print(line, markup=False, highlight=False, soft_wrap=line.count("\n") > 0)
-
-
-def _print_gain(console: "Console", found: "loop_gain.LoopGain") -> None:
-    for line in (repr(found), *found.sentences()):
-        console.print(line, markup=False, highlight=False, soft_wrap=line.count("\n") > 0)
-
-
-def _print_new(console: "Console", found: "new_scenario.NewScenario", file: Path) -> None:
-    for line in (*found.notes, f"wrote {file}; next: noack check, certify, simulate or run {file}"):
-        console.print(line, markup=False, highlight=False)
+def _show(
+    found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool
+) -> None:
+    """Print a result, and write its document."""
+    if out is not None:
+        try:
+            if out.suffix != ".json":
+                raise ValueError("the name of a model ends in .json")
+            with new_file(out, make_folder=False) as file:
+                file.write(json_format.dumps(found.to_json(), indent=2).encode())
+        except (OSError, ValueError) as error:
+            raise MachineError(f"--out {out}: cannot be written: {why(error)}") from None
+    cli.print_lines(json, found.to_json(), repr(found))

@@ -40,6 +40,7 @@ class PlantReference:
     """A plant, its numbers of states and inputs, and what is known about its runs."""
 
     label: str  # as the user named it
+    settings: ReadTable  # values by the keys of a scenario
     system: PlantSettings
     n: int
     m: int
@@ -47,6 +48,16 @@ class PlantReference:
     rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
     initial_state: tuple[float, ...] | None = None
     matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return self.names[0] or tuple(f"x_{i}" for i in range(1, self.n + 1))
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.names[1] or tuple(f"u_{j}" for j in range(1, self.m + 1))
 
     @property
     def step_ns(self) -> int:
@@ -89,21 +100,21 @@ def plant_reference(
             scenario_file.put(content, key, value, f"--set {key}")
     plant = content["plant"]
     assert isinstance(plant, dict)
-    system = settings_of(plant["system"], label)
+    system = _settings(plant["system"], label)
     rates = {key: float(plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
     if isinstance(system, GymnasiumSettings):
-        return _of_environment(label, system)
+        return _of_environment(label, settings, system)
     if isinstance(system, FmuSettings):
         n, m = len(system.state_variables), len(system.input_variables)
         names = _plain(system.state_variables), _plain(system.input_variables)
-        return PlantReference(label, system, n, m, names, rates)
+        return PlantReference(label, settings, system, n, m, names, rates)
     if isinstance(system, PythonPlantSettings):
         n, m = _sizes_of_class(system, label, sizes)
-        return PlantReference(label, system, n, m, (None, None), rates)
+        return PlantReference(label, settings, system, n, m, (None, None), rates)
     known = _of_scenario(str(system.scenario), {})
     initial = known.initial_state
     return PlantReference(
-        label, system, known.n, known.m, known.names, {**known.rates, **rates}, initial
+        label, settings, system, known.n, known.m, known.names, {**known.rates, **rates}, initial
     )
 
 
@@ -133,7 +144,7 @@ def _classes(path: Path) -> str:
     return f"write {path}:Class"
 
 
-def settings_of(table: object, label: str) -> PlantSettings:
+def _settings(table: object, label: str) -> PlantSettings:
     """Return validated settings whose file is found; an FMU may lack the names of variables."""
     assert isinstance(table, dict)
     if table["kind"] == "fmu" and not {"state_variables", "input_variables"} <= table.keys():
@@ -160,17 +171,17 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     resolved = resolve(scenario_file.completed(content, path))
     loop, plant = loop_of(resolved), resolved.plant
     return PlantReference(
-        label, plant.system, loop.n, loop.m, (loop.state_names, loop.input_names),
+        label, settings, plant.system, loop.n, loop.m, (loop.state_names, loop.input_names),
         {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every}, plant.initial_state,
         (loop.A, loop.B) if resolved.coverage.is_linear else None,
     )  # fmt: skip
 
 
-def _of_environment(label: str, system: GymnasiumSettings) -> PlantReference:
+def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
     environment = system.environment()
     n, m = len(environment.state), int(np.prod(environment.action_space.shape))
     rate_hz = float(f"{1 / system.step_of(environment):.12g}")
-    return PlantReference(label, system, n, m, (None, None), {"rate_hz": rate_hz})
+    return PlantReference(label, settings, system, n, m, (None, None), {"rate_hz": rate_hz})
 
 
 def _plain(names: Sequence[str]) -> tuple[str, ...]:
