@@ -326,10 +326,10 @@ def _notes(
     if not is_linear:
         errors = ", ".join(f"{of.max():.2g} within ±{w:g}" for w, of in trial.gain.model.errors)
         yield (
-            "The plant itself is not linear: the certificate does not cover it, and a run checks "
-            "only what holds for every plant. Largest relative error of the linear model, sampled: "
-            f"{errors}. A run with --set 'plant.system={{kind=\"linear\"}}' has the linear plant, "
-            "and is checked against the certificate."
+            "The plant itself is not linear: no certificate covers it, and a run checks only what "
+            "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "
+            "linear plant, and is checked against its certificate. Largest relative error of the "
+            f"linear model, sampled: {errors}."
         )
     start = ", ".join(f"{one:.3g}" for one in trial.x0)
     end = "returns to 0" if returns else "does not return to 0"

@@ -37,6 +37,8 @@ _NOISE = 100.0
 _ROUNDING = 1e-13
 _DIGITS = 10
 _SAMPLES = {"derivative": 1000, "motion": 100}
+_FORGOTTEN = 1e-12
+"""If an eigenvalue of a step is below this, a deviation is gone after the step."""
 _LOGARITHM = 1e-6
 """Largest relative difference between the step and the exponential of its logarithm."""
 
@@ -173,6 +175,8 @@ def _by_motion(
     sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (before, later)))
     if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
         return without(NO_STATE)
+    if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
+        return without(NO_LOGARITHM)
     with warnings.catch_warnings(action="ignore"):  # the result is checked next
         from scipy.linalg import expm, logm  # takes 0.2 s: linear plants do not need it
 
