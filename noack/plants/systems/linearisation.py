@@ -58,15 +58,6 @@ class LinearMotion:
     void: str | None = None
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """What A and B are compared with: the derivative, or the change of x over a step."""
-
-    change: Callable[[Vector, Vector], tuple[Vector, Vector]]
-    """(x, u) → x where the change begins, and the change."""
-    source: str
-
-
 def linearise(
     system_at: SystemAt,
     n: int,
