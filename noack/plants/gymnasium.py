@@ -5,7 +5,7 @@ effect.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -14,10 +14,7 @@ from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Vector
 from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
 from noack.settings.section import Positive
-from noack.settings.user_files import real_vector
-
-if TYPE_CHECKING:
-    Environment = Any  # of gymnasium, an extra of noack without which types are checked, too
+from noack.settings.user_files import UserCode, real_vector
 
 
 class GymnasiumSettings(PlantSettings):
@@ -37,7 +34,7 @@ class GymnasiumSettings(PlantSettings):
     """Time of a step; by default the environment's attribute dt or tau. plant.rate_hz must be its
     inverse."""
 
-    def environment(self) -> "Environment":
+    def environment(self) -> UserCode:
         """Return the environment.
 
         Raises:
@@ -57,7 +54,7 @@ class GymnasiumSettings(PlantSettings):
             raise CallerError(f"{place}: its state cannot be set: it has no vector `state`")
         return made
 
-    def step_of(self, environment: "Environment") -> float:
+    def step_of(self, environment: UserCode) -> float:
         """Return the time of a step, s; raise CallerError if the environment has none."""
         own = (getattr(environment, name, None) for name in ("dt", "tau"))
         step_s = self.step_s or next((float(step) for step in own if step), None)

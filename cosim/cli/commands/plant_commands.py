@@ -58,9 +58,12 @@ def linearise(
         noack linearise four_tank --set plant.system.voltages_v=[4.0,4.0] --json   as JSON
     """
     found = linear_model.linearise(
-        plant, at=_numbers("--at", at), input=_numbers("--input", held),
-        settings=_settings(settings), within=within,
-    )  # fmt: skip
+        plant,
+        at=_numbers("--at", at),
+        input=_numbers("--input", held),
+        settings=_settings(settings),
+        within=within,
+    )
     _show(found, out, json=json)
 
 
@@ -90,9 +93,12 @@ def gain(
         noack gain cart_pole --poles=-2,-3,-4,-5 --json   given poles, as JSON
     """
     found = linear_model.gain(
-        plant, q=_numbers("--q", q), r=_numbers("--r", r),
-        poles=_numbers("--poles", poles, complex), settings=_settings(settings),
-    )  # fmt: skip
+        plant,
+        q=_numbers("--q", q),
+        r=_numbers("--r", r),
+        poles=_numbers("--poles", poles, complex),
+        settings=_settings(settings),
+    )
     _show(found, out, json=json)
 
 
@@ -125,9 +131,12 @@ def new(
         raise CallerError(f"{file}: exists; give another name, or remove it first")
     with cli.status("linearising") as status:
         found = new_scenario.new(
-            plant, file, initial_state=_numbers("--x0", x0), settings=_settings(settings),
+            plant,
+            file,
+            initial_state=_numbers("--x0", x0),
+            settings=_settings(settings),
             report=status.update,
-        )  # fmt: skip
+        )
     found.save(file)
     following = f"wrote {file}; now noack check, certify, simulate or run {file}"
     cli.print_lines(json, found.to_json(), *found.notes, following)

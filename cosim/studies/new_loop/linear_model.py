@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +18,7 @@ from noack.plants.systems.linearisation import LinearMotion, largest_errors
 from noack.plants.systems.linearisation import linearise as linear_motion
 from noack.scenario.sections import instability
 from noack.settings.section import ReadTable, Table
+from noack.settings.user_files import UserCode
 
 TOLERANCE = 1e-6
 """Relative size below which an entry of the controllability matrix is 0."""
@@ -79,15 +79,22 @@ class LinearModel:
 
     def to_json(self) -> Table:
         """Return the document of ``noack linearise --json``."""
-        return {
-            "plant": self.plant.label, "settings": self.plant.settings, "at": self.at.tolist(),
-            "input": self.input.tolist(), "A": self.A.tolist(), "B": self.B.tolist(),
-            "drift": self.drift.tolist(), "is_equilibrium": self.rests, "source": self.source,
-            "errors": [{"within": within, "of_states": of.tolist()} for within, of in self.errors],
-            "eigenvalues": _pairs(self.eigenvalues), "rank": self.rank, "tolerance": TOLERANCE,
-            "uncontrollable": _pairs(self.uncontrollable),
-            "is_stabilisable": bool((self.uncontrollable.real < 0).all()),
-        }  # fmt: skip
+        arrays = {key: getattr(self, key).tolist() for key in ("at", "input", "A", "B", "drift")}
+        errors = [{"within": within, "of_states": of.tolist()} for within, of in self.errors]
+        return (
+            {"plant": self.plant.label, "settings": self.plant.settings}
+            | arrays
+            | {
+                "is_equilibrium": self.rests,
+                "source": self.source,
+                "errors": errors,
+                "eigenvalues": _pairs(self.eigenvalues),
+                "rank": self.rank,
+                "tolerance": TOLERANCE,
+                "uncontrollable": _pairs(self.uncontrollable),
+                "is_stabilisable": bool((self.uncontrollable.real < 0).all()),
+            }
+        )
 
     def __repr__(self) -> str:
         states, inputs = self.plant.state_names, self.plant.input_names
@@ -147,19 +154,22 @@ class LoopGain:
     def to_json(self) -> Table:
         """Return the document of ``noack gain --json``: that of the model, and the gain."""
         return self.model.to_json() | {
-            "gain": self.K.tolist(), "method": self.method,
+            "gain": self.K.tolist(),
+            "method": self.method,
             "closed_loop_eigenvalues": _pairs(self.eigenvalues),
             "alpha_below_per_s": self.decay_per_s,
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         plant = self.model.plant
-        return "\n".join([
-            _matrix("K", self.K, plant.input_names, plant.state_names),
-            f"u = K x; {self.method}",
-            f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
-            f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
-        ])  # fmt: skip
+        return "\n".join(
+            [
+                _matrix("K", self.K, plant.input_names, plant.state_names),
+                f"u = K x; {self.method}",
+                f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
+                f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
+            ]
+        )
 
 
 def linearise(
@@ -191,10 +201,12 @@ def linearise(
     if plant.endswith(".json"):
         document = read_document(Path(plant))
         return linearise(
-            document["plant"], at=document["at"] if at is None else at,
+            document["plant"],
+            at=document["at"] if at is None else at,
             input=document["input"] if input is None else input,
-            settings=document["settings"] | dict(settings or {}), within=within,
-        )  # fmt: skip
+            settings=document["settings"] | dict(settings or {}),
+            within=within,
+        )
     if not (np.isfinite(within) and within > 0):
         raise CallerError(f"within: {within:g}; give a positive number")
     sizes = (None if at is None else len(at), None if input is None else len(input))
@@ -330,12 +342,13 @@ def eigenvalues(matrix: Matrix) -> Complex:
 
 def eigenvalue_text(values: Complex) -> str:
     """Return eigenvalues as text, conjugate pairs as one: "-0.81±0.5j, -5.8"."""
-    scale = max(1.0, float(np.abs(values).max(initial=0.0)))
-    return ", ".join(
-        f"{value.real:.4g}±{value.imag:.4g}j" if value.imag > _REAL * scale
-        else f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}"
-        for value in values if value.imag >= -_REAL * scale
-    )  # fmt: skip
+    scale, shown = max(1.0, float(np.abs(values).max(initial=0.0))), list[str]()
+    for value in values:
+        if value.imag > _REAL * scale:
+            shown.append(f"{value.real:.4g}±{value.imag:.4g}j")
+        elif value.imag >= -_REAL * scale:
+            shown.append(f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}")
+    return ", ".join(shown)
 
 
 def vector(key: str, given: object, size: int, what: str) -> Vector:
@@ -351,7 +364,7 @@ def vector(key: str, given: object, size: int, what: str) -> Vector:
     return found
 
 
-def read_document(path: Path) -> dict[str, Any]:
+def read_document(path: Path) -> dict[str, UserCode]:
     """Return the document of a file that ``noack linearise`` or ``noack gain`` wrote."""
     try:
         document = json.loads(path.read_bytes())

@@ -92,8 +92,10 @@ class NewScenario:
         """Return the document of ``noack new --json``."""
         found = self.certificate and self.certificate.to_json()
         return self.gain.to_json() | {
-            "toml": self.text, "notes": self.notes, "certificate": found,
-        }  # fmt: skip
+            "toml": self.text,
+            "notes": self.notes,
+            "certificate": found,
+        }
 
     def __repr__(self) -> str:
         return self.text
@@ -219,26 +221,32 @@ class _Builder:
             "horizon_s": horizon_s,
             "speed": max(1.0, float(round(horizon_s / _LONGEST_RUN_S))),
             "model": {
-                "A": model.A.tolist(), "B": model.B.tolist(), "gain": trial.gain.K.tolist(),
+                "A": model.A.tolist(),
+                "B": model.B.tolist(),
+                "gain": trial.gain.K.tolist(),
                 "state_names": list(reference.state_names),
                 "input_names": list(reference.input_names),
             },
             "plant": {
-                "initial_state": trial.x0.tolist(), "rate_hz": trial.rate_hz,
+                "initial_state": trial.x0.tolist(),
+                "rate_hz": trial.rate_hz,
                 "measure_every": int(reference.rates.get("measure_every", 1)),
                 "system": self._system(),
             },
             "controller": {"rate_hz": trial.rate_hz},
             "trigger": {
-                "policy": "decaying", "beta": beta, "alpha_per_s": alpha,
-                "floor": rounded(_FLOOR_SHARE * beta), **({"weight": weight} if weight else {}),
+                "policy": "decaying",
+                "beta": beta,
+                "alpha_per_s": alpha,
+                "floor": rounded(_FLOOR_SHARE * beta),
+                **({"weight": weight} if weight else {}),
             },
             "network": {
                 "mansd": trial.mansd,
                 "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
             },
             "seeds": {"loss": 1},
-        }  # fmt: skip
+        }
         for key, value in self._fixed.items():
             put(content, key, value, f"--set {key}")
         return content

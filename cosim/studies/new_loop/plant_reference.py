@@ -171,10 +171,16 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
     resolved = resolve(scenario_file.completed(content, path))
     loop, plant = loop_of(resolved), resolved.plant
     return PlantReference(
-        label, settings, plant.system, loop.n, loop.m, (loop.state_names, loop.input_names),
-        {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every}, plant.initial_state,
+        label,
+        settings,
+        plant.system,
+        loop.n,
+        loop.m,
+        (loop.state_names, loop.input_names),
+        {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
+        plant.initial_state,
         (loop.A, loop.B) if resolved.coverage.is_linear else None,
-    )  # fmt: skip
+    )
 
 
 def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
