@@ -28,6 +28,7 @@ else:
 
 __all__ = [
     "CampaignResult", "Certificates", "Explorer", "Measurement", "NoackError", "Run", "Scenario",
-    "__version__", "campaign", "certify", "compare", "explore", "from_system", "load", "margin",
-    "measure", "open_run", "reproduce", "run", "save_tables", "simulate", "with_settings",
+    "__version__", "campaign", "certify", "compare", "explore", "from_system", "gain", "linearise",
+    "load", "margin", "measure", "new", "open_run", "reproduce", "run",
+    "save_tables", "simulate", "with_settings",
 ]  # fmt: skip

@@ -6,10 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Matrix
 from noack.core.number_format import NONE, Rows, as_html, as_text, number
 from noack.impairments.markov_chain import NotPredictableError
+from noack.plants.linear import LinearSettings
 from noack.scenario.resolution import loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.theory.bounds.enclosure import NotDecayingError, norm_bounds, response
@@ -82,6 +83,8 @@ class Certificates:
     """What holds without a limit on the losses; None if the network enforces its guarantee, or if
     the losses are no Markov chain over the packets (``unpredictable`` is the reason)."""
     unpredictable: str | None
+    nonlinear: str | None = None
+    """Why the certificates are for the model as the plant, not for the plant itself; else None."""
 
     def __init__(
         self,
@@ -179,6 +182,7 @@ class Certificates:
         """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return {
             "scenario": self.scenario.name,
+            "of_the_model_only": self.nonlinear,
             "setpoint": self.setpoint,
             "weight": None if self.weight is None else self.weight.tolist(),
             "error_in_given_norm": self.error_in_given_norm,
@@ -257,10 +261,18 @@ def with_weight(
             )  # fmt: skip
         except NotDecayingError as error:
             raise CallerError(f"weight chosen: {error}") from None
+        except np.linalg.LinAlgError as error:  # extremely stiff models
+            raise CallerError(f"weight chosen: {one_line(error)}") from None
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
     return resolved.model_copy(
         update={"trigger": trigger.model_copy(update={"weight": rows})}
     ), weight
+
+
+def with_linear_plant(resolved: Scenario) -> Scenario:
+    """Return the scenario with its model as the plant."""
+    plant = resolved.plant.model_copy(update={"system": LinearSettings()})
+    return resolved.model_copy(update={"plant": plant})
 
 
 def certificates_of(
@@ -268,6 +280,8 @@ def certificates_of(
     weight: str = "given",
     late_periods: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
+    *,
+    of_model: bool = False,
 ) -> Certificates:
     """Certify a scenario under the paper's conditions and under its own schedule.
 
@@ -276,17 +290,23 @@ def certificates_of(
         weight: ``given``, ``identity`` or ``chosen``.
         late_periods: allowed lateness in steps of the plant, 0 to 1000; by default the scenario's.
         progress: called with the completed share of the choice of a weight.
+        of_model: if the plant is not linear, certify the model as the plant; ``nonlinear`` says so.
 
     Raises:
         CallerError: the choice is unknown, or no certificate covers this scenario.
     """
-    resolved = resolve(scenario)
+    resolved, nonlinear = resolve(scenario), None
+    if of_model and not resolved.coverage.is_linear:
+        nonlinear = f'plant.system.kind = "{resolved.plant.system.kind}"'
+        resolved = with_linear_plant(resolved)
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
     if not 0 <= allowed <= MOST_LATE:
         raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
     weighted, W = with_weight(resolved, weight, allowed, progress)
     given = getattr(resolved.trigger, "weight", None)
-    return Certificates(weighted, allowed, W, None if given is None else np.array(given))
+    found = Certificates(weighted, allowed, W, None if given is None else np.array(given))
+    found.nonlinear = nonlinear
+    return found
 
 
 def in_chosen_norm(
@@ -300,7 +320,7 @@ def in_chosen_norm(
         progress: called with the completed share of the choice.
     """
     with contextlib.suppress(CallerError):  # no weight can be chosen for this scenario
-        chosen = certificates_of(scenario, "chosen", found.late_periods, progress)
+        chosen = certificates_of(scenario, "chosen", found.late_periods, progress, of_model=True)
         return chosen if chosen.schedule.constants is not None else None
     return None
 

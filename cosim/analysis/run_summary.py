@@ -41,7 +41,8 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
-from noack.plants.plant_settings import PlantSystem, linearise
+from noack.plants.plant_settings import PlantSystem
+from noack.plants.systems.linearisation import linearise
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -314,9 +315,11 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     n, m = loop.n, loop.m
     try:
         with np.errstate(all="ignore"):
-            A, B = plant.system.linearisation() or linearise(
-                system_at, n, m, settling_s=plant.system.settling_s
-            )
+            if (exact := plant.system.linearisation()) is not None:
+                A, B = exact
+            else:
+                found = linearise(system_at, n, m, settling_s=plant.system.settling_s)
+                A, B = found.A, found.B
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):

@@ -25,6 +25,9 @@ from cosim.api.studies import certify as certify
 from cosim.api.studies import margin as margin
 from cosim.api.studies import measure as measure
 from cosim.api.studies import save_tables as save_tables
+from cosim.studies.new_loop.linear_model import gain as gain
+from cosim.studies.new_loop.linear_model import linearise as linearise
+from cosim.studies.new_loop.new_scenario import new as new
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
 

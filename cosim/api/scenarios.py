@@ -10,6 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.shipped_files import find_shipped
+from cosim.studies.new_loop import (
+    ALPHA_SHARE,
+    BETA_SHARE,
+    LOSS_PROBABILITY,
+    MANSD,
+    SETTLED,
+    rounded,
+)
 from noack.core.errors import CallerError
 from noack.core.linear_systems import spectral_abscissa
 from noack.scenario import toml_file
@@ -20,12 +28,6 @@ from noack.settings.section import ReadTable, Table
 
 Source = Scenario | str | PathLike[str] | ReadTable
 """A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""
-
-_BETA_SHARE = 0.1
-_ALPHA_SHARE = 0.5
-_SETTLED = 0.01
-_MANSD = 4
-_LOSS_PROBABILITY = 0.5
 
 
 def load(source: Source, settings: ReadTable | None = None) -> Scenario:
@@ -111,7 +113,7 @@ def from_system(
     model = model_of(system, gain, state_names=state_names, input_names=input_names)
     A, B = model.matrices
     decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
-    alpha_per_s = _rounded(_ALPHA_SHARE * decay_per_s)
+    alpha_per_s = rounded(ALPHA_SHARE * decay_per_s)
     start = plain(initial_state)
     # If it is no vector, the validation reports the mistake.
     norm = float(np.linalg.norm(start)) if _is_vector(start) else 0.0
@@ -121,17 +123,17 @@ def from_system(
         true_plant |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
     content: Table = {
         "name": name,
-        "horizon_s": _rounded(math.log(1 / _SETTLED) / alpha_per_s),
+        "horizon_s": rounded(math.log(1 / SETTLED) / alpha_per_s),
         "model": model.model_dump(mode="json", exclude_none=True),
         "plant": true_plant,
         "trigger": {
             "policy": "decaying",
-            "beta": _rounded(_BETA_SHARE * norm or _BETA_SHARE),
+            "beta": rounded(BETA_SHARE * norm or BETA_SHARE),
             "alpha_per_s": alpha_per_s,
         },
         "network": {
-            "mansd": _MANSD,
-            "loss": {"model": "bernoulli", "probability": _LOSS_PROBABILITY},
+            "mansd": MANSD,
+            "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
         },
     }
     return _completed(content, settings, Path("from_system"))
@@ -174,7 +176,3 @@ def plain(value: object) -> object:
 
 def _is_vector(value: object) -> TypeGuard[list[float]]:
     return isinstance(value, list) and all(isinstance(entry, int | float) for entry in value)
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.3g}")

@@ -59,6 +59,8 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
     >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
     no two events closer than 8 ms
 
+    If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
+
     Args:
         scenario: a scenario, or a source that :func:`noack.load` accepts.
         weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
@@ -68,10 +70,9 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
 
     Raises:
         NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
-            the paper's, its plant is not linear or is disturbed, or the state is not fully
-            measured.
+            the paper's, its updates are acknowledged, or u is not K x_c.
     """
-    return certificates_of(load(scenario), weight, late)
+    return certificates_of(load(scenario), weight, late, of_model=True)
 
 
 def margin(

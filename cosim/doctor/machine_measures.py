@@ -37,6 +37,7 @@ from noack.scenario.scenario import Scenario
 T = TypeVar("T")
 EXTRAS = {
     "fmi": ("fmpy", 'plants of kind "fmu"'),
+    "gymnasium": ("gymnasium", 'plants of kind "gymnasium"'),
     "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
     "cluster": ("distributed", "`noack campaign --scheduler`"),
     "mcap": ("mcap", "`noack export --format mcap`"),

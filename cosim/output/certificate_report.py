@@ -29,6 +29,11 @@ def print_certificates(
 ) -> None:
     """Print the tables, and what is certified in a norm that noack chose instead."""
     constants, *limits = certificate_tables(found)
+    if found.nonlinear is not None:
+        console.print(
+            f"[yellow]the plant is not linear[/] ({escape(found.nonlinear)}): what follows is "
+            "certified for the linear plant ẋ = Âx + B̂u in its place, not for the plant itself"
+        )
     console.print(terminal_table(constants))
     _print_notes(console, found)
     if any(found.setpoint or ()):
@@ -83,7 +88,8 @@ def _in_words(found: Certificates) -> Iterator[str]:
         constants = certificate.constants
         if under != SCHEDULE or constants is None:
             continue
-        plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
+        own = "the scenario's plant" if found.nonlinear is None else "the model as the plant"
+        plants = "every plant of the box" if certificate.scope == BOX else own
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" The inter-event time is at least {_limit(spacing_s)}."

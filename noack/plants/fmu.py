@@ -36,7 +36,7 @@ from noack.plants.plant_settings import (
     SystemFailedError,
 )
 from noack.settings.section import Row, require_length
-from noack.settings.user_files import FileSettings, unchanged
+from noack.settings.user_files import FileSettings, NamedFile, unchanged
 
 if TYPE_CHECKING:  # an extra of noack, and slow to import
     from fmpy.fmi1 import _FMU
@@ -129,7 +129,7 @@ class FmuSystem:
         end = contextlib.ExitStack()
         weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
-            description = self._described(path)
+            description = _described(path)
             self.about = _about(description)
             self._instance = self._loaded(path, end, description)
             self._start(settings, x0, description)
@@ -159,19 +159,6 @@ class FmuSystem:
 
     def _wrong(self, message: str) -> NoReturn:
         raise CallerError(f"{self._place}: {message}")
-
-    def _described(self, path: Path) -> "ModelDescription":
-        fmpy = _fmpy()
-        try:
-            with path.open("rb") as file:  # FMPy does not close a file that it cannot read
-                description = fmpy.read_model_description(file, validate=False)
-        except Exception as error:  # a file that is not an FMU can raise any error
-            self._wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
-        if description.fmiVersion.startswith("1."):
-            self._wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
-        if description.coSimulation is None:
-            self._wrong("is not for co-simulation; export it as a co-simulation FMU")
-        return description
 
     def _loaded(
         self, path: Path, end: contextlib.ExitStack, description: "ModelDescription"
@@ -236,6 +223,35 @@ class FmuSystem:
                 f"plant.initial_state: it is {x0.tolist()}, but the FMU begins at "
                 f"{self.x.tolist()}; name in plant.system.initial_variables the variables to set"
             )
+
+
+def variables_of(path: Path) -> dict[str, list[str]]:
+    """Return the keys state_variables and input_variables for an FMU.
+
+    The states are the variables whose derivatives the FMU names; if it names none, its outputs.
+    """
+    real = [one for one in _described(path).modelVariables if _not_a_real_scalar(one) is None]
+    states = [one.derivative.name for one in real if one.derivative is not None]
+    outputs = [one.name for one in real if one.causality == "output"]
+    inputs = [one.name for one in real if one.causality == "input"]
+    return {"state_variables": states or outputs, "input_variables": inputs}
+
+
+def _described(path: Path) -> "ModelDescription":
+    """Return an FMU's description; raise CallerError unless it is for co-simulation, FMI 2 or 3."""
+    file = NamedFile(path.name, path.parent, "plant.system")
+    file.sha256()  # it can be read
+    fmpy = _fmpy()
+    try:
+        with path.open("rb") as content:  # FMPy does not close a file that it cannot read
+            description = fmpy.read_model_description(content, validate=False)
+    except Exception as error:  # a file that is not an FMU can raise any error
+        file.wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
+    if description.fmiVersion.startswith("1."):
+        file.wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 are supported")
+    if description.coSimulation is None:
+        file.wrong("is not for co-simulation; export it as a co-simulation FMU")
+    return description
 
 
 class _Instance:

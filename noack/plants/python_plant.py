@@ -86,6 +86,10 @@ class PythonSystem:
             self._system.advance(u, t_ns, dt_ns)
             self._copy_state()
 
+    def rates(self, x: Vector, u: Vector) -> Vector | None:
+        """Return dx/dt, (n,); None if the class has no derivative of x."""
+        return self._system.rates(x, u) if isinstance(self._system, OdeSystem) else None
+
     def _copy_state(self) -> None:
         self.x = real_vector("x", self._system.x, len(self.x))
         if self._recorded:

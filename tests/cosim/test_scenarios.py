@@ -22,8 +22,9 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate, simulate_loops
 from noack.core.linear_systems import Matrix
 from noack.plants.four_tank import FourTankSettings
-from noack.plants.plant_settings import OdeSystem, linearise
+from noack.plants.plant_settings import OdeSystem
 from noack.plants.quadrotor import QuadrotorSettings
+from noack.plants.systems.linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
 from noack.scenario.link_load import require_capacity
 from noack.scenario.resolution import LoopMatrices, loop_of, resolve
@@ -115,7 +116,8 @@ def closed(found: LoopMatrices) -> Matrix:
 
 def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
     settings = FourTankSettings(kind="four_tank", **given)
-    return linearise(lambda x0: OdeSystem(settings.equations(), x0), 4, 2)
+    found = linearise(lambda x0: OdeSystem(settings.equations(), x0), 4, 2)
+    return found.A, found.B
 
 
 def zeros(A: Matrix, B: Matrix) -> list[float]:
@@ -172,9 +174,9 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
 def test_the_quadrotors_gain_is_the_regulator_named_in_its_scenario() -> None:
     """Its model is the linearisation of its plant."""
     found, settings = loop("quadrotor_hover"), QuadrotorSettings(kind="quadrotor")
-    A, B = linearise(lambda x0: OdeSystem(settings.equations(), x0), 12, 4)
-    np.testing.assert_allclose(found.A_model, A, atol=1e-6)
-    np.testing.assert_allclose(found.B_model, B, atol=1e-5)
+    linear = linearise(lambda x0: OdeSystem(settings.equations(), x0), 12, 4)
+    np.testing.assert_allclose(found.A_model, linear.A, atol=1e-6)
+    np.testing.assert_allclose(found.B_model, linear.B, atol=1e-5)
     Q, R = np.diag([1.0] * 6 + [0.5] * 3 + [0.1] * 3), np.diag([1.0, 100.0, 100.0, 100.0])
     P = solve_continuous_are(found.A_model, found.B_model, Q, R)
     np.testing.assert_allclose(found.K, -np.linalg.solve(R, found.B_model.T @ P), atol=1e-5)

@@ -35,7 +35,7 @@ def certify(
     """Compute the bounds that are guaranteed for a scenario, and their conditions.
 
     If there are none for the given norm, those of a norm that noack chooses follow, with the lines
-    for the scenario file.
+    for the scenario file. If the plant is not linear, the model is certified as the plant.
 
     Exit status 1: nothing can be certified, not even under the paper's conditions.
 
@@ -52,9 +52,9 @@ def certify(
     loaded, chosen = given.load(), None
     if weight == "chosen":
         with progress.work_bar("choosing the weight") as bar:
-            found = certificates.certificates_of(loaded, weight, late, bar)
+            found = certificates.certificates_of(loaded, weight, late, bar, of_model=True)
     else:
-        found = certificates.certificates_of(loaded, weight, late)
+        found = certificates.certificates_of(loaded, weight, late, of_model=True)
     if weight == "given" and found.schedule.constants is None:
         with progress.work_bar("no certificate in the given norm; choosing another") as bar:
             chosen = certificates.in_chosen_norm(loaded, found, bar)

@@ -98,7 +98,7 @@ def test_the_box_is_certified_and_shown(scenario: noack.Scenario) -> None:
     [
         ("double_integrator", {"weight": "best"}, "weight: given, identity or chosen, not"),
         ("double_integrator", {"late": -1}, "late: -1 steps; give 0 to 1000"),
-        ("cart_pole", {}, "the plant is not linear"),
+        ("model_predictive", {}, "u is not K x_c; no certificate covers this"),
     ],
 )
 def test_a_missing_certificate_gives_one_line(

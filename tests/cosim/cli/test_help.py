@@ -77,7 +77,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 AS_THEY_ARE = (
     "archive", "check", "export", "schema", "summary", "replay", "fidelity", "report", "scenarios",
-    "measure", "certify",
+    "measure", "certify", "linearise", "gain",
 )  # fmt: skip
 MORE = dict.fromkeys(AS_THEY_ARE, ()) | {
     "margin": ("--most", "2", "--no-period"),

@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 
 from noack.plants.cart_pole import CartPoleSettings
 from noack.plants.dc_motor import DcMotor, DcMotorSettings
-from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantSettings, linearise
+from noack.plants.plant_settings import OdeSystem, PlantEquations, PlantSettings
 from noack.plants.systems import jump_integrator
 from noack.plants.systems.jump_integrator import DONE, advance, buffers
+from noack.plants.systems.linearisation import linearise
 from noack.scenario.resolution import resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
@@ -110,10 +111,11 @@ def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
 
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
     """Open-loop poles by the Control Tutorials (MATLAB): 0, -0.1428, -5.6041, 5.5651."""
-    A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
-    poles = np.sort(np.linalg.eigvals(A).real)
+    equations = CartPoleSettings(kind="cart_pole").equations()
+    found = linearise(lambda x0: OdeSystem(equations, x0), 4, 1)
+    poles = np.sort(np.linalg.eigvals(found.A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
-    np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
+    np.testing.assert_allclose(found.B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
 
 
 def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:

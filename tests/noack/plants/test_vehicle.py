@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 
 from noack.core.errors import CallerError
 from noack.plants import vehicle as compiled
-from noack.plants.plant_settings import OdeSystem, linearise
+from noack.plants.plant_settings import OdeSystem
+from noack.plants.systems.linearisation import linearise
 from noack.plants.vehicle import VehicleSettings, equations, library
 from noack.scenario.named_models import single_track_lane
 from tests.noack.plants.motion import H_NS, motion
@@ -29,9 +30,10 @@ def parameters(car: str) -> Any:
 
 
 def linearised(chosen: VehicleSettings) -> tuple[np.ndarray, np.ndarray]:
-    return linearise(
+    found = linearise(
         lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
     )
+    return found.A, found.B
 
 
 @pytest.mark.parametrize("car", CARS)

@@ -1,0 +1,411 @@
+"""The linear model of a plant at a point, and the gain of a loop with it."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cosim.studies.new_loop import rounded
+from cosim.studies.new_loop.plant_reference import PlantReference, plant_reference
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, norm
+from noack.core.number_format import Rows, as_text
+from noack.plants.systems.linearisation import LinearMotion, largest_errors
+from noack.plants.systems.linearisation import linearise as linear_motion
+from noack.scenario.sections import instability
+from noack.settings.section import ReadTable, Table
+from noack.settings.user_files import UserCode
+
+TOLERANCE = 1e-6
+"""Relative size below which an entry of the controllability matrix is 0."""
+_REST = 1e-6
+"""A drift below this share of the largest entry of A and B is rounding."""
+_ROUGH, _ROUGH_LEAST = 0.5, 1e-3
+_REAL, _ZERO = 1e-7, 1e-12
+"""Sizes, relative to the largest eigenvalue, below which imaginary parts and numbers are 0."""
+_DIGITS = 10
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """A plant's linear model ẋ ≈ drift + A (x − at) + B (u − input); n states, m inputs.
+
+    ``A``, (n, n), and ``B``, (n, m), are per second. ``errors`` has the half-width of a
+    neighbourhood and the relative error of each state in it. ``eigenvalues`` are those of A,
+    ``rank`` is that of the controllability matrix, and no input changes the eigenvalues
+    ``uncontrollable``.
+    """
+
+    plant: PlantReference
+    A: Matrix
+    B: Matrix
+    at: Vector
+    input: Vector
+    drift: Vector
+    source: str  # "derivative" or "motion", or "exact" if the plant has A and B itself
+    errors: tuple[tuple[float, Vector], ...]
+
+    @property
+    def eigenvalues(self) -> Complex:
+        """Eigenvalues of A, per second, the largest real part first."""
+        return eigenvalues(self.A)
+
+    @property
+    def rank(self) -> int:
+        """Rank of the controllability matrix."""
+        return len(self.controllable.T)
+
+    @cached_property
+    def controllable(self) -> Matrix:
+        """An orthonormal basis of the controllable states, (n, rank)."""
+        return controllable_states(self.A, self.B)
+
+    @property
+    def uncontrollable(self) -> Complex:
+        """The eigenvalues that no input changes, per second."""
+        rest = np.linalg.svd(np.hstack([self.controllable, 0 * self.A]))[0][:, self.rank :]
+        return eigenvalues(rest.T @ self.A @ rest)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the plant rests at the point."""
+        scale = np.abs(np.hstack([self.A, self.B])).max(axis=1)
+        return bool((np.abs(self.drift) <= _REST * scale).all())
+
+    def to_json(self) -> Table:
+        """Return the document of ``noack linearise --json``."""
+        arrays = {key: getattr(self, key).tolist() for key in ("at", "input", "A", "B", "drift")}
+        errors = [{"within": within, "of_states": of.tolist()} for within, of in self.errors]
+        return (
+            {"plant": self.plant.label, "settings": self.plant.settings}
+            | arrays
+            | {
+                "is_equilibrium": self.rests,
+                "source": self.source,
+                "errors": errors,
+                "eigenvalues": _pairs(self.eigenvalues),
+                "rank": self.rank,
+                "tolerance": TOLERANCE,
+                "uncontrollable": _pairs(self.uncontrollable),
+                "is_stabilisable": bool((self.uncontrollable.real < 0).all()),
+            }
+        )
+
+    def __repr__(self) -> str:
+        states, inputs = self.plant.state_names, self.plant.input_names
+        both = np.hstack([self.A, self.B])
+        return "\n".join([_matrix("Â, B̂", both, states, states + inputs), *self._sentences()])
+
+    def _sentences(self) -> Iterator[str]:
+        way = {
+            "derivative": "differences of its derivative",
+            "motion": f"the matrix logarithm of its motion over {self.plant.step_ns * 1e-9:g} s",
+            "exact": "the plant's own matrices",
+        }[self.source]
+        yield f"computed from {way}, at x = {_shown(self.at)}, u = {_shown(self.input)}"
+        if not self.rests:
+            move, *_ = np.linalg.lstsq(np.hstack([self.A, self.B]), -self.drift, rcond=None)
+            x, u = np.split(np.concatenate([self.at, self.input]) + move, [len(self.A)])
+            yield f"no equilibrium: ẋ = {_shown(self.drift)} there"
+            yield f"the linear model rests at x = {_shown(x)}, u = {_shown(u)}"
+        for within, error in self.errors:
+            worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
+            name = self.plant.state_names[worst]
+            yield f"relative error within ±{within:g}, sampled: up to {error[worst]:.2g} ({name})"
+        if self.errors and self._is_rough(*(error for _, error in self.errors)):
+            yield "the error does not shrink with the neighbourhood: the plant is not smooth there"
+        yield f"eigenvalues: {eigenvalue_text(self.eigenvalues)} /s"
+        yield f"controllable: {self.rank} of {len(self.A)} states (tolerance {TOLERANCE:g})"
+        if len(rest := self.uncontrollable):
+            effect = "stable" if rest[0].real < 0 else "no gain stabilises the plant"
+            yield f"not controllable: the eigenvalues {eigenvalue_text(rest)} /s: {effect}"
+
+    @staticmethod
+    def _is_rough(wide: Vector, near: Vector) -> bool:
+        return bool((near > np.maximum(_ROUGH * wide, _ROUGH_LEAST)).any())
+
+
+@dataclass(frozen=True)
+class LoopGain:
+    """A linear model and the gain ``K``, (m, n), of u = K x; ``eigenvalues`` are those of A + BK.
+
+    ``method`` says how K was computed.
+    """
+
+    model: LinearModel
+    K: Matrix
+    method: str
+
+    @property
+    def eigenvalues(self) -> Complex:
+        """Eigenvalues of A + BK, per second, the largest real part first."""
+        return eigenvalues(self.model.A + self.model.B @ self.K)
+
+    @property
+    def decay_per_s(self) -> float:
+        """The decay rate of A + BK: the trigger's α must be below it."""
+        return -float(self.eigenvalues[0].real)
+
+    def to_json(self) -> Table:
+        """Return the document of ``noack gain --json``: that of the model, and the gain."""
+        return self.model.to_json() | {
+            "gain": self.K.tolist(),
+            "method": self.method,
+            "closed_loop_eigenvalues": _pairs(self.eigenvalues),
+            "alpha_below_per_s": self.decay_per_s,
+        }
+
+    def __repr__(self) -> str:
+        plant = self.model.plant
+        return "\n".join(
+            [
+                _matrix("K", self.K, plant.input_names, plant.state_names),
+                f"u = K x; {self.method}",
+                f"eigenvalues of Â + B̂K: {eigenvalue_text(self.eigenvalues)} /s",
+                f"trigger.alpha_per_s must be below {self.decay_per_s:.4g}; half of it is usual",
+            ]
+        )
+
+
+def linearise(
+    plant: str,
+    *,
+    at: Sequence[float] | None = None,
+    input: Sequence[float] | None = None,  # noqa: A002 # the option of the command
+    settings: ReadTable | None = None,
+    within: float = 0.1,
+) -> LinearModel:
+    """Linearise a plant about a point.
+
+    >>> import noack
+    >>> noack.linearise("cart_pole").rank
+    4
+
+    Args:
+        plant: ``"file.py:Class"``, ``"file.fmu"``, ``"gymnasium:ID"``, a kind of plant, a scenario,
+            or a file that ``noack linearise`` or ``noack gain`` wrote.
+        at: x at the point, n entries; by default 0.
+        input: u there, m entries; by default 0.
+        settings: values by the keys of a scenario, e.g. ``{"plant.system.cart_kg": 1.0}``.
+        within: half-width of the neighbourhood in which the error is sampled, in each coordinate's
+            units; a tenth of it is sampled, too.
+
+    Raises:
+        NoackError: there is no such plant, it has no linear model there, or a value is wrong.
+    """
+    if plant.endswith(".json"):
+        document = read_document(Path(plant))
+        return linearise(
+            document["plant"],
+            at=document["at"] if at is None else at,
+            input=document["input"] if input is None else input,
+            settings=document["settings"] | dict(settings or {}),
+            within=within,
+        )
+    if not (np.isfinite(within) and within > 0):
+        raise CallerError(f"within: {within:g}; give a positive number")
+    sizes = (None if at is None else len(at), None if input is None else len(input))
+    found = plant_reference(plant, settings or {}, sizes)
+    x, u = vector("at", at, found.n, "states"), vector("input", input, found.m, "inputs")
+    place = {"at": x, "held": u, "step_ns": found.step_ns, "settling_s": found.system.settling_s}
+    with np.errstate(all="ignore"):
+        exact = found.matrices or found.system.linearisation()
+        if exact is None:
+            motion = linear_motion(found.at, found.n, found.m, **place)  # type: ignore[arg-type]
+        else:
+            motion = LinearMotion(*exact, exact[0] @ x + exact[1] @ u, "motion")
+    if motion.void is not None:
+        raise CallerError(f"{plant}: no linear model: {motion.void}")
+    widths = () if found.matrices else (within, within / 10)
+    errors = tuple(
+        (width, largest_errors(found.at, motion, np.full(found.n + found.m, width), **place))  # type: ignore[arg-type]
+        for width in widths
+    )
+    source = motion.source if exact is None else "exact"
+    return LinearModel(found, motion.A, motion.B, x, u, motion.drift, source, errors)
+
+
+def gain(
+    plant: str | LinearModel,
+    *,
+    q: ArrayLike | None = None,
+    r: ArrayLike | None = None,
+    poles: Sequence[complex] | None = None,
+    settings: ReadTable | None = None,
+) -> LoopGain:
+    """Compute the gain K of u = K x: a linear-quadratic regulator, or given eigenvalues.
+
+    Args:
+        plant: a linear model, or a plant as for :func:`linearise`.
+        q: weight of the states in ∫ xᵀQx + uᵀRu dt: a number, or the diagonal; by default 1.
+        r: weight of the inputs, likewise.
+        poles: the eigenvalues of the controllable part of A + BK instead, per second.
+        settings: as for :func:`linearise`.
+
+    Raises:
+        NoackError: an unstable eigenvalue is not controllable, or a value is wrong.
+    """
+    model = linearise(plant, settings=settings) if isinstance(plant, str) else plant
+    label, rest = model.plant.label, model.uncontrollable
+    if len(rest) and rest[0].real >= 0:
+        worst = eigenvalue_text(rest[:1])
+        raise CallerError(
+            f"{label}: no gain stabilises it: the eigenvalue {worst} /s is not controllable"
+        )
+    if poles is None:
+        Q, R = (_diagonal(*one) for one in (("q", q, model.A), ("r", r, model.B.T)))
+        K = _regulator(model, Q, R)
+        method = f"linear-quadratic regulator, Q = {_diagonal_text(Q)}, R = {_diagonal_text(R)}"
+    elif q is not None or r is not None:
+        raise CallerError("poles: give either these or the weights q and r")
+    else:
+        wanted = np.array(poles, dtype=np.complex128)
+        K, method = _placed(model, wanted), f"poles {eigenvalue_text(wanted)} /s"
+    K = np.array([[rounded(value, _DIGITS) for value in row] for row in K])
+    if (why := instability(model.A, model.B, K)) is not None:
+        raise CallerError(f"{label}: {why}")
+    return LoopGain(model, K, method)
+
+
+def _regulator(model: LinearModel, Q: Matrix, R: Matrix) -> Matrix:
+    from scipy.linalg import solve_continuous_are  # importing scipy takes 0.2 s
+
+    try:
+        P = solve_continuous_are(model.A, model.B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise CallerError(f"{model.plant.label}: no linear-quadratic regulator: {error}") from None
+    return np.asarray(-np.linalg.solve(R, model.B.T @ P), dtype=np.float64)
+
+
+def _placed(model: LinearModel, poles: Complex) -> Matrix:
+    from scipy.signal import place_poles  # importing scipy takes 0.2 s
+
+    basis = model.controllable
+    if not np.isfinite(poles).all() or (poles.real >= 0).any():
+        raise CallerError("poles: they need negative real parts, e.g. -1,-2+1j,-2-1j")
+    if len(poles) != model.rank:
+        raise CallerError(
+            f"poles: {len(poles)} given; the controllable part has {model.rank} eigenvalues"
+        )
+    try:
+        placed = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
+    except ValueError as error:  # not in conjugate pairs, or one too often
+        raise CallerError(f"poles: {error}") from None
+    return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
+
+
+def _diagonal(key: str, given: ArrayLike | None, shaped: Matrix) -> Matrix:
+    """Return a diagonal weight with an entry for each row of ``shaped``."""
+    size, values = len(shaped), np.atleast_1d(np.array(1.0 if given is None else given, np.float64))
+    if values.shape not in ((1,), (size,)):
+        raise CallerError(f"{key}: {values.size} numbers; give 1 or {size}")
+    if not (np.isfinite(values).all() and (values >= 0).all() and (key == "q" or values.all())):
+        raise CallerError(f"{key}: {values.tolist()}; positive numbers are needed")
+    return np.diag(np.full(size, values))
+
+
+def _diagonal_text(matrix: Matrix) -> str:
+    values = np.diag(matrix)
+    if (values == values[0]).all():
+        return f"{values[0]:g} I"
+    return f"diag({', '.join(f'{value:g}' for value in values)})"
+
+
+def controllable_states(A: Matrix, B: Matrix) -> Matrix:
+    """Return an orthonormal basis of the range of the controllability matrix, (n, rank).
+
+    It grows from the range of B by A times the directions found last. A direction counts if it is
+    larger than the tolerance times the terms that it is the sum of. So neither the units of the
+    states nor fast and slow eigenvalues decide.
+    """
+    basis, new, terms = np.zeros((len(A), 0)), B, np.abs(B)
+    while new.shape[1] and basis.shape[1] < len(A):
+        projection = np.eye(len(A)) - basis @ basis.T
+        noise = TOLERANCE * norm(np.linalg.norm(np.abs(projection) @ terms, axis=1))
+        directions, sizes, _ = np.linalg.svd(projection @ new, full_matrices=False)
+        last = directions[:, sizes > noise]
+        basis = np.linalg.qr(np.hstack([basis, last]))[0]
+        new, terms = A @ last, np.abs(A) @ np.abs(last)
+    return basis
+
+
+def eigenvalues(matrix: Matrix) -> Complex:
+    """Return the eigenvalues, the largest real part first."""
+    found = np.linalg.eigvals(matrix).astype(np.complex128)
+    return found[np.lexsort((found.imag, -found.real))]
+
+
+def eigenvalue_text(values: Complex) -> str:
+    """Return eigenvalues as text, conjugate pairs as one: "-0.81±0.5j, -5.8"."""
+    scale, shown = max(1.0, float(np.abs(values).max(initial=0.0))), list[str]()
+    for value in values:
+        if value.imag > _REAL * scale:
+            shown.append(f"{value.real:.4g}±{value.imag:.4g}j")
+        elif value.imag >= -_REAL * scale:
+            shown.append(f"{value.real if abs(value.real) > _ZERO * scale else 0.0:.4g}")
+    return ", ".join(shown)
+
+
+def vector(key: str, given: object, size: int, what: str) -> Vector:
+    """Return a given vector, (size,); None is 0. Raise CallerError if it is not one."""
+    try:
+        found = np.zeros(size) if given is None else np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CallerError(f"{key}: {given!r} is no list of numbers") from None
+    if found.shape != (size,):
+        raise CallerError(f"{key}: {found.size} numbers; the plant has {size} {what}")
+    if not np.isfinite(found).all():
+        raise CallerError(f"{key}: {found.tolist()} has entries that are not finite")
+    return found
+
+
+def read_document(path: Path) -> dict[str, UserCode]:
+    """Return the document of a file that ``noack linearise`` or ``noack gain`` wrote."""
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise CallerError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError:
+        document = None
+    wanted = {"plant": str, "settings": dict, "at": list, "input": list}
+    if not isinstance(document, dict) or not all(
+        isinstance(document.get(key), kind) for key, kind in wanted.items()
+    ):
+        raise CallerError(f"{path}: not written by `noack linearise` or `noack gain`")
+    return document
+
+
+def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
+    """Return the model of a plant, or of a file, and its gain if the file has one."""
+    model = linearise(plant, settings=settings)
+    if not plant.endswith(".json") or "gain" not in (document := read_document(Path(plant))):
+        return model
+    rows = [vector("gain", row, len(model.A), "states") for row in document["gain"]]
+    if len(rows) != model.plant.m:
+        raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")
+    K = np.array(rows)
+    if (why := instability(model.A, model.B, K)) is not None:
+        raise CallerError(f"{plant}: gain: {why}")
+    return LoopGain(model, K, str(document.get("method", "given")))
+
+
+def _matrix(name: str, matrix: Matrix, rows: Sequence[str], columns: Sequence[str]) -> str:
+    entries = ([f"{value:.6g}" for value in row] for row in matrix)
+    table: Rows = [
+        [name, *columns],
+        *([row, *cells] for row, cells in zip(rows, entries, strict=True)),
+    ]
+    return as_text(table)
+
+
+def _shown(values: Vector) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in values)})"
+
+
+def _pairs(values: Complex) -> list[list[float]]:
+    return [[float(value.real), float(value.imag)] for value in values]

@@ -1,0 +1,394 @@
+"""A scenario for a plant: a file with comments, whose settings are chosen so that it is certified.
+
+The loop is tried with several limits of consecutive losses, rates and thresholds, and also with
+slower gains if the gain is not given. Each trial is certified, which takes some 30 ms. The first
+one whose bound of ‖x‖ is below 200 times ‖x(0)‖ is used, else the one with the smallest bound. If
+there is none, a norm is chosen for the trial with the smallest loop gain. x(0) is made smaller if a
+nonlinear plant does not return to 0 in a simulation.
+"""
+
+import math
+import os
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from cosim.analysis.certificates import with_linear_plant, with_weight
+from cosim.simulation.virtual_time import simulate_loops
+from cosim.studies.new_loop import (
+    ALPHA_SHARE,
+    BETA_SHARE,
+    LOSS_PROBABILITY,
+    MANSD,
+    SETTLED,
+    rounded,
+)
+from cosim.studies.new_loop.linear_model import (
+    LinearModel,
+    LoopGain,
+    eigenvalue_text,
+    gain,
+    model_or_gain,
+    vector,
+)
+from noack.core.errors import CallerError, MachineError, why
+from noack.core.file_access import new_file
+from noack.core.linear_systems import Matrix, Vector, norm
+from noack.plants.fmu import FmuSettings
+from noack.plants.gymnasium import GymnasiumSettings
+from noack.plants.linear import LinearSettings
+from noack.plants.python_plant import PythonPlantSettings
+from noack.scenario.resolution import resolve, resolve_run
+from noack.scenario.scenario import Scenario
+from noack.scenario.scenario_file import completed, put, toml_text
+from noack.settings.section import ReadTable, Table
+from noack.theory.certificates.certified_bounds import ScenarioCertificate, envelope_formula
+from noack.theory.certificates.conditions import nominal_conditions
+from noack.theory.certificates.scenario_certificates import own_plant
+
+_FLOOR_SHARE = 0.05
+_FASTEST_ALPHA_PER_S = 1.0
+_RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
+_FASTEST_PER_S = 1000.0
+"""Faster eigenvalues do not determine the rate: no loop can follow them."""
+_STEPS_PER_TIME_CONSTANT = 50
+_INPUT_WEIGHTS = (1.0, 10.0, 100.0)
+_LOOSE = 200.0
+_START = 0.1
+_SMALLER, _FEWEST = 0.5, 6
+_RETURNED = 0.1
+_LONGEST_RUN_S = 20.0
+
+
+@dataclass(frozen=True)
+class NewScenario:
+    """A scenario for a plant: its ``text`` as a file, the loaded ``scenario``, what was chosen.
+
+    ``certificate`` is for the scenario's schedule and the linear plant; it is None if none was
+    found. ``notes`` are sentences about what was chosen and found.
+    """
+
+    gain: LoopGain
+    scenario: Scenario
+    text: str
+    certificate: ScenarioCertificate | None
+    notes: tuple[str, ...]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the file; raise NoackError if it exists, or cannot be written."""
+        if Path(path).exists():
+            raise CallerError(f"{path}: exists; give another name, or remove it first")
+        try:
+            with new_file(Path(path), make_folder=False) as file:
+                file.write(self.text.encode())
+        except (OSError, ValueError) as error:
+            raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+
+    def to_json(self) -> Table:
+        """Return the document of ``noack new --json``."""
+        found = self.certificate and self.certificate.to_json()
+        return self.gain.to_json() | {
+            "toml": self.text,
+            "notes": self.notes,
+            "certificate": found,
+        }
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A loop with settings that are tried together."""
+
+    gain: LoopGain
+    rate_hz: float
+    mansd: int
+    alpha_per_s: float
+    x0: Vector
+    weight: Matrix | None = None
+
+
+def new(
+    plant: str | LinearModel | LoopGain,
+    path: str | PathLike[str] = "new.toml",
+    *,
+    initial_state: Sequence[float] | None = None,
+    settings: ReadTable | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> NewScenario:
+    """Choose a complete scenario for a plant; its ``save`` writes the file.
+
+    Args:
+        plant: a gain with its model; a model or a plant, for which K is chosen; or the file of one.
+        path: the file that the scenario will have; file names in it are relative to its folder.
+        initial_state: x(0), n entries; by default chosen.
+        settings: values by the keys of a scenario that are not to be chosen.
+        report: called with what is being done.
+
+    Raises:
+        NoackError: the plant does not rest at x = 0, u = 0, or a value is wrong.
+    """
+    found = model_or_gain(plant, settings or {}) if isinstance(plant, str) else plant
+    fixed = {
+        key: one for key, one in (settings or {}).items() if not key.startswith("plant.system")
+    }
+    given = fixed.pop("plant.initial_state", initial_state)
+    model = found.model if isinstance(found, LoopGain) else found
+    _require_rest(model)
+    build = _Builder(model, Path(path), fixed)
+    best = build.search(list(_trials(found, _initial_state(model, given))), report)
+    report("simulating")
+    for _ in range(_FEWEST):
+        if (returns := build.returns(best)) or given is not None:
+            break
+        best = replace(best, x0=best.x0 * _SMALLER)
+    certificate, _ = build.certified(best)
+    notes = tuple(_notes(best, certificate, returns, build.is_linear))
+    text = _commented(build.content(best), notes, best)
+    found_certificate = certificate if certificate.constants is not None else None
+    return NewScenario(best.gain, build.scenario(best), text, found_certificate, notes)
+
+
+def _require_rest(model: LinearModel) -> None:
+    label, is_moved = model.plant.label, model.at.any() or model.input.any()
+    if is_moved and not isinstance(model.plant.system, FmuSettings):
+        raise CallerError(
+            f"{label}: a scenario needs x and u as deviations from its operating point; let the "
+            "plant subtract this point, and linearise it at 0"
+        )
+    if not model.rests:
+        drift = ", ".join(f"{one:.4g}" for one in model.drift)
+        raise CallerError(
+            f"{label}: a scenario needs an equilibrium; at the point ẋ is ({drift}). "
+            "`noack linearise` shows where the linear model rests"
+        )
+
+
+def _initial_state(model: LinearModel, given: object) -> Vector:
+    """Return x(0): as given, the plant's own, or 0.1 for each state that is no other's rate."""
+    n, unit = model.plant.n, np.eye(model.plant.n)
+    if given is not None or model.plant.initial_state is not None:
+        return vector("x0", given or model.plant.initial_state, n, "states")
+    is_rate = [any((model.A[i] == unit[j]).all() for i in range(n) if i != j) for j in range(n)]
+    return np.where(is_rate, 0.0, _START) if not all(is_rate) else np.full(n, _START)
+
+
+def _trials(found: LinearModel | LoopGain, x0: Vector) -> Iterator[_Trial]:
+    """Yield what is tried, the preferred settings first."""
+    if isinstance(found, LoopGain):
+        gains = [found]
+    else:
+        gains = [gain(found, r=weight) for weight in _INPUT_WEIGHTS]
+    for one in gains:
+        fastest = max(
+            (size for size in np.abs(one.eigenvalues) if size < _FASTEST_PER_S), default=1
+        )
+        wanted = _STEPS_PER_TIME_CONSTANT * fastest
+        base = next((rate for rate in _RATES_HZ if rate >= wanted), _RATES_HZ[-1])
+        base = one.model.plant.rates.get("rate_hz", base)
+        is_fixed = isinstance(one.model.plant.system, GymnasiumSettings)
+        for rate in (base,) if is_fixed else (base, 2 * base):
+            for mansd in range(MANSD, 0, -1):
+                for share in (ALPHA_SHARE, ALPHA_SHARE / 2):
+                    alpha = rounded(min(share * one.decay_per_s, _FASTEST_ALPHA_PER_S))
+                    yield _Trial(one, rate, mansd, alpha, x0)
+
+
+class _Builder:
+    """Builds, certifies and simulates the scenarios of trials."""
+
+    def __init__(self, model: LinearModel, path: Path, fixed: ReadTable) -> None:
+        self._model, self._path, self._fixed = model, path, fixed
+        self.is_linear = isinstance(model.plant.system, LinearSettings)
+
+    def content(self, trial: _Trial) -> Table:
+        """Return the content of the scenario file."""
+        model, reference = self._model, self._model.plant
+        start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
+        beta, alpha = rounded(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
+        horizon_s = rounded(math.log(1 / SETTLED) / alpha)
+        weight = None
+        if trial.weight is not None:
+            weight = [[rounded(entry, 6) for entry in row] for row in trial.weight]
+        content: Table = {
+            "name": "".join(c if c.isascii() and c.isalnum() else "_" for c in self._path.stem),
+            "description": f"{reference.label} over a network that loses half of the updates.",
+            "horizon_s": horizon_s,
+            "speed": max(1.0, float(round(horizon_s / _LONGEST_RUN_S))),
+            "model": {
+                "A": model.A.tolist(),
+                "B": model.B.tolist(),
+                "gain": trial.gain.K.tolist(),
+                "state_names": list(reference.state_names),
+                "input_names": list(reference.input_names),
+            },
+            "plant": {
+                "initial_state": trial.x0.tolist(),
+                "rate_hz": trial.rate_hz,
+                "measure_every": int(reference.rates.get("measure_every", 1)),
+                "system": self._system(),
+            },
+            "controller": {"rate_hz": trial.rate_hz},
+            "trigger": {
+                "policy": "decaying",
+                "beta": beta,
+                "alpha_per_s": alpha,
+                "floor": rounded(_FLOOR_SHARE * beta),
+                **({"weight": weight} if weight else {}),
+            },
+            "network": {
+                "mansd": trial.mansd,
+                "loss": {"model": "bernoulli", "probability": LOSS_PROBABILITY},
+            },
+            "seeds": {"loss": 1},
+        }
+        for key, value in self._fixed.items():
+            put(content, key, value, f"--set {key}")
+        return content
+
+    def _system(self) -> Table:
+        """Return the table plant.system, with a file's name relative to the scenario's folder."""
+        system, model = self._model.plant.system, self._model
+        table = system.content()
+        if isinstance(system, FmuSettings | PythonPlantSettings) and system.file is not None:
+            table["file"] = os.path.relpath(system.file, self._path.absolute().parent)
+            table.pop("sha256", None)
+        if isinstance(system, FmuSettings):
+            for key, value in (("operating_state", model.at), ("operating_input", model.input)):
+                if value.any():
+                    table[key] = (value + np.array(getattr(system, key) or 0.0)).tolist()
+        return {key: one for key, one in table.items() if one not in ({}, [])}
+
+    def scenario(self, trial: _Trial) -> Scenario:
+        """Return the loaded scenario."""
+        return completed(self.content(trial), self._path)
+
+    def certified(self, trial: _Trial) -> tuple[ScenarioCertificate, float]:
+        """Return the certificate of a trial's linear plant, perhaps void, and its loop gain."""
+        resolved = with_linear_plant(resolve(self.scenario(trial)))
+        resolved.coverage.require_certifiable()
+        conditions = nominal_conditions(resolved, resolved.certificate.late_periods)
+        found = own_plant(resolved).certificate(conditions)
+        if found.constants is not None:
+            return found, found.constants.loop_gain
+        return found, own_plant(resolved).loop_gain(conditions)
+
+    def search(self, trials: Sequence[_Trial], report: Callable[[str], None]) -> _Trial:
+        """Return the trial that is used."""
+        certified: list[tuple[float, _Trial]] = []
+        closest, known = (math.inf, trials[0]), set[str]()
+        for place, trial in enumerate(trials):
+            report(f"certifying: {place + 1} of {len(trials)}")
+            if (content := str(self.content(trial))) in known:  # the given settings exclude it
+                continue
+            known.add(content)
+            found, loop_gain = self.certified(trial)
+            if found.constants is None:
+                closest = min(closest, (loop_gain, trial), key=lambda one: one[0])
+                continue
+            certified.append((found.constants.state / (norm(trial.x0) or 1.0), trial))
+            if certified[-1][0] <= _LOOSE:
+                return trial
+        if certified:
+            return min(certified, key=lambda one: one[0])[1]
+        report("choosing a norm")
+        weighted = self._weighted(closest[1]) if math.isfinite(closest[0]) else None
+        return trials[0] if weighted is None else weighted
+
+    def _weighted(self, trial: _Trial) -> _Trial | None:
+        """Return a trial in a norm that certifies it; None if there is none."""
+        resolved = with_linear_plant(resolve(self.scenario(trial)))
+        try:
+            _, weight = with_weight(resolved, "chosen", resolved.certificate.late_periods)
+        except CallerError:
+            return None
+        weighted = replace(trial, weight=weight)
+        return weighted if self.certified(weighted)[0].constants is not None else None
+
+    def returns(self, trial: _Trial) -> bool:
+        """Whether ‖x‖ ends below a tenth of its maximum, in virtual time."""
+        run = simulate_loops(resolve_run(self.scenario(trial)))
+        sizes = np.linalg.norm(run.loop().columns("plant_step", "x")["x"], axis=1)
+        return bool(np.isfinite(sizes).all() and sizes[-1] <= _RETURNED * (sizes.max() or 1.0))
+
+
+def _notes(
+    trial: _Trial, certificate: ScenarioCertificate, returns: bool, is_linear: bool
+) -> Iterator[str]:
+    """Yield what was chosen and found, a sentence each."""
+    yield f"K: {trial.gain.method}; decay rate of Â + B̂K: {trial.gain.decay_per_s:.3g} /s."
+    plant = "the plant" if is_linear else "the linear plant ẋ = Âx + B̂u"
+    if certificate.constants is None:
+        yield (
+            f"No certificate was found for {plant}: {certificate.void}. A faster rate, a slower "
+            "gain (a larger --r) or a smaller network.mansd may have one."
+        )
+    else:
+        bound = envelope_formula("‖x‖", certificate, "state").format(certificate.constants.state)
+        yield f"Certified for {plant}, for every pattern of losses: {bound}."
+    if not is_linear:
+        errors = ", ".join(f"{of.max():.2g} within ±{w:g}" for w, of in trial.gain.model.errors)
+        yield (
+            "The plant itself is not linear: no certificate covers it, and a run checks only what "
+            "holds for every plant; with --set 'plant.system={kind=\"linear\"}' a run has the "
+            "linear plant, and is checked against its certificate. Largest relative error of the "
+            f"linear model, sampled: {errors}."
+        )
+    start = ", ".join(f"{one:.3g}" for one in trial.x0)
+    end = "returns to 0" if returns else "does not return to 0"
+    yield f"Simulated from x(0) = ({start}), the loop {end}."
+
+
+_COMMENTS = {
+    "horizon_s": "Length of the run in simulated time: e^(−alpha_per_s t) falls to a hundredth.",
+    "speed": "Simulated time per wall time of a live run.",
+    "model": "What sensor and controller know of the plant: ẋ = A x + B u, per second.",
+    "plant": "The true plant.",
+    "plant.initial_state": "x(0), one number per state.",
+    "plant.rate_hz": "Steps of the plant per second of simulated time.",
+    "plant.measure_every": "Steps per measurement.",
+    "controller.rate_hz": "Inputs per second of simulated time.",
+    "trigger": "The sensor transmits when the error of its model exceeds the threshold "
+    "max(beta e^(−alpha_per_s t), floor).",
+    "trigger.beta": "The first threshold, a tenth of the norm of x(0). Larger: fewer "
+    "transmissions, larger errors.",
+    "trigger.floor": "The last threshold. With 0, x converges to 0.",
+    "trigger.weight": "W of the norm ‖W e‖ of errors, chosen for the certificate.",
+    "network.mansd": "Maximum consecutive losses, M − 1. The network delivers the next packet.",
+    "network.loss": "Losses, before this limit is applied.",
+    "seeds": "Another number: other losses.",
+}
+
+
+def _commented(content: ReadTable, notes: Sequence[str], trial: _Trial) -> str:
+    """Return the file: the content with comments."""
+    poles, decay = eigenvalue_text(trial.gain.eigenvalues), trial.gain.decay_per_s
+    comments = _COMMENTS | {
+        "model.gain": f"u = gain x_c. {trial.gain.method}; eigenvalues of A + B gain: {poles} /s.",
+        "trigger.alpha_per_s": f"Must be below the decay rate of A + B gain, {decay:.4g} /s.",
+    }
+    lines = [f"# A scenario for {trial.gain.model.plant.label}, written by `noack new`."]
+    lines += [line for note in notes for line in _comment(note)]
+    return "\n".join([*lines, *_section("", content, comments), ""])
+
+
+def _section(name: str, table: ReadTable, comments: Mapping[str, str]) -> list[str]:
+    lines = _comment(comments.get(name, ""))
+    lines = ["", *lines, f"[{name}]"] if name else lines
+    inner: list[str] = []
+    for key, value in table.items():
+        path = f"{name}.{key}" if name else key
+        if isinstance(value, dict):
+            inner += _section(path, value, comments)
+        else:
+            lines += _comment(comments.get(path, "")) + toml_text({key: value}).splitlines()
+    return lines + inner
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, 98, initial_indent="# ", subsequent_indent="# ")

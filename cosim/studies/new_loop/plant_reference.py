@@ -1,0 +1,218 @@
+"""What PLANT may be on the command line: a class, an FMU, a kind of plant, an environment."""
+
+import ast
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from cosim.shipped_files import find_shipped, shipped_names
+from noack.core.errors import CallerError, did_you_mean
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.fmu import FmuSettings, variables_of
+from noack.plants.gymnasium import GymnasiumSettings
+from noack.plants.linear import LinearSettings
+from noack.plants.plant_settings import PlantSettings, PlantStart, PlantSystem
+from noack.plants.python_plant import PythonPlantSettings
+from noack.plants.systems.linearisation import STEP_NS
+from noack.scenario import scenario_file, toml_file
+from noack.scenario.resolution import loop_of, resolve
+from noack.scenario.sections import PLANTS
+from noack.settings.section import ReadTable, Table
+from noack.settings.user_files import located
+
+_GYMNASIUM = "gymnasium:"
+_MOST_TRIED = 16
+"""Largest number of states and of inputs that is tried with a class that names neither."""
+_KINDS = sorted(kind for kind, one in PLANTS.items() if one.scenario and one is not LinearSettings)
+_FORMS = (
+    f"PLANT is FILE.py:Class, FILE.fmu, gymnasium:ID, a kind of plant ({', '.join(_KINDS)}), a "
+    "scenario, or a file that `noack linearise` or `noack gain` wrote"
+)
+
+
+@dataclass(frozen=True)
+class PlantReference:
+    """A plant, its numbers of states and inputs, and what is known about its runs."""
+
+    label: str  # as the user named it
+    settings: ReadTable  # values by the keys of a scenario
+    system: PlantSettings
+    n: int
+    m: int
+    names: tuple[tuple[str, ...] | None, tuple[str, ...] | None]  # of states and inputs
+    rates: Mapping[str, float]  # rate_hz and measure_every of its plant, if they are given
+    initial_state: tuple[float, ...] | None = None
+    matrices: tuple[Matrix, Matrix] | None = None  # A and B of a linear plant
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return self.names[0] or tuple(f"x_{i}" for i in range(1, self.n + 1))
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.names[1] or tuple(f"u_{j}" for j in range(1, self.m + 1))
+
+    @property
+    def step_ns(self) -> int:
+        """Step of its motion: that of an environment, or 10 ms."""
+        if isinstance(self.system, GymnasiumSettings):
+            return round(1e9 / self.rate_hz)
+        return STEP_NS
+
+    @property
+    def rate_hz(self) -> float:
+        """Its steps per second; that of a scenario by default."""
+        return self.rates.get("rate_hz", 500.0)
+
+    def at(self, x0: Vector) -> PlantSystem:
+        """Return the system at an initial state."""
+        A, B = self.matrices or (np.zeros((self.n, self.n)), np.zeros((self.n, self.m)))
+        return self.system.system(PlantStart(x0, A, B, self.step_ns))
+
+
+def plant_reference(
+    label: str,
+    settings: ReadTable,
+    sizes: tuple[int | None, int | None] = (None, None),
+) -> PlantReference:
+    """Return the plant that a text names.
+
+    Args:
+        label: the text.
+        settings: values by the keys of a scenario; those that begin with ``plant.`` are used.
+        sizes: numbers of states and inputs, if they are known.
+
+    Raises:
+        CallerError: there is no such plant.
+    """
+    if (table := _system_table(label)) is None:
+        return _of_scenario(label, settings)
+    content: Table = {"plant": {"system": table}}
+    for key, value in settings.items():
+        if key.startswith("plant."):
+            scenario_file.put(content, key, value, f"--set {key}")
+    plant = content["plant"]
+    assert isinstance(plant, dict)
+    system = _settings(plant["system"], label)
+    rates = {key: float(plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
+    if isinstance(system, GymnasiumSettings):
+        return _of_environment(label, settings, system)
+    if isinstance(system, FmuSettings):
+        n, m = len(system.state_variables), len(system.input_variables)
+        names = _plain(system.state_variables), _plain(system.input_variables)
+        return PlantReference(label, settings, system, n, m, names, rates)
+    if isinstance(system, PythonPlantSettings):
+        n, m = _sizes_of_class(system, label, sizes)
+        return PlantReference(label, settings, system, n, m, (None, None), rates)
+    known = _of_scenario(str(system.scenario), {})
+    initial = known.initial_state
+    return PlantReference(
+        label, settings, system, known.n, known.m, known.names, {**known.rates, **rates}, initial
+    )
+
+
+def _system_table(label: str) -> Table | None:
+    """Return the table plant.system that a text names; None if it may be a scenario."""
+    file, colon, name = label.rpartition(":")
+    if label.startswith(_GYMNASIUM):
+        return {"kind": "gymnasium", "id": label.removeprefix(_GYMNASIUM)}
+    if label.endswith(".py"):
+        raise CallerError(f"{label}: which class of it? {_classes(Path(label))}")
+    if colon and file.endswith(".py"):
+        return {"kind": "python", "file": file, "name": name}
+    if label.endswith(".fmu"):
+        return {"kind": "fmu", "file": label}
+    if label in PLANTS:
+        if label not in _KINDS:
+            raise CallerError(f"{label}: names no plant by itself; {_FORMS}")
+        return {"kind": label}
+    return {"kind": "python", "name": label} if colon else None
+
+
+def _classes(path: Path) -> str:
+    with suppress(OSError, SyntaxError, ValueError):
+        statements = ast.parse(path.read_bytes()).body
+        if found := [one.name for one in statements if isinstance(one, ast.ClassDef)]:
+            return "write " + " or ".join(f"{path}:{name}" for name in found)
+    return f"write {path}:Class"
+
+
+def _settings(table: object, label: str) -> PlantSettings:
+    """Return validated settings whose file is found; an FMU may lack the names of variables."""
+    assert isinstance(table, dict)
+    if table["kind"] == "fmu" and not {"state_variables", "input_variables"} <= table.keys():
+        table = variables_of(Path(str(table["file"]))) | table
+    system = toml_file.validated(PLANTS[str(table["kind"])], table, f"{label}: plant.system")
+    system.require_installed()
+    if isinstance(system, FmuSettings | PythonPlantSettings):
+        return located(system, Path.cwd(), "plant.system")
+    return system
+
+
+def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
+    try:
+        path = find_shipped(label, "scenarios")
+        content = toml_file.read(path)
+    except CallerError as error:
+        if shipped := did_you_mean(label, [*PLANTS, *shipped_names("scenarios")]):
+            raise CallerError(f"{label}: no such plant; {shipped}") from None
+        raise CallerError(
+            f"{error}; {_FORMS}" if not Path(label).exists() else str(error)
+        ) from None
+    for key, value in settings.items():
+        scenario_file.put(content, key, value, f"--set {key}")
+    resolved = resolve(scenario_file.completed(content, path))
+    loop, plant = loop_of(resolved), resolved.plant
+    return PlantReference(
+        label,
+        settings,
+        plant.system,
+        loop.n,
+        loop.m,
+        (loop.state_names, loop.input_names),
+        {"rate_hz": plant.rate_hz, "measure_every": plant.measure_every},
+        plant.initial_state,
+        (loop.A, loop.B) if resolved.coverage.is_linear else None,
+    )
+
+
+def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
+    environment = system.environment()
+    n, m = len(environment.state), int(np.prod(environment.action_space.shape))
+    rate_hz = float(f"{1 / system.step_of(environment):.12g}")
+    return PlantReference(label, settings, system, n, m, (None, None), {"rate_hz": rate_hz})
+
+
+def _plain(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(re.sub(r"\W", "_", name) for name in names)
+
+
+def _sizes_of_class(
+    system: PythonPlantSettings, label: str, sizes: tuple[int | None, int | None]
+) -> tuple[int, int]:
+    """Return the smallest numbers of states and inputs that a user's class accepts."""
+    ranges = [range(1, _MOST_TRIED + 1) if size is None else (size,) for size in sizes]
+    refusals: dict[str, tuple[int, int]] = {}
+    for n, m in product(*ranges):
+        start = PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), STEP_NS)
+        try:
+            with np.errstate(all="ignore"):
+                system.system(start).advance(np.zeros(m), 0, STEP_NS)
+        except Exception as error:  # an equation that is tried with too few states
+            refusals.setdefault(str(error), (n, m))
+        else:
+            return n, m
+    first, *more = refusals
+    if not more:
+        raise CallerError(first)
+    raise CallerError(
+        f"{label}: no number of states and inputs up to {_MOST_TRIED} is accepted at x = 0, u = 0; "
+        f"--at and --input give the numbers. With one of each: {first}"
+    )

@@ -1,0 +1,236 @@
+"""Linear models of plants about a point: ẋ ≈ f₀ + A (x − x₀) + B (u − u₀), and their error.
+
+If a system has a derivative (:meth:`OdeSystem.rates`), A and B are its differences: central
+differences over steps from 0.1 to 4e-7 times the size of the component, extrapolated to the order
+4. For each entry the step is used at which the result changes least; an entry that is not larger
+than that change becomes 0.
+
+Other systems are only moved: n + m small deviations of x and u are applied, each with both signs. x
+is taken after the rest of the state has settled, and again a step later. Central differences give
+x(t + h) = Ad x(t) + Bd u; the matrix logarithm of [[Ad, Bd], [0, I]] divided by h gives A and B. So
+a system with more states than x is described as far as the loop sees it.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector, discretise, norm
+from noack.plants.plant_settings import PlantSystem
+
+SystemAt = Callable[[Vector], PlantSystem]
+"""Makes a system at an initial state, (n,)."""
+STEP_NS = 10_000_000
+"""Step of the motion, for a system that allows any."""
+_OFF = 1e-4  # size of a deviation, relative to the component or 1
+_SINGULAR = 1e-9
+"""If the smallest singular value of the settled deviations is below this, x is not a state."""
+_AHEAD = 10
+_MISSED = 0.05
+"""If A and B predict x some steps after any deviation with a larger relative error, x is not a
+state."""
+_WIDEST, _FINER, _STEPS = 0.1, 4.0, 10
+_NOISE = 100.0
+"""An entry that is smaller than this multiple of its change from step to step is 0."""
+_ROUNDING = 1e-13
+_DIGITS = 10
+_SAMPLES = {"derivative": 1000, "motion": 100}
+_FORGOTTEN = 1e-12
+"""If an eigenvalue of a step is below this, a deviation is gone after the step."""
+_LOGARITHM = 1e-6
+"""Largest relative difference between the step and the exponential of its logarithm."""
+
+NO_STATE = "x is not its whole state, or it is not smooth"
+NOT_FINITE = "its motion is not finite there"
+NO_LOGARITHM = "a step of its motion has no real logarithm: no linear system in continuous time"
+
+
+@dataclass(frozen=True)
+class LinearMotion:
+    """A linear model of a plant; the matrices are NaN if ``void`` says why there is none."""
+
+    A: Matrix  # (n, n), per second
+    B: Matrix  # (n, m)
+    drift: Vector  # f₀ at the point, (n,), per second; 0 at an equilibrium
+    source: str  # "derivative" or "motion", from which A and B are computed
+    void: str | None = None
+
+
+def linearise(
+    system_at: SystemAt,
+    n: int,
+    m: int,
+    *,
+    settling_s: float = 0.0,
+    at: Vector | None = None,
+    held: Vector | None = None,
+    step_ns: int = STEP_NS,
+) -> LinearMotion:
+    """Linearise a system.
+
+    Args:
+        system_at: makes the system at an initial state, (n,).
+        n: number of states.
+        m: number of inputs.
+        settling_s: time after which x and u determine the whole state.
+        at: x₀, (n,); by default 0.
+        held: u₀, (m,); by default 0.
+        step_ns: step of a system that is moved.
+    """
+    at, held = np.zeros(n) if at is None else at, np.zeros(m) if held is None else held
+    rates = getattr(system_at(at), "rates", None)
+    if rates is None or rates(at, held) is None:
+        return _by_motion(system_at, at, held, settling_s, step_ns)
+
+    def f(point: Vector) -> Vector:
+        return np.asarray(rates(point[:n], point[n:]))
+
+    point = np.concatenate([at, held])
+    jacobian, drift = _differences(f, point), f(point)
+    void = None if np.isfinite(jacobian).all() and np.isfinite(drift).all() else NOT_FINITE
+    return LinearMotion(jacobian[:, :n], jacobian[:, n:], drift, "derivative", void)
+
+
+def _differences(f: Callable[[Vector], Vector], point: Vector) -> Matrix:
+    """Return the Jacobian of f, (n, len(point)); NaN where f is not finite."""
+    columns = []
+    size = np.abs(f(point))
+    for i, value in enumerate(point):
+        steps = max(1.0, abs(value)) * _WIDEST / _FINER ** np.arange(_STEPS)
+        off = np.zeros_like(point)
+        slopes = []
+        for step in steps:
+            off[i] = step
+            slopes.append((f(point + off) - f(point - off)) / (2 * step))
+        second = np.array(slopes)
+        fourth = (_FINER**2 * second[1:] - second[:-1]) / (_FINER**2 - 1)
+        changes = np.abs(np.diff(fourth, axis=0))
+        changes[~np.isfinite(changes)] = np.inf
+        best = changes.argmin(axis=0)
+        places = np.arange(len(size))
+        column, change = fourth[best + 1, places], changes[best, places]
+        noise = np.maximum(_NOISE * change, _ROUNDING * (size + np.abs(column).max()))
+        columns.append(np.where(np.abs(column) <= noise, 0.0, _rounded(column)))
+    return np.array(columns).T
+
+
+def _rounded(values: Matrix) -> Matrix:
+    """Return the values with ten significant digits: 1 instead of 0.99999999998."""
+    return np.array([float(f"{value:.{_DIGITS}g}") for value in values.ravel()]).reshape(
+        values.shape
+    )
+
+
+def _followed(
+    system_at: SystemAt, x0: Vector, u: Vector, settling: int, ahead: int, step_ns: int
+) -> Matrix:
+    """Return x after the settling, a step later, and at the end, (3, n)."""
+    system, met = system_at(x0), []
+    for step in range(settling + ahead):
+        met.append(system.x)
+        system.advance(u, step * step_ns, step_ns)
+    return np.array([*met, system.x])[[settling, settling + 1, -1]]
+
+
+def _by_motion(
+    system_at: SystemAt, at: Vector, held: Vector, settling_s: float, step_ns: int
+) -> LinearMotion:
+    """Return the linear model of a system that is only moved."""
+    n, m, settling = len(at), len(held), round(settling_s * 1e9 / step_ns)
+    ahead = _AHEAD if settling else 1
+    rest = _followed(system_at, at, held, settling, ahead, step_ns)
+    drift = (rest[1] - rest[0]) / (step_ns * 1e-9)
+
+    def without(why: str) -> LinearMotion:
+        return LinearMotion(np.full((n, n), np.nan), np.full((n, m), np.nan), drift, "motion", why)
+
+    before, after, later = (np.eye(n + m) for _ in range(3))
+    for i, value in enumerate(np.concatenate([at, held])):
+        off = np.zeros(n + m)
+        off[i] = _OFF * max(1.0, abs(value))
+        plus, minus = (
+            _followed(
+                system_at, at + sign * off[:n], held + sign * off[n:], settling, ahead, step_ns
+            )
+            for sign in (1.0, -1.0)
+        )
+        before[:n, i], after[:n, i], later[:n, i] = (plus - minus) / (2 * off[i])
+    if not (np.isfinite(before).all() and np.isfinite(later).all()):
+        return without(NOT_FINITE)
+    if np.linalg.svd(before, compute_uv=False)[-1] < _SINGULAR:
+        return without(NO_STATE)
+    step = after @ np.linalg.inv(before)
+    missed = np.linalg.matrix_power(step, ahead) @ before - later
+    sizes = np.maximum(*(np.linalg.norm(deviations[:n], axis=0) for deviations in (before, later)))
+    if (np.linalg.norm(missed, axis=0) > _MISSED * sizes).any():
+        return without(NO_STATE)
+    if np.abs(np.linalg.eigvals(step)).min() < _FORGOTTEN:
+        return without(NO_LOGARITHM)
+    with warnings.catch_warnings(action="ignore"):  # the result is checked next
+        from scipy.linalg import expm, logm  # takes 0.2 s: linear plants do not need it
+
+        generator = np.real(logm(step))
+        if not np.isfinite(generator).all():
+            return without(NO_LOGARITHM)
+        if np.abs(expm(generator) - step).max() > _LOGARITHM * np.abs(step).max():
+            return without(NO_LOGARITHM)
+    generator /= step_ns * 1e-9
+    return LinearMotion(generator[:n, :n], generator[:n, n:], drift, "motion")
+
+
+def largest_errors(
+    system_at: SystemAt,
+    motion: LinearMotion,
+    halfwidths: Vector,
+    *,
+    settling_s: float = 0.0,
+    at: Vector,
+    held: Vector,
+    step_ns: int = STEP_NS,
+) -> Vector:
+    """Return by how much the linear model misses the plant near the point, per state, (n,).
+
+    The plant is sampled in the box of the half-widths around the point, half of the samples at its
+    corners. For a plant with a derivative the value of state i is max |ẋᵢ − f₀ᵢ − (A δx + B δu)ᵢ| /
+    max |(A δx + B δu)ᵢ|, for another plant the same of the change of x over a step. It is NaN if
+    the plant is not finite at a sample, and infinite if the linear part of a state is 0 while its
+    remainder is not.
+
+    Args:
+        system_at: makes the system.
+        motion: its linear model.
+        halfwidths: of the box, (n + m,).
+        settling_s: as for :func:`linearise`.
+        at: the point x₀, (n,).
+        held: u₀, (m,).
+        step_ns: step of a system that is moved.
+    """
+    n, settling = len(at), round(settling_s * 1e9 / step_ns)
+    rates = getattr(system_at(at), "rates", None) if motion.source == "derivative" else None
+
+    def change(x: Vector, u: Vector) -> tuple[Vector, Vector]:
+        if rates is not None:
+            return x, np.asarray(rates(x, u))
+        begin, end, _ = _followed(system_at, x, u, settling, 1, step_ns)
+        return begin, end - begin
+
+    linear = np.hstack([motion.A, motion.B])
+    if rates is None:
+        Ad, Bd = discretise(motion.A, motion.B, step_ns)
+        linear = np.hstack([Ad - np.eye(n), Bd])
+    random = np.random.default_rng(0)
+    offs = random.uniform(-1.0, 1.0, size=(_SAMPLES[motion.source], len(halfwidths)))
+    offs[::2] = np.sign(offs[::2])
+    rest, still = change(at, held)
+    missed, largest = np.zeros(n), np.zeros(n)
+    with np.errstate(all="ignore"):
+        for off in offs * halfwidths:
+            x, moved = change(at + off[:n], held + off[n:])
+            expected = linear @ np.concatenate([x - rest, off[n:]])
+            missed = np.maximum(missed, np.abs(moved - still - expected))
+            largest = np.maximum(largest, np.abs(expected))
+        # A state that does not move has no error but rounding.
+        rounding = _ROUNDING * (norm(largest) + norm(still) + norm(rest))
+        return np.where(missed <= rounding, 0.0, missed / largest)

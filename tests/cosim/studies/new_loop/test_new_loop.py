@@ -1,0 +1,304 @@
+"""From a plant to a scenario: models, gains, and files that every command accepts."""
+
+import json
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
+from typer.testing import CliRunner, Result
+
+import noack
+from cosim.cli import app
+from cosim.studies.new_loop.linear_model import controllable_states
+from noack.core.errors import CallerError
+from noack.scenario.resolution import loop_of, resolve
+from tests.plant_server.fmus.build import build
+
+POLE = '''
+import math
+
+class Pole:
+    """A pole on a cart."""
+
+    def __init__(self, length_m=0.5):
+        self.length_m = length_m
+
+    def derivative(self, t_s, z, u):
+        position, velocity, angle, rate = z
+        sine, cosine = math.sin(angle), math.cos(angle)
+        push = u[0] + 0.1 * self.length_m * sine * rate**2 - 0.1 * 9.81 * sine * cosine
+        acceleration = push / (1 + 0.1 * sine**2)
+        return velocity, acceleration, rate, (9.81 * sine - cosine * acceleration) / self.length_m
+
+class Unreachable:
+    def derivative(self, t_s, z, u):
+        return z[0], u[0] - z[1]
+
+class Weighed:
+    """x = 0, u = 0 is no equilibrium."""
+
+    def derivative(self, t_s, z, u):
+        return z[1], u[0] - 9.81
+
+class Broken:
+    def derivative(self, t_s, z, u):
+        return nothing
+
+class Endless:
+    def derivative(self, t_s, z, u):
+        return float("nan"), u[0] + z[1]
+
+class Stepped:
+    """A discrete simulator: ẋ = −2 x + u, exactly."""
+
+    def start(self, x0):
+        self.x = x0
+
+    def advance(self, u, t_s, dt_s):
+        a = math.exp(-2.0 * dt_s)
+        self.x = a * self.x + (1 - a) / 2 * u
+'''
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("pole.py").write_text(POLE)
+    return tmp_path
+
+
+def command(*words: str, ok: bool = True) -> Result:
+    done = CliRunner().invoke(app, list(words), prog_name="noack")
+    assert (done.exit_code == 0) == ok, done.output
+    return done
+
+
+def test_three_commands_lead_from_a_class_to_a_certified_run() -> None:
+    command("linearise", "pole.py:Pole", "--out", "pole.json")
+    command("gain", "pole.json", "--r", "2", "--out", "pole.json")
+    text = command("new", "loop.toml", "--plant", "pole.json").stdout
+    assert "Certified for the linear plant ẋ = Âx + B̂u, for every pattern of losses" in text
+    document = json.loads(Path("pole.json").read_text())
+    expected = [[0, 1, 0, 0], [0, 0, -0.981, 0], [0, 0, 0, 1], [0, 0, 21.582, 0]]
+    np.testing.assert_allclose(document["A"], expected, rtol=1e-9)
+    np.testing.assert_allclose(document["B"], [[0], [1], [0], [-2]], rtol=1e-9)
+    loop = loop_of(resolve(noack.load("loop.toml")))
+    assert loop.K.tolist() == document["gain"]
+    command("check", "loop.toml")
+    certified = command("certify", "loop.toml", "--json").stdout
+    assert json.loads(certified)["of_the_model_only"] == 'plant.system.kind = "python"'
+    assert "what follows is certified for the linear plant" in " ".join(
+        command("certify", "loop.toml").stdout.split()
+    )
+    run = noack.simulate("loop.toml")
+    assert run.ok
+    assert run.replay().bit_exact
+    # With its linear plant the claims of the certificate are checked, and hold.
+    linear = noack.simulate(noack.load("loop.toml", {"plant.system": {"kind": "linear"}}))
+    assert linear.ok
+    assert re.search(r"claims +\d+ held$", repr(linear), re.MULTILINE)
+    command("new", "loop.toml", "--plant", "pole.json", ok=False)  # it exists
+
+
+@pytest.mark.parametrize(
+    "name", ["cart_pole", "quadrotor", "dc_motor", "four_tank", "vehicle", "unstable_pendulum"]
+)
+def test_a_scenario_for_each_plant_that_comes_with_noack(name: str) -> None:
+    if name == "vehicle":
+        pytest.importorskip("vehiclemodels")
+    made = noack.new(name, "made.toml")
+    made.save("made.toml")
+    assert noack.load("made.toml") == made.scenario
+    command("check", "made.toml")
+    certified = command("certify", "made.toml", ok=made.certificate is not None).stdout
+    if name == "dc_motor":  # an eigenvalue of −1.5e6 /s
+        assert made.certificate is None
+        assert "No certificate was found" in made.text
+    else:
+        assert made.certificate is not None
+        assert made.certificate.constants is not None
+        assert made.certificate.constants.loop_gain < 1
+        assert "In words" in certified
+    assert made.notes[-1].endswith("the loop returns to 0.")
+    assert noack.simulate("made.toml").ok
+
+
+def test_every_key_of_the_file_that_is_chosen_has_a_comment() -> None:
+    lines = noack.new("four_tank", "tanks.toml").text.splitlines()
+    for key in ("horizon_s", "gain", "initial_state", "beta", "alpha_per_s", "floor", "mansd"):
+        (before,) = {one for one, line in pairwise(lines) if line.startswith(f"{key} = ")}
+        assert before.startswith("# "), key
+    assert max(map(len, (line for line in lines if line.startswith("#")))) <= 100
+
+
+def test_given_settings_stay_and_the_rest_is_chosen_around_them() -> None:
+    given = {"network.mansd": 3, "plant.rate_hz": 1000.0, "plant.system.cart_kg": 1.0}
+    made = noack.new("cart_pole", settings=given, initial_state=[0.0, 0.0, 0.05, 0.0])
+    scenario = made.scenario
+    assert (scenario.network.mansd, scenario.plant.rate_hz) == (3, 1000.0)
+    assert scenario.plant.initial_state == (0.0, 0.0, 0.05, 0.0)
+    assert scenario.plant.system.content()["cart_kg"] == 1.0
+    assert made.certificate is not None
+
+
+def test_an_initial_state_from_which_the_plant_does_not_return_is_made_smaller() -> None:
+    Path("weak.py").write_text(
+        "class Weak:\n"
+        "    def derivative(self, t_s, z, u):\n"
+        "        return (z[0] + 0.5 * min(max(u[0], -0.1), 0.1),)\n"
+    )
+    made = noack.new("weak.py:Weak")
+    assert abs(made.scenario.plant.initial_state[0]) < 0.05
+    assert made.notes[-1].endswith("the loop returns to 0.")
+
+
+@pytest.mark.parametrize("name", ["cart_pole", "four_tank", "quadrotor"])
+def test_the_regulator_solves_the_riccati_equation(name: str) -> None:
+    model = noack.linearise(name)
+    n, m = model.B.shape
+    found = noack.gain(model, q=np.arange(1.0, n + 1), r=0.5)
+    Q, R = np.diag(np.arange(1.0, n + 1)), 0.5 * np.eye(m)
+    P = solve_continuous_are(model.A, model.B, Q, R)
+    residual = model.A.T @ P + P @ model.A + Q - found.K.T @ R @ found.K
+    assert np.abs(residual).max() < 1e-6 * np.abs(P).max()
+    assert found.decay_per_s > 0
+
+
+@pytest.mark.parametrize("poles", [[-1, -2, -3, -4], [-2 + 1j, -2 - 1j, -3 + 2j, -3 - 2j]])
+def test_poles_are_placed(poles: list[complex]) -> None:
+    found = noack.gain("cart_pole", poles=poles)
+    np.testing.assert_allclose(
+        np.sort_complex(found.eigenvalues), np.sort_complex(poles), atol=1e-5
+    )
+
+
+def test_the_double_integrators_gain_is_the_textbooks() -> None:
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    model = replace(noack.linearise("double_integrator"), A=A, B=B)
+    found = noack.gain(model, q=[1.0, 0.0])
+    np.testing.assert_allclose(found.K, [[-1.0, -np.sqrt(2.0)]], atol=1e-9)
+
+
+def test_an_fmu_is_linearised_and_its_operating_point_goes_into_the_scenario(folder: Path) -> None:
+    """ẍ = u − k x + μ (1 − x²) ẋ: [[0, 1], [−1, 1]] at 0; at x = 1 it rests with u = 1."""
+    fmu = build(folder, 2)
+    found = noack.linearise(str(fmu))
+    np.testing.assert_allclose(found.A, [[0, 1], [-1, 1]], atol=1e-4)
+    np.testing.assert_allclose(found.B, [[0], [1]], atol=1e-4)
+    moved = noack.linearise(str(fmu), at=[1.0, 0.0], input=[1.0])
+    np.testing.assert_allclose(moved.A, [[0, 1], [-1, 0]], atol=1e-4)
+    made = noack.new(moved, "made.toml")
+    assert made.scenario.plant.system.content()["operating_state"] == [1.0, 0.0]
+    assert made.scenario.plant.system.content()["operating_input"] == [1.0]
+    made.save("made.toml")
+    assert noack.simulate("made.toml").ok
+
+
+def test_a_simulator_is_moved() -> None:
+    found = noack.linearise("pole.py:Stepped")
+    np.testing.assert_allclose([found.A[0, 0], found.B[0, 0]], [-2.0, 1.0], atol=1e-6)
+
+
+def test_uncontrollable_states_are_found_in_any_coordinates() -> None:
+    rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(4, 4)))[0]
+    A = rotation @ np.diag([1.0, -2.0, -2.0, -5.0]) @ rotation.T
+    B = rotation @ np.array([[1.0], [1.0], [0.0], [0.0]])
+    assert controllable_states(A, B).shape == (4, 2)
+    assert controllable_states(np.diag([1.0, 1.0]), np.ones((2, 1))).shape == (2, 1)
+    stiff = noack.linearise("dc_motor")  # 1e6 between its eigenvalues
+    assert stiff.rank == 3
+    chain = np.diag(np.ones(5), 1)
+    assert controllable_states(chain, np.eye(6)[:, -1:]).shape == (6, 6)
+
+
+def test_a_plant_that_cannot_be_stabilised_gives_one_line() -> None:
+    found = noack.linearise("pole.py:Unreachable")
+    assert (found.rank, found.uncontrollable.tolist()) == (1, [1.0])
+    assert "no gain stabilises the plant" in repr(found)
+    with pytest.raises(CallerError, match="the eigenvalue 1 /s is not controllable"):
+        noack.new(found)
+
+
+def test_a_stable_uncontrollable_part_stays_where_it_is() -> None:
+    model = noack.linearise("double_integrator")
+    wider = replace(model, A=np.diag([1.0, -3.0]), B=np.array([[1.0], [0.0]]))
+    assert noack.gain(wider, poles=[-2]).eigenvalues.real.tolist() == [-2.0, -3.0]
+    assert noack.gain(wider).eigenvalues[1] == -3.0
+
+
+MISTAKES: dict[str, str] = {
+    "linearise nothing": "no such file, nor a shipped scenario; .* PLANT is FILE.py:Class",
+    "linearise cart_pol": "cart_pol: no such plant; did you mean cart_pole",
+    "linearise pole.py": "which class of it. write pole.py:Pole or",
+    "linearise pole.py:Pol": "LookupError: pole.py has no Pol",
+    "linearise gone.py:Pole": "cannot be read: No such file",
+    "linearise gone.fmu": "cannot be read: No such file",
+    "linearise python": "names no plant by itself",
+    "linearise pole.py:Broken": "NameError: name 'nothing' is not defined",
+    "linearise pole.py:Endless": "no linear model: its motion is not finite",
+    "linearise cart_pole --at 1,2": "at: 2 numbers; the plant has 4 states",
+    "linearise cart_pole --at nan,0,0,0": "entries that are not finite",
+    "linearise cart_pole --at x": "--at x: give numbers with commas",
+    "linearise cart_pole --within 0": "within: 0; give a positive number",
+    "linearise pole.py:Pole --at 0,0,0": "ValueError: not enough values to unpack",
+    "linearise cart_pole --set plant.system.cart_kg=-1": "plant.system: cart_kg = -1",
+    "linearise cart_pole --set cart_kg": "write it as key=value",
+    "linearise cart_pole --out x.txt": "the name of a model ends in .json",
+    "linearise vehicle --set plant.system.model=kinematic": "x is not its whole state",
+    "linearise gone.json": "gone.json: cannot be read",
+    "gain cart_pole --q nan": "q: .nan.; positive numbers are needed",
+    "gain cart_pole --r 0": "r: .0.0.; positive numbers are needed",
+    "gain cart_pole --q 1,2": "q: 2 numbers; give 1 or 4",
+    "gain cart_pole --poles=-1,-2": "poles: 2 given; the controllable part has 4",
+    "gain cart_pole --poles=-1,-2,-3,4": "poles: they need negative real parts",
+    "gain cart_pole --poles=-1,-2,-3,-4+1j": "poles: .*conjugate",
+    "gain cart_pole --poles=-1,-2,-3,-4 --q 1": "poles: give either these or the weights",
+    "new a --plant cart_pole": "the name of a scenario file ends in .toml",
+    "new a.toml --plant cart_pole --x0 1": "x0: 1 numbers; the plant has 4 states",
+    "new a.toml --plant cart_pole --set network.nothing=1": "network.nothing",
+    "new a.toml --plant pole.py:Weighed": r"needs an equilibrium; at the point ẋ is \(0, -9.81\)",
+    "new gone/a.toml --plant unstable_pendulum": "cannot be written",
+}
+
+
+@pytest.mark.parametrize(("line", "expected"), MISTAKES.items())
+def test_a_mistake_gives_one_line(line: str, expected: str) -> None:
+    if "vehicle" in line:
+        pytest.importorskip("vehiclemodels")
+    if ".fmu" in line:
+        pytest.importorskip("fmpy")
+    done = CliRunner().invoke(app, line.split(), prog_name="noack")
+    assert done.exit_code in (1, 2), done.output
+    assert re.search(expected, done.stderr), done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(("edit", "why"), [
+    ({"plant": 1}, "not written by `noack linearise`"),
+    ({"gain": [[1.0]]}, "gain: 1 numbers; the plant has 4 states"),
+    ({"gain": [[1.0] * 4] * 2}, "gain: 2 rows; the plant has 1 inputs"),
+    ({"gain": [[0.0] * 4]}, "does not stabilise the model"),
+    ({"at": [0.0]}, "at: 1 numbers"),
+])  # fmt: skip
+def test_a_damaged_file_of_a_model_is_refused(edit: dict[str, Any], why: str) -> None:
+    command("gain", "cart_pole", "--out", "model.json")
+    document = json.loads(Path("model.json").read_text())
+    Path("model.json").write_text(json.dumps(document | edit))
+    with pytest.raises(CallerError, match=why):
+        noack.new("model.json")
+
+
+def test_a_gymnasium_environment_becomes_a_scenario() -> None:
+    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
+    made = noack.new("gymnasium:Pendulum-v1", "made.toml")
+    made.save("made.toml")
+    assert made.scenario.plant.rate_hz == 20.0
+    run = noack.simulate("made.toml")
+    assert run.ok
+    assert run.replay().bit_exact

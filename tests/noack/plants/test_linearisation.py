@@ -1,0 +1,182 @@
+"""Linear models of plants: against closed forms, and where there is none."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, logm
+
+from noack.core.errors import CallerError
+from noack.plants.gymnasium import GymnasiumSettings
+from noack.plants.linear import LinearSystem
+from noack.plants.plant_settings import (
+    OdeSystem,
+    PlantEquations,
+    PlantStart,
+    PlantSystem,
+    SystemFailedError,
+)
+from noack.plants.systems.linearisation import (
+    NO_LOGARITHM,
+    NOT_FINITE,
+    STEP_NS,
+    largest_errors,
+    linearise,
+)
+
+
+def pendulum(_: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+    return z[1], 9.81 * math.sin(z[0]) - 0.1 * z[1] + v[0] * math.cos(z[0])
+
+
+def system(x0: np.ndarray) -> OdeSystem:
+    return OdeSystem(PlantEquations(pendulum), x0)
+
+
+class Moved:
+    """A system that only moves: x(t + h) = step(x(t), u)."""
+
+    z = np.zeros(0)
+
+    def __init__(self, step: Any, x0: np.ndarray) -> None:
+        self._step, self.x = step, x0
+
+    def advance(self, u: np.ndarray, t_ns: int, dt_ns: int) -> None:
+        self.x = self._step(self.x, u)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0, math.pi])
+def test_a_pendulum_has_its_jacobian_at_any_point(angle: float) -> None:
+    found = linearise(system, 2, 1, at=np.array([angle, 0.2]), held=np.array([0.3]))
+    sine, cosine = math.sin(angle), math.cos(angle)
+    np.testing.assert_allclose(
+        found.A, [[0, 1], [9.81 * cosine - 0.3 * sine, -0.1]], rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(found.B, [[0], [cosine]], rtol=1e-9)
+    np.testing.assert_allclose(found.drift, [0.2, 9.81 * sine - 0.02 + 0.3 * cosine], rtol=1e-12)
+    assert found.source == "derivative"
+    assert found.void is None
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_units_of_any_size_do_not_change_the_relative_accuracy(scale: float) -> None:
+    def scaled(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        rate, acceleration = pendulum(t, z, v * scale)
+        return rate, acceleration
+
+    at = np.zeros(2)
+    found = linearise(lambda x0: OdeSystem(PlantEquations(scaled), x0), 2, 1, at=at)
+    np.testing.assert_allclose(found.B, [[0.0], [scale]], rtol=1e-9)
+    np.testing.assert_allclose(found.A, [[0.0, 1.0], [9.81, -0.1]], rtol=1e-9)
+
+
+def test_the_motion_and_the_derivative_give_the_same_model() -> None:
+    class OnlyMoved(OdeSystem):
+        rates = None  # type: ignore[assignment]
+
+    found = linearise(lambda x0: OnlyMoved(PlantEquations(pendulum), x0), 2, 1)
+    assert found.source == "motion"
+    np.testing.assert_allclose(found.A, [[0, 1], [9.81, -0.1]], atol=1e-6)
+    np.testing.assert_allclose(found.B, [[0], [1]], atol=1e-6)
+
+
+def test_the_remainder_is_of_the_second_order() -> None:
+    """At θ₀ = 1 it is −g sin θ₀ δ²/2 and smaller terms, relative to the largest linear part."""
+    at, held = np.array([1.0, 0.0]), np.zeros(1)
+    found = linearise(system, 2, 1, at=at)
+    sizes = [
+        largest_errors(system, found, np.array([width, width, 0.0]), at=at, held=held)
+        for width in (0.1, 0.01)
+    ]
+    expected = 9.81 * math.sin(1.0) * 0.01**2 / 2 / (0.01 * (9.81 * math.cos(1.0) + 0.1))
+    assert sizes[1][0] == 0.0  # ẋ₁ = x₂ is linear
+    assert sizes[1][1] == pytest.approx(expected, rel=0.02)
+    assert sizes[0][1] == pytest.approx(10 * expected, rel=0.1)
+
+
+def test_a_linear_system_that_is_moved_has_no_error() -> None:
+    A, B = np.array([[0.0, 1.0], [9.81, -0.1]]), np.array([[0.0], [1.0]])
+
+    def at(x0: np.ndarray) -> PlantSystem:
+        return LinearSystem(A, B, x0)
+
+    found = linearise(at, 2, 1)
+    np.testing.assert_allclose(found.A, A, atol=1e-8)
+    errors = largest_errors(at, found, np.ones(3), at=np.zeros(2), held=np.zeros(1))
+    assert errors.max() < 1e-8
+
+
+@pytest.mark.parametrize(("step", "why"), [
+    (lambda x, u: -0.5 * x + u, NO_LOGARITHM),
+    (lambda x, u: 0.0 * x + u, NO_LOGARITHM),
+    (lambda x, u: x + np.where(u > 0, np.nan, u), NOT_FINITE),
+])  # fmt: skip
+def test_a_step_without_a_model_in_continuous_time_says_why(step: Any, why: str) -> None:
+    found = linearise(lambda x0: Moved(step, x0), 1, 1)
+    assert found.void == why
+    assert np.isnan(found.A).all()
+
+
+def test_dry_friction_is_found_by_the_error() -> None:
+    def dry(_: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        return (v[0] - math.copysign(0.05, z[0]),)
+
+    def at(x0: np.ndarray) -> OdeSystem:
+        return OdeSystem(PlantEquations(dry), x0)
+
+    x, u = np.array([0.2]), np.zeros(1)
+    found = linearise(at, 1, 1, at=x)
+    assert largest_errors(at, found, np.full(2, 0.1), at=x, held=u)[0] == 0.0
+    assert largest_errors(at, found, np.full(2, 0.5), at=x, held=u)[0] > 0.1
+
+
+def start(n: int = 2, m: int = 1, step_ns: int = 50_000_000) -> PlantStart:
+    return PlantStart(np.zeros(n), np.zeros((n, n)), np.zeros((n, m)), step_ns)
+
+
+def test_the_pendulum_of_gymnasium_has_the_logarithm_of_its_step() -> None:
+    """ω' = ω + (15 sin θ + 3u) h and θ' = θ + ω' h, with θ = 0 upright, h = 0.05 s."""
+    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
+    settings, h = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1"), 0.05
+    found = linearise(
+        lambda x0: settings.system(start()._replace(x0=x0)), 2, 1, step_ns=round(h * 1e9)
+    )
+    step = np.array([[1 + 15 * h * h, h, 3 * h * h], [15 * h, 1, 3 * h], [0, 0, 1]])
+    expected = logm(step) / h
+    np.testing.assert_allclose(found.A, expected[:2, :2], atol=1e-6)
+    np.testing.assert_allclose(found.B, expected[:2, 2:], atol=1e-6)
+    np.testing.assert_allclose(expm(found.A * h), step[:2, :2], atol=1e-7)
+    moved = settings.system(start()._replace(x0=np.array([0.1, 0.2])))
+    moved.advance(np.array([0.5]), 0, 50_000_000)
+    speed = 0.2 + (15 * math.sin(0.1) + 1.5) * h
+    np.testing.assert_allclose(moved.x, [0.1 + speed * h, speed], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("given", "started", "why"), [
+    ({"id": "CartPole-v1"}, start(4), r"its actions are Discrete\(2\), not continuous"),
+    ({"id": "NoSuchThing-v1"}, start(), "NameNotFound: Environment `NoSuchThing` doesn't exist"),
+    ({"id": "MountainCarContinuous-v0"}, start(), "no time of a step; give plant.system.step_s"),
+    ({"id": "Pendulum-v1"}, start(3), "it has 2 states and 1 actions; the model has 3 and 1"),
+    ({"id": "Pendulum-v1"}, start(step_ns=STEP_NS), "its step is 0.05 s; set plant.rate_hz = 20"),
+    ({"id": "Pendulum-v1", "parameters": {"weight": 1.0}}, start(), "unexpected keyword argument"),
+])  # fmt: skip
+def test_an_unsuitable_environment_is_refused(given: Any, started: PlantStart, why: str) -> None:
+    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
+    with pytest.raises(CallerError, match=why) as caught:
+        GymnasiumSettings(kind="gymnasium", **given).system(started)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_environment_that_fails_stops_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
+    made = GymnasiumSettings(kind="gymnasium", id="Pendulum-v1").system(start())
+    monkeypatch.setattr(made._environment, "step", lambda u: 1 / 0)
+    with pytest.raises(SystemFailedError, match=r"Pendulum-v1.*ZeroDivisionError"):
+        made.advance(np.zeros(1), 0, 50_000_000)
+
+
+def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("noack.plants.plant_settings.find_spec", lambda name: None)
+    with pytest.raises(CallerError, match=r"pip install 'noack\[gymnasium\]'"):
+        GymnasiumSettings(kind="gymnasium", id="Pendulum-v1").system(start())
