@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _EVENTS_SHOWN = 40
 
 
-@cli.command(cli.RUNS, 20)
+@cli.command(cli.RUNS, 20, on_linux=True)
 def run(
     context: typer.Context,
     given: cli.ScenarioOptions,
@@ -56,7 +56,7 @@ def run(
     return run_processes(given.load(), options, server=context.obj, listening=listening)
 
 
-@cli.command(cli.RUNS, 10)
+@cli.command(cli.RUNS, 10, on_linux=True)
 def demo(
     context: typer.Context,
     *,
@@ -168,6 +168,7 @@ def _print_run(
 @cli.command(
     cli.RUNS,
     45,
+    on_linux=True,
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value
 )
