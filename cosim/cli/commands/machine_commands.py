@@ -18,7 +18,7 @@ with lazy_modules():
     from noack.scenario import resolution, scenario_file
 
 
-@cli.command(cli.FILES, 10, on_linux=True)
+@cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
 def doctor(
     given: cli.ExampleOptions,
     *,

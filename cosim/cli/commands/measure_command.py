@@ -147,7 +147,7 @@ class WrittenOptions(cli.FigureOptions):
         )
 
 
-@cli.command(cli.MEASURING, 10)
+@cli.command(cli.MEASURING, 10, takes="some seconds for a file; a probe, as long as --for")
 def measure(
     sources: Annotated[list[str] | None, Argument(metavar="FILE...|ADDRESS")] = None,
     *,
