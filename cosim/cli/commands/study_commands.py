@@ -72,7 +72,7 @@ def campaign(
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
 
 
-@cli.command(cli.THEORY, 30, takes="some minutes")
+@cli.command(cli.THEORY, 30, takes="up to a minute")
 def paper(
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
