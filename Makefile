@@ -166,10 +166,14 @@ lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header --group compiler -o requirements-compiler.lock
 
-dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
+dist: setup-dev ## Build the sdist, and from it the wheels for Linux, macOS and Windows, into dist/
 	@rm -rf dist
-	$(BIN)/uv build --quiet --no-build-isolation --out-dir dist .
-	@ls dist/*
+	$(PIP) -r requirements-compiler.lock
+	$(BIN)/uv build --quiet --sdist --no-build-isolation --out-dir dist .
+	@for platform in $$($(BIN)/python native/build.py --platforms); do \
+		NOACK_PLATFORM=$$platform $(BIN)/uv build --quiet --wheel --no-build-isolation --out-dir dist \
+			dist/noack-*.tar.gz || exit; done
+	@ls -s --block-size=K dist/*
 
 clean: ## Remove the environment and caches, not runs/
 	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache \

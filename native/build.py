@@ -1,7 +1,8 @@
 """Builds the core: a shared library of native/*.c, and the declarations of noack.h for cffi.
 
 ``make setup`` and the wheel's build call it. It takes a few seconds, and nothing if no source has
-changed. Without a C compiler on the path it uses the one of the package ziglang, if that is there.
+changed. Without a C compiler on the path it uses the one of the package ziglang, if that is there;
+the library of another platform is always built by it.
 """
 
 import argparse
@@ -15,7 +16,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +25,18 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 INTO = HERE.parent / "noack" / "core"
 LIBRARY, HEADER = "libnoack.so", "_core_header.py"
+PLATFORMS = {
+    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
+    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
+    "macosx_11_0_arm64": "aarch64-macos.11.0",
+    "macosx_10_13_x86_64": "x86_64-macos.10.13",
+    "win_amd64": "x86_64-windows-gnu",
+}
+"""The platforms for which ``make dist`` builds wheels, each by its tag: ziglang's names of them."""
+OWN = f"{sys.platform}_{platform.machine()}".lower()
+"""The platform of this machine."""
+_LIVE = ("driver/driver.c", "relay/*.c")
+"""Sockets and timers of live runs: only Linux has them. Elsewhere the library is without them."""
 _SCRATCH = ".building-"
 _STATES = "states.c"
 """The exact simulator's code for a fixed number of states; it is compiled for each of these:"""
@@ -39,7 +51,7 @@ NO_COMPILER = 3
 # No contraction of a·b + c: results have the same bits on every processor.
 FLAGS = (
     "-std=c11", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off",
-    "-fno-math-errno", "-fno-semantic-interposition", "-g0", "-Wall", "-Wextra", "-Wconversion",
+    "-fno-math-errno", "-g0", "-Wall", "-Wextra", "-Wconversion",
 )  # fmt: skip
 SANITIZERS = (
     "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-g",
@@ -51,12 +63,17 @@ class NoCompilerError(Exception):
     """There is no C compiler."""
 
 
-def compiler() -> list[str]:
+def compiler(target: str = OWN) -> list[str]:
     """Return the command of a C compiler: $CC, cc, gcc or clang, or that of ziglang.
 
     Raises:
         NoCompilerError: there is none.
     """
+    ziglang = [sys.executable, "-m", "ziglang", "cc"]
+    if target != OWN:
+        if importlib.util.find_spec("ziglang"):
+            return [*ziglang, "-target", PLATFORMS[target]]
+        raise NoCompilerError("the core of another platform needs the Python package ziglang")
     if os.environ.get("CC"):
         return shlex.split(os.environ["CC"])
     for name in ("cc", "gcc", "clang"):
@@ -64,16 +81,17 @@ def compiler() -> list[str]:
             return [name]
     if importlib.util.find_spec("ziglang"):
         # Not for this machine's processor only, as the other compilers do it.
-        return [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+        return [*ziglang, "-mcpu=baseline"]
     raise NoCompilerError(
         "noack's core needs a C compiler: install gcc or clang (Debian: apt-get install gcc "
         "libc6-dev), or the Python package ziglang"
     )
 
 
-def sources() -> list[Path]:
-    """Return the C files of the core, in a fixed order."""
-    return sorted(HERE.glob("**/*.c"))
+def sources(target: str = OWN) -> list[Path]:
+    """Return the C files of a platform's core, in a fixed order."""
+    live = {file for pattern in _LIVE for file in HERE.glob(pattern)}
+    return sorted({*HERE.glob("**/*.c")} - (set() if "linux" in target else live))
 
 
 def declarations() -> str:
@@ -81,14 +99,18 @@ def declarations() -> str:
     return (HERE / "noack.h").read_text() + "const char *noack_sources(void);\n"
 
 
-def is_current(into: Path = INTO, files: Sequence[str] = (LIBRARY, HEADER)) -> bool:
+def is_current(
+    into: Path = INTO, files: Sequence[str] = (LIBRARY, HEADER), target: str = OWN
+) -> bool:
     """Return whether a folder has files of the present sources."""
-    digest = _digest().encode()
+    digest = _digest(target).encode()
     paths = [into / name for name in files]
     return all(path.exists() and digest in path.read_bytes() for path in paths)
 
 
-def build(into: Path = INTO, *more_flags: str, library_alone: bool = False) -> bool:
+def build(
+    into: Path = INTO, *more_flags: str, library_alone: bool = False, target: str = OWN
+) -> bool:
     """Build library and declarations into a folder; return whether anything had changed.
 
     Each file is replaced as a whole, and one build waits for another. Both files contain the digest
@@ -103,7 +125,7 @@ def build(into: Path = INTO, *more_flags: str, library_alone: bool = False) -> b
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
         files = [LIBRARY] if library_alone else [LIBRARY, HEADER]
-        if not (missing := [name for name in files if not is_current(into, [name])]):
+        if not (missing := [name for name in files if not is_current(into, [name], target)]):
             return False
         for left in into.glob(f"{_SCRATCH}*"):  # by a build that was killed
             shutil.rmtree(left)
@@ -111,9 +133,9 @@ def build(into: Path = INTO, *more_flags: str, library_alone: bool = False) -> b
             scratch = Path(name)
             if LIBRARY in missing:
                 print("building the core in C ...", flush=True)
-                _compile(scratch, more_flags)
+                _compile(scratch, more_flags, target)
             if HEADER in missing:
-                _write_declarations(scratch)
+                _write_declarations(scratch, target)
             for file in missing:
                 (scratch / file).replace(into / file)
         for old in into.glob(f"__pycache__/{Path(HEADER).stem}.*"):  # maybe of the same second
@@ -123,45 +145,48 @@ def build(into: Path = INTO, *more_flags: str, library_alone: bool = False) -> b
         os.close(folder)
 
 
-def _compile(into: Path, more_flags: tuple[str, ...]) -> None:
-    command = compiler()
+def _compile(into: Path, more_flags: tuple[str, ...], target: str = OWN) -> None:
+    is_linux = "linux" in target
+    command = [*compiler(target), *FLAGS, *more_flags]
+    if is_linux:
+        command.append("-fno-semantic-interposition")
     digest = into / "sources.c"
     digest.write_text(
         '__attribute__((visibility("default"))) const char *noack_sources(void);\n'
-        f'const char *noack_sources(void) {{ return "{_digest()}"; }}\n'
+        f'const char *noack_sources(void) {{ return "{_digest(target)}"; }}\n'
     )
 
     def compile_one(unit: tuple[int, tuple[Path, tuple[str, ...]]]) -> str:
         number, (file, own) = unit
         result = str(into / f"{file.stem}-{number}.o")
-        subprocess.run(
-            [*command, *FLAGS, *own, *more_flags, "-c", str(file), "-o", result], check=True
-        )
+        subprocess.run([*command, *own, "-c", str(file), "-o", result], check=True)
         return result
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        objects = [*pool.map(compile_one, enumerate([*_units(), (digest, ())]))]
-    library = str(into / LIBRARY)
-    # The core's own calls go directly to its functions, not through a table.
-    command += [*FLAGS, *more_flags, "-shared", "-Wl,-Bsymbolic", *objects, "-lm", "-o", library]
+        objects = [*pool.map(compile_one, enumerate([*_units(target), (digest, ())]))]
+    command += ["-shared", *objects, "-o", str(into / LIBRARY)]
+    if is_linux:  # the core's own calls go directly to its functions, not through a table
+        command += ["-Wl,-Bsymbolic", "-lm"]
+    elif target.startswith(("macosx", "darwin")):  # its name; otherwise it is its path
+        command.append(f"-Wl,-install_name,{LIBRARY}")
     subprocess.run(command, check=True)
 
 
-def _units() -> list[tuple[Path, tuple[str, ...]]]:
+def _units(target: str) -> list[tuple[Path, tuple[str, ...]]]:
     """Return the files to compile, each with its own flags; those that take longest are first."""
     states = HERE / "exact" / _STATES
     sizes: list[tuple[str, ...]] = [(f"-DN={size}",) for size in _SIZES]
-    if platform.machine() in ("x86_64", "AMD64"):  # three sizes without AVX2 and FMA
+    if target.endswith(("x86_64", "amd64")):  # three sizes without AVX2 and FMA
         fused = [(*size, *_FUSED) for size in sizes]
         wide = [(size, *_FUSED, *_WIDE) for size in ("-DN=8", "-DN=4")]
         sizes = [*fused, *wide, ("-DN=64",), ("-DN=4",), ("-DN=3",)]
     return [
         *((states, flags) for flags in sizes),
-        *((file, ()) for file in sources() if file != states),
+        *((file, ()) for file in sources(target) if file != states),
     ]
 
 
-def _write_declarations(into: Path) -> None:
+def _write_declarations(into: Path, target: str) -> None:
     from cffi import FFI
 
     ffi = FFI()
@@ -170,13 +195,13 @@ def _write_declarations(into: Path) -> None:
     path = into / HEADER
     with redirect_stdout(io.StringIO()):  # it says what it does
         ffi.emit_python_code(str(path))
-    path.write_text(f"{path.read_text()}SOURCES = {_digest()!r}\n")
+    path.write_text(f"{path.read_text()}SOURCES = {_digest(target)!r}\n")
 
 
-def _digest() -> str:
+def _digest(target: str) -> str:
     """Return a digest of all that the library depends on."""
-    digest = hashlib.blake2b(sysconfig.get_platform().encode(), digest_size=16)
-    for file in (*sources(), *sorted(HERE.glob("**/*.h")), Path(__file__)):
+    digest = hashlib.blake2b(target.encode(), digest_size=16)
+    for file in (*sources(target), *sorted(HERE.glob("**/*.h")), Path(__file__)):
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
@@ -192,7 +217,11 @@ def main() -> int:
     parser.add_argument(
         "--library", action="store_true", help="only the library: before cffi is installed"
     )
+    parser.add_argument("--platforms", action="store_true", help="print those of the wheels")
     given = parser.parse_args()
+    if given.platforms:
+        print(*PLATFORMS)
+        return 0
     if given.sanitized and given.into == INTO:
         parser.error("--sanitized: noack cannot load this library; give another folder by --into")
     try:

@@ -1,9 +1,7 @@
 /* The clock of a run: simulated time as a function of this host's monotonic clock. */
-#define _GNU_SOURCE
 #include "core.h"
 
 #include <math.h>
-#include <time.h>
 
 enum {
     PPB = 1000000000,
@@ -12,12 +10,6 @@ enum {
     MOST_SETTLE_NS = 10000000,
     MOST_PUT_OFF_NS = 50000000 /* if something is always near, or datagrams wait */
 };
-
-int64_t clock_ns(int clock) {
-    struct timespec now;
-    clock_gettime(clock, &now);
-    return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
-}
 
 /* The offset of the coordinator's clock, as noack.core.clock.SlewedClock applies it. */
 static int64_t applied_offset_ns(const noack_clock *clock, int64_t own_ns) {
@@ -34,10 +26,6 @@ int64_t noack_clock_at_ns(const noack_clock *clock, int64_t own_ns) {
     if (clock->slew_ppb > 0)
         wall_ns += applied_offset_ns(clock, own_ns);
     return simulated_ns_of(clock, wall_ns);
-}
-
-int64_t run_time_ns(const noack_clock *clock) {
-    return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
 }
 
 /* Truncate to a whole number, of 146 years at most. */

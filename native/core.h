@@ -86,10 +86,10 @@ void queue_occupy(noack_link *link, int64_t number, int64_t until_ns);
 int codel_is_due(const noack_link *link, int64_t number);
 void codel_drop(noack_link *link, int64_t number);
 
-/* clock.c: readings of a clock, and simulated times. */
+/* clock.c, and driver.c: readings of a clock. */
+int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
 int64_t clock_ns(int clock);
 int64_t run_time_ns(const noack_clock *clock);
-int64_t simulated_ns_of(const noack_clock *clock, int64_t wall_ns);
 
 typedef struct {          /* of a driver that returns to Python for housekeeping */
     int64_t worked;       /* 1: it has done something since it last waited */

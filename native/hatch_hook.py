@@ -1,8 +1,11 @@
 """Builds the core for wheels and editable installations; hatchling calls it (pyproject.toml)."""
 
+import os
 import re
 import runpy
+import shutil
 import sysconfig
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +16,40 @@ class CoreHook(BuildHookInterface):
     """Adds the library and its declarations to a wheel."""
 
     PLUGIN_NAME = "custom"
+    _scratch: Path | None = None
 
     def dependencies(self) -> list[str]:
         """Return the further packages that a build needs: a compiler, if the machine has none."""
         build = self._build()
         try:
-            build["compiler"]()
+            build["compiler"](os.environ.get("NOACK_PLATFORM", build["OWN"]))
         except build["NoCompilerError"]:
             return ["ziglang>=0.13"]
         return []
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Build the core in its place; the wheel is of this platform, and of every Python 3."""
+        """Build the core; the wheel is of one platform, and of every Python 3.
+
+        It is this machine's, with the core in its place, or that of $NOACK_PLATFORM.
+        """
         build = self._build()
-        build["build"]()
-        library = build["INTO"] / build["LIBRARY"]
-        build_data["artifacts"] += [f"/noack/core/{build[name]}" for name in ("LIBRARY", "HEADER")]
+        tag = os.environ.get("NOACK_PLATFORM")
+        folder = Path(tempfile.mkdtemp(prefix="noack-core-")) if tag else build["INTO"]
+        if tag is None:
+            build["build"]()
+            tag = _platform((folder / build["LIBRARY"]).read_bytes())
+        else:
+            build["build"](folder, target=tag)
+            self._scratch = folder
+        for name in (build["LIBRARY"], build["HEADER"]):
+            build_data["force_include"][str(folder / name)] = f"noack/core/{name}"
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{_platform(library.read_bytes())}"
+        build_data["tag"] = f"py3-none-{tag}"
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Remove what was built for another platform."""
+        if self._scratch:
+            shutil.rmtree(self._scratch)
 
     def _build(self) -> dict[str, Any]:
         return runpy.run_path(str(Path(self.root) / "native" / "build.py"))

@@ -18,6 +18,7 @@ from typer.main import get_command
 
 import noack
 from cosim.cli import app
+from cosim.cli.command import durations
 from cosim.output.page_kit import glossary
 from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
 from cosim.studies.campaign.campaign_file import load as load_campaign
@@ -134,6 +135,15 @@ def test_every_option_is_documented_and_no_other(command: str) -> None:
     parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
     known = {name for one in parameters for name in one.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
+
+
+def test_the_table_of_commands_says_how_long_each_takes() -> None:
+    text = (ROOT / "docs/command-line.md").read_text().partition("## What noack can do")[2]
+    rows = [line.split("|") for line in text.partition("```")[0].splitlines() if "|" in line]
+    assert len(durations) > 10
+    for name, takes in durations.items():
+        assert any(re.search(rf"\b{name}\b", row[1]) and takes in row[3] for row in rows), name
+        assert f"Takes {takes}." in get_command(app).commands[name].help  # type: ignore[attr-defined]
 
 
 def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:

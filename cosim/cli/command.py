@@ -47,6 +47,7 @@ with lazy_modules():
 
     from cosim.live import fork_server, progress
     from cosim.output import result_tables
+    from noack.core import core_library
     from noack.scenario import scenario_file
 
 if TYPE_CHECKING:
@@ -222,6 +223,8 @@ T = TypeVar("T")
 Found = TypeVar("Found")
 _order: dict[object, tuple[int, int]] = {}
 """By command function: panel, and place in the panel."""
+durations: dict[str, str] = {}
+"""By command: how long it takes."""
 
 
 def _columns(rows: Iterable[tuple[str, str]]) -> list[str]:
@@ -403,7 +406,7 @@ def options(
 
 
 def command(
-    panel: str, place: int, **settings: Any
+    panel: str, place: int, *, takes: str = "", on_linux: bool = False, **settings: Any
 ) -> Callable[[Callable[..., int | None]], Callable[..., None]]:
     """Register a command. Its result is the exit status; an error or Ctrl-C is printed as one line.
 
@@ -414,11 +417,14 @@ def command(
     Args:
         panel: panel of the help, one of :data:`PANELS`.
         place: sort key within the panel, ascending.
+        takes: how long it takes, for its help and the manual, unless it is instant.
+        on_linux: Linux only: elsewhere an error.
         settings: keyword arguments of :meth:`typer.Typer.command`.
     """
 
     def register(function: Callable[..., int | None]) -> Callable[..., None]:
         text, examples = _describe_options(function)
+        text += f"\n\nTakes {takes}." if takes else ""
         parameters, groups = _parameters(function)
 
         @wraps(function)
@@ -430,6 +436,8 @@ def command(
                 )
             try:
                 with stop_requests_raised():
+                    if on_linux:
+                        core_library.require_live_runs()
                     status = function(**given) or ExitStatus.OK
                 if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
@@ -448,6 +456,8 @@ def command(
         reported.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         reported.__annotations__ = {option.name: option.annotation for option in parameters}
         _order[reported] = PANELS.index(panel), place
+        if takes:
+            durations[settings.get("name", function.__name__)] = takes
         shown = "\n".join(["\b", "Examples:", *_columns(examples)]) if examples else None
         registered: Callable[..., None] = app.command(
             rich_help_panel=panel, epilog=shown, help=text, **settings

@@ -31,6 +31,7 @@ with lazy_modules():
     from cosim.output.viewer import rerun_program
     from cosim.record import run_directory
     from cosim.studies.campaign import campaign_file, campaign_report, campaign_workers
+    from noack.core import core_library
     from noack.protocol import topology
     from noack.runtime import address, run_registry
     from noack.runtime.connections import metrics_server
@@ -103,6 +104,7 @@ def run_processes(
         server: starts the processes, and ends with the run; by default a new one.
         listening: how processes on other hosts join.
     """
+    core_library.require_live_runs()
     with fork_server.fork_server(server) as server:
         ending = None
         link_load.require_capacity(loaded)

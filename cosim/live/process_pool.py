@@ -23,7 +23,6 @@ _ENVIRONMENT = dict.fromkeys(
 """One thread each, and no imports from the current folder (:mod:`noack.core.process_limits`). They
 keep freed memory: with new memory for each part of a record, half of the time is page faults."""
 
-_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _STARTS = threading.Lock()
 
 
@@ -72,14 +71,25 @@ def process_starts() -> Iterator[None]:
     import the parent's main module, as multiprocessing lets them do: a user's program need not
     have an ``if __name__ == "__main__"``.
     """
-    with _STARTS:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    with _STARTS, _endings_blocked():
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             yield
         finally:
             sys.modules["__main__"] = main
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _endings_blocked() -> Iterator[None]:
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    endings = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, endings)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def called(module: str, function: str, *arguments: object) -> object:

@@ -49,6 +49,7 @@ REPORT_FILE = "report.html"
 RECORD = "record"
 LATEST = "latest"
 _LOCK = ".lock"
+_HAS_LINKS = hasattr(os, "geteuid")  # not on Windows
 _MOST_JSON_BYTES = 256 * 2**20
 LEAST_FREE_BYTES = 16 * 1024 * 1024
 
@@ -139,6 +140,8 @@ def read_object(path: Path) -> dict[str, Any]:
 
 def point_to_latest(run_dir: Path) -> None:
     """Link ``latest``, beside the run directory, to it; warn if this fails."""
+    if not _HAS_LINKS:
+        return
     latest = run_dir.parent / LATEST
     scratch = run_dir.parent / f".{LATEST}.{os.urandom(8).hex()}"
     try:  # the link is optional, so its failure does not end the run
@@ -160,6 +163,10 @@ def latest_run(runs: Path) -> Path:
         CallerError: there is none, or the link or the directory belongs to another user: opening a
             run may execute the code of its plant.
     """
+    if not _HAS_LINKS:  # the names begin with the time
+        if made := sorted(path.parent for path in runs.glob(f"*/{SCENARIO_FILE}")):
+            return made[-1]
+        raise CallerError(f"{runs}: no run yet; `noack simulate SCENARIO` makes one")
     link = runs / LATEST
     if not link.is_symlink() or not link.is_dir():
         raise CallerError(f"{runs}: no run yet; `noack demo` makes one")

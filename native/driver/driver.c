@@ -64,6 +64,16 @@ typedef struct {
     uint8_t in_data[MESSAGES][MESSAGE_BYTES];
 } driver_scratch;
 
+int64_t clock_ns(int clock) {
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
+}
+
+int64_t run_time_ns(const noack_clock *clock) {
+    return noack_clock_at_ns(clock, clock_ns(CLOCK_MONOTONIC));
+}
+
 static driver_scratch *scratch_of(const noack_driver *driver) { return driver->scratch; }
 
 int64_t noack_driver_scratch_bytes(void) { return (int64_t)sizeof(driver_scratch); }

@@ -56,6 +56,16 @@ def load_core(path: Path) -> CData:
 core: CData = load_core(LIBRARY)
 """The functions and constants of native/noack.h."""
 
+
+def require_live_runs() -> None:
+    """Raise CallerError where there are no live runs: the core has its sockets on Linux only."""
+    if not hasattr(core, "noack_drive"):
+        raise CallerError(
+            "live runs and the network emulator need Linux; `noack simulate` runs the same loop in "
+            "virtual time"
+        )
+
+
 _FORMATS = {
     "int64_t": "<i8", "int32_t": "<i4", "uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4",
     "uint64_t": "<u8", "double": "<f8",

@@ -1,20 +1,28 @@
 """Files: atomic writing, reading of limited size, and advisory locks."""
 
 import errno
-import fcntl
 import os
 import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from noack.core.errors import CallerError, MachineError, printable, why
+
+with suppress(ImportError):  # Windows has other locks
+    import fcntl
 
 PARTIAL = ".partial"
 """End of the names of files that are being written; they begin with a dot."""
 _NOT_REGULAR = "not a regular file"
+_HAS_LINKS = os.open in os.supports_dir_fd
+"""Whether other users can put links into a folder (POSIX). On Windows links need their privilege,
+and a folder has no descriptor, nor can an open file be replaced."""
+_UNBLOCKED = os.O_NONBLOCK if _HAS_LINKS else os.O_BINARY  # type: ignore[attr-defined]
+_SAFE = _UNBLOCKED | (os.O_NOFOLLOW | os.O_CLOEXEC if _HAS_LINKS else 0)
+"""Follow no link, and do not wait for the reader of a FIFO."""
 
 
 def shipped_folder(name: str) -> Path:
@@ -62,10 +70,10 @@ def new_file(path: Path, *, make_folder: bool = True, mode: int = 0o666) -> Iter
         try:
             with os.fdopen(descriptor, "wb") as file:
                 yield file
-            os.replace(scratch, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+            folder.replace(scratch, path.name)
         except BaseException:
             with suppress(OSError):
-                os.unlink(scratch, dir_fd=folder)
+                os.unlink(folder.at / scratch, dir_fd=folder.descriptor)
             raise
 
 
@@ -78,6 +86,8 @@ def open_growing(path: Path, *, follow: bool = False) -> int:
     a folder, or a FIFO or a device without ``follow``, or another user's; or its folder is a link
     of another user.
     """
+    if not _HAS_LINKS:
+        return _open_regular(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     flags = os.O_WRONLY | os.O_CLOEXEC
     with suppress(FileNotFoundError):
         status = path.lstat()
@@ -95,10 +105,10 @@ def open_growing(path: Path, *, follow: bool = False) -> int:
     with _folder(path.parent) as folder:
         scratch, descriptor = _scratch_file(folder, 0o666)
         try:
-            os.replace(scratch, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+            folder.replace(scratch, path.name)
         except BaseException:
             os.close(descriptor)
-            os.unlink(scratch, dir_fd=folder)
+            os.unlink(folder.at / scratch, dir_fd=folder.descriptor)
             raise
     return descriptor
 
@@ -120,7 +130,7 @@ def copy_whole(source: Path, target: Path) -> None:
 def remove_folder(path: Path) -> None:
     """Remove a folder and what is in it; follow no link of another user. Errors are ignored."""
     with suppress(OSError), _folder(path.parent) as folder:
-        shutil.rmtree(path.name, ignore_errors=True, dir_fd=folder)
+        shutil.rmtree(folder.at / path.name, ignore_errors=True, dir_fd=folder.descriptor)
 
 
 def _open_alone(path: Path, flags: int) -> int:
@@ -134,10 +144,9 @@ def _open_alone(path: Path, flags: int) -> int:
 
 def _open_regular(path: Path, flags: int) -> int:
     """Open a regular file; follow no link, and do not wait for the reader of a FIFO."""
-    more = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         with _folder(path.parent) as folder:
-            descriptor = os.open(path.name, flags | more, 0o666, dir_fd=folder)
+            descriptor = folder.open(path.name, flags | _SAFE, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):
             raise OSError(_NOT_REGULAR) from None
@@ -149,16 +158,32 @@ def _open_regular(path: Path, flags: int) -> int:
     return descriptor
 
 
-def _scratch_file(folder: int, mode: int) -> tuple[str, int]:
+class _Folder(NamedTuple):
+    """A folder: its descriptor, to which names are relative, or its path where there is none."""
+
+    at: Path
+    descriptor: int | None
+
+    def open(self, name: str, flags: int, mode: int) -> int:
+        return os.open(self.at / name, flags, mode, dir_fd=self.descriptor)
+
+    def replace(self, name: str, other: str) -> None:
+        at, folder = self.at, self.descriptor
+        os.replace(at / name, at / other, src_dir_fd=folder, dst_dir_fd=folder)
+
+
+def _scratch_file(folder: _Folder, mode: int) -> tuple[str, int]:
     """Create a file with a random name in an open folder; return its name and descriptor."""
     name = f".{os.urandom(8).hex()}{PARTIAL}"
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    return name, os.open(name, flags, mode, dir_fd=folder)
+    return name, folder.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _SAFE, mode)
 
 
 @contextmanager
-def _folder(path: Path) -> Iterator[int]:
+def _folder(path: Path) -> Iterator[_Folder]:
     """Open a folder; raise OSError if it is a symbolic link that another user has made."""
+    if not _HAS_LINKS:
+        yield _Folder(path, None)
+        return
     flags = os.O_DIRECTORY | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
     if path.is_symlink() and _is_trusted(path.lstat()):
         descriptor = os.open(path, flags)
@@ -170,7 +195,7 @@ def _folder(path: Path) -> Iterator[int]:
                 raise OSError(f"{path} is a symbolic link of another user") from None
             raise
     try:
-        yield descriptor
+        yield _Folder(Path(), descriptor)
     finally:
         os.close(descriptor)
 
@@ -183,7 +208,7 @@ def _is_trusted(status: os.stat_result) -> bool:
 @contextmanager
 def open_regular(path: Path) -> Iterator[IO[bytes]]:
     """Open a regular file; raise ValueError if it is a device, a FIFO or a directory."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
+    descriptor = os.open(path, os.O_RDONLY | _UNBLOCKED)  # so that a FIFO does not block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError(_NOT_REGULAR)
@@ -209,8 +234,10 @@ def lock(file: int | IO[bytes], *, shared: bool = False, wait: bool = False) -> 
     """Lock an open file or folder until it is closed; return False if another process has the lock.
 
     ``shared`` locks exclude only exclusive ones. With ``wait`` it waits for the other processes.
-    Raise OSError if the file system does not support locks.
+    Raise OSError if the file system does not support locks. Without locks (Windows) it is True.
     """
+    if "fcntl" not in globals():
+        return True
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         fcntl.flock(file, kind if wait else kind | fcntl.LOCK_NB)

@@ -4,11 +4,15 @@ A child imports nothing from the current folder.
 """
 
 import errno
+import math
 import os
-import resource
 import sys
+from contextlib import suppress
 
 from noack.core.errors import MachineError, one_line
+
+with suppress(ImportError):  # Windows has no limits
+    import resource
 
 _FILES = 64
 """Open files of a process of a run, up to 40, and some more."""
@@ -23,16 +27,17 @@ def require_limits() -> None:
     Libraries abort, print stack traces or wait for ever when they reach a limit. Raise MachineError
     if a limit is too low.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if _is_less(soft, _FILES):
-        if _is_less(hard, _FILES):
+    soft, hard = _limits("RLIMIT_NOFILE")
+    if soft < _FILES:
+        if hard < _FILES:
             raise MachineError(
                 f"at most {hard} open files are permitted; a process of a run needs {_FILES}: "
                 "ulimit -n 1024"
             )
-        resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard))
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if _is_less(soft, _ADDRESS_SPACE_BYTES):
+        _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (_FILES, hard_limit))
+    soft, _ = _limits("RLIMIT_AS")
+    if soft < _ADDRESS_SPACE_BYTES:
         raise MachineError(
             f"at most {_gb(soft)} of address space are permitted; a process of a run needs "
             f"{_gb(_ADDRESS_SPACE_BYTES)}: ulimit -v unlimited"
@@ -43,24 +48,29 @@ def exhausted_limit(error: BaseException) -> str | None:
     """Return one line with the remedy if an error is that of a limit; None if it is not."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EMFILE, errno.ENFILE):
-        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        soft, _ = _limits("RLIMIT_NOFILE")
         return f"too many open files: at most {soft} are permitted; see `ulimit -n`"
     text = one_line(error)
     known = isinstance(error, ImportError | RuntimeError)
     known = known and any(phrase in text.lower() for phrase in _OUT_OF_MEMORY)
     if not (known or isinstance(error, MemoryError) or number == errno.ENOMEM):
         return None
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if soft == resource.RLIM_INFINITY:
+    soft, _ = _limits("RLIMIT_AS")
+    if soft == math.inf:
         return f"out of memory: {text}"
     return f"out of memory: at most {_gb(soft)} of address space are permitted; see `ulimit -v`"
 
 
-def _is_less(limit: int, needed: int) -> bool:
-    return limit != resource.RLIM_INFINITY and limit < needed
+def _limits(name: str) -> tuple[float, float]:
+    """Return the soft and the hard limit of this name; infinity if there is none."""
+    if "resource" not in globals():
+        return math.inf, math.inf
+    limits = resource.getrlimit(getattr(resource, name))
+    soft, hard = (math.inf if limit == resource.RLIM_INFINITY else limit for limit in limits)
+    return soft, hard
 
 
-def _gb(size_bytes: int) -> str:
+def _gb(size_bytes: float) -> str:
     return f"{size_bytes / 1e9:.2g} GB"
 
 

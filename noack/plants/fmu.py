@@ -57,7 +57,6 @@ _LONGEST = 300
 """Largest length of a quoted text, in characters."""
 _PREFIX = "noack-native-"
 _STREAMS = (1, 2)
-_LIBC = ctypes.CDLL(None)
 Refusal = Callable[["ScalarVariable"], str | None]
 """Returns why a variable is unsuitable; None if it is suitable."""
 
@@ -425,6 +424,8 @@ def temporary_folder() -> Iterator[Path]:
     A lock marks a folder that is in use. The lock ends with its process, even if that process is
     killed; a folder without a lock is abandoned.
     """
+    if not hasattr(os, "getuid"):
+        raise CallerError('plant.system.kind: "fmu" needs Linux or macOS')
     for left in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         _remove_if_left(left)
     while True:
@@ -478,7 +479,7 @@ def quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        _LIBC.fflush(None)  # otherwise its buffer is printed later
+        ctypes.CDLL(None).fflush(None)  # otherwise its buffer is printed later
         for stream, copy in kept:
             os.dup2(copy, stream)
             os.close(copy)

@@ -32,12 +32,13 @@ _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 """Environment variable of a launched process: its first line of input is its ticket."""
 _ECHO_NS = 500_000_000  # a parent may pass on a signal that the process group has received already
-_ENDING = {
+_HANGUP: int | None = getattr(signal, "SIGHUP", None)  # not on Windows
+_ENDING: dict[int, tuple[ExitStatus, str]] = {  # exit status and reason after a signal
     signal.SIGINT.value: (ExitStatus.INTERRUPTED, "stopped by the user"),
     signal.SIGTERM.value: (ExitStatus.TERMINATED, "stopped on request"),
-    signal.SIGHUP.value: (ExitStatus.TERMINATED, "stopped because the terminal was closed"),
 }
-"""Exit status and reason after a signal."""
+if _HANGUP:
+    _ENDING[_HANGUP] = ExitStatus.TERMINATED, "stopped because the terminal was closed"
 
 
 class LogFormat(StrEnum):
@@ -172,8 +173,8 @@ class Signals:
     def handled(self) -> Iterator["Signals"]:
         """Handle the signals while the context lasts; under nohup, SIGHUP stays ignored."""
         handled = set(_ENDING)
-        if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
-            handled.remove(signal.SIGHUP)
+        if _HANGUP and signal.getsignal(_HANGUP) == signal.SIG_IGN:
+            handled.remove(_HANGUP)
         before = {number: signal.signal(number, self._note) for number in handled}
         try:
             yield self

@@ -18,7 +18,7 @@ with lazy_modules():
     from noack.scenario import resolution, scenario_file
 
 
-@cli.command(cli.FILES, 10)
+@cli.command(cli.FILES, 10, takes="some 10 s", on_linux=True)
 def doctor(
     given: cli.ExampleOptions,
     *,
@@ -54,7 +54,7 @@ def doctor(
     return ExitStatus.FAILED if is_bad else ExitStatus.OK
 
 
-@cli.command(cli.RUNS, 5)
+@cli.command(cli.RUNS, 5, on_linux=True)
 def lab(
     given: cli.ExampleOptions,
     *,

@@ -19,6 +19,7 @@ with lazy_modules():
         trace_sources,
     )
     from cosim.measurement.live import live_measurement, probe_ends
+    from noack.core import core_library
     from noack.traces import trace_formats
 
 
@@ -146,7 +147,7 @@ class WrittenOptions(cli.FigureOptions):
         )
 
 
-@cli.command(cli.MEASURING, 10)
+@cli.command(cli.MEASURING, 10, takes="some seconds for a file; a probe, as long as --for")
 def measure(
     sources: Annotated[list[str] | None, Argument(metavar="FILE...|ADDRESS")] = None,
     *,
@@ -202,6 +203,8 @@ def _result(
     how: "trace_sources.SourceOptions",
 ) -> tuple["probe_ends.ProbeResult", str]:
     """Return the result of a probe or of reading files, and a name for it."""
+    if listen is not None or (sources and live_measurement.is_address(sources[0])):
+        core_library.require_live_runs()
     refuse, options = trace_sources.refuse_unused, live_measurement.LIVE_OPTIONS
     if listen is not None:
         if sources:

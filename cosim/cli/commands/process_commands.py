@@ -31,7 +31,7 @@ class Invited(StrEnum):
     CONTROLLER = "controller"
 
 
-@cli.command(cli.PROCESSES, 10)
+@cli.command(cli.PROCESSES, 10, on_linux=True)
 def record(
     context: typer.Context,
     given: cli.ScenarioOptions,
@@ -102,7 +102,7 @@ def _join(role: str, place: int, module: str, about: str) -> None:
         noack {role} --session two --json   in another session; print its report as JSON
         noack {role} --invitation invitation.json   on another host
     """
-    cli.command(cli.PROCESSES, place, name=role)(join)
+    cli.command(cli.PROCESSES, place, on_linux=True, name=role)(join)
 
 
 _join("plant", 20, "plant_server.__main__", "integrates the state, sends measurements.")
@@ -113,6 +113,7 @@ _join("controller", 40, "controller_node.__main__", "runs x_c, sends u = K x_c."
 @cli.command(
     cli.PROCESSES,
     50,
+    on_linux=True,
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     add_help_option=False,
 )

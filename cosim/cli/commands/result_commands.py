@@ -86,7 +86,7 @@ def view(
     return ExitStatus.OK
 
 
-@cli.command(cli.RUNS, 90)
+@cli.command(cli.RUNS, 90, takes="some seconds where it is not there yet")
 def report(
     run: cli.LoopOptions,
     *,
@@ -114,7 +114,7 @@ def report(
     cli.print_lines(json, {"report": str(path)} | written, path, *drawn)
 
 
-@cli.command(cli.RUNS, 70)
+@cli.command(cli.RUNS, 70, takes="about a second")
 def replay(run: cli.LoopOptions, *, json: cli.JsonOption = False) -> int:
     """Replay a run's recorded inputs; compare the outputs bit for bit.
 
@@ -131,7 +131,7 @@ def replay(run: cli.LoopOptions, *, json: cli.JsonOption = False) -> int:
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
-@cli.command(cli.RUNS, 60)
+@cli.command(cli.RUNS, 60, takes="about a second")
 def fidelity(
     run: cli.LoopOptions,
     *,
@@ -200,7 +200,7 @@ def export(
     cli.print_lines(json, {"files": [str(path) for path in written]}, *written)
 
 
-@cli.command(cli.RUNS, 92)
+@cli.command(cli.RUNS, 92, takes="about a second")
 def archive(
     run: cli.RunOptions, *, out: cli.OutOption = None, json: cli.JsonOption = False
 ) -> None:
@@ -222,7 +222,7 @@ def archive(
     cli.print_lines(json, {"archive": str(path)} | manifest.model_dump(mode="json"), path)
 
 
-@cli.command(cli.RUNS, 94)
+@cli.command(cli.RUNS, 94, takes="as long as the archived command did")
 def reproduce(
     file: Annotated[Path, Argument(metavar="FILE")],
     *,
@@ -281,7 +281,7 @@ def collect(
     cli.show(json, outcome.summary.to_json, run_verdict.print_outcome, outcome)
 
 
-@cli.command(cli.RUNS, 80)
+@cli.command(cli.RUNS, 80, takes="about a second")
 def compare(
     directories: Annotated[
         list[Path], Argument(metavar="RUN...", autocompletion=completion.run_directories)

@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 _EVENTS_SHOWN = 40
 
 
-@cli.command(cli.RUNS, 20)
+@cli.command(
+    cli.RUNS, 20, takes="as long as the scenario's horizon, and a few seconds", on_linux=True
+)
 def run(
     context: typer.Context,
     given: cli.ScenarioOptions,
@@ -56,7 +58,7 @@ def run(
     return run_processes(given.load(), options, server=context.obj, listening=listening)
 
 
-@cli.command(cli.RUNS, 10)
+@cli.command(cli.RUNS, 10, takes="20 s and a few", on_linux=True)
 def demo(
     context: typer.Context,
     *,
@@ -78,7 +80,7 @@ def demo(
     return run_processes(cli.load_scenario("lane_following", wanted), options, server=context.obj)
 
 
-@cli.command(cli.RUNS, 30)
+@cli.command(cli.RUNS, 30, takes="about a second; the report, some more")
 def simulate(
     given: cli.ScenarioOptions,
     *,
@@ -168,6 +170,7 @@ def _print_run(
 @cli.command(
     cli.RUNS,
     45,
+    on_linux=True,
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value
 )

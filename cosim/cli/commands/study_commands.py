@@ -30,7 +30,7 @@ with lazy_modules():
     from noack.scenario import run_sections, scenario, scenario_file
 
 
-@cli.command(cli.CAMPAIGNS, 10)
+@cli.command(cli.CAMPAIGNS, 10, takes="seconds to minutes, by the number of draws")
 def campaign(
     file: Annotated[str, typer.Argument(autocompletion=completion.campaigns)],
     *,
@@ -72,7 +72,7 @@ def campaign(
     return ExitStatus.FAILED if summary.breaches else ExitStatus.OK
 
 
-@cli.command(cli.THEORY, 30)
+@cli.command(cli.THEORY, 30, takes="up to a minute")
 def paper(
     *,
     draws: Annotated[int | None, Option(min=1)] = None,
@@ -187,7 +187,7 @@ class GainOptions:
         return None
 
 
-@cli.command(cli.CAMPAIGNS, 20)
+@cli.command(cli.CAMPAIGNS, 20, takes="up to a minute")
 def design(
     given: cli.ScenarioOptions,
     *,
@@ -353,7 +353,7 @@ class StudyOptions(cli.ScenarioOptions):
         return found
 
 
-@cli.command(cli.CAMPAIGNS, 30)
+@cli.command(cli.CAMPAIGNS, 30, takes="some 10 s with its defaults")
 def capacity(
     study: StudyOptions,
     *,

@@ -22,7 +22,7 @@ with lazy_modules():
     from noack.theory.certificates import scenario_certificates
 
 
-@cli.command(cli.THEORY, 10)
+@cli.command(cli.THEORY, 10, takes="about two seconds")
 def certify(
     given: cli.ScenarioOptions,
     *,
@@ -70,7 +70,7 @@ def certify(
     return ExitStatus.OK if certified else ExitStatus.FAILED
 
 
-@cli.command(cli.THEORY, 30)
+@cli.command(cli.THEORY, 30, takes="some seconds")
 def margin(
     context: typer.Context,
     given: cli.ScenarioOptions,
@@ -129,7 +129,7 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-@cli.command(cli.THEORY, 20)
+@cli.command(cli.THEORY, 20, takes="some 20 s")
 def adversary(
     given: cli.ScenarioOptions,
     *,

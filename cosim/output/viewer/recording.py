@@ -59,7 +59,7 @@ class RecordingFile:
         try:
             descriptor = open_growing(path)
             try:  # by its descriptor, as rerun would follow a link
-                own = f"/dev/fd/{descriptor}"
+                own = f"/dev/fd/{descriptor}" if hasattr(os, "O_NOFOLLOW") else str(path)
                 self._stream.save(own, default_blueprint=layout, write_footer=indexed)
             finally:
                 os.close(descriptor)

@@ -1,0 +1,29 @@
+"""ziglang builds the core for other platforms; a wheel's tag says what its library needs."""
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from native.build import LIBRARY, build
+
+FORMATS = {  # the first bytes: the format, and the processor at its place
+    "manylinux_2_17_aarch64": (b"\x7fELF", 18, b"\xb7\x00"),
+    "macosx_11_0_arm64": (b"\xcf\xfa\xed\xfe", 4, b"\x0c\x00\x00\x01"),
+    "win_amd64": (b"MZ", 0, b"MZ"),
+}
+
+
+@pytest.mark.skipif(find_spec("ziglang") is None, reason="the package ziglang is not installed")
+@pytest.mark.parametrize("platform", FORMATS)
+def test_a_platform_has_its_library(platform: str, tmp_path: Path) -> None:
+    build(tmp_path, "-O0", "-Werror", target=platform)  # as it is built, but in less time
+    library = (tmp_path / LIBRARY).read_bytes()
+    start, place, processor = FORMATS[platform]
+    assert (library[: len(start)], library[place:][: len(processor)]) == (start, processor)
+    assert b"noack_exact_runs" in library
+    assert (b"noack_relay_run" in library) == ("linux" in platform)
+    assert str(tmp_path).encode() not in library
+    versions = [(2, int(minor)) for minor in re.findall(rb"GLIBC_2\.(\d+)", library)]
+    assert max(versions, default=(2, 17)) == (2, 17)
