@@ -414,7 +414,7 @@ DRAGGED, VIEWED = "a slider moves", "viewer open"
 _PATIENCE_S = 120.0
 _MOVE_S = 0.05
 _KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
-_SLIDER = "document.querySelector('.q-slider[aria-label=\"loss probability\"] [tabindex]')"
+_SLIDER = "document.getElementById('lab-set-network.loss.probability')"
 
 
 class _Page:
@@ -463,13 +463,13 @@ class _Page:
 
     def run_live(self) -> None:
         """Run live by the page, until it says that the run ended."""
-        for kind in (".q-tab", "button"):
+        for text in ("live", "run live"):
             self.js(
-                f"[...document.querySelectorAll('{kind}')].filter("
-                "e => e.innerText.trim().toLowerCase().endsWith('run live')).at(-1).click()"
+                "[...document.querySelectorAll('button')].find("
+                f"e => e.innerText.trim().endsWith('{text}') && e.offsetParent).click()"
             )
             time.sleep(0.5)
-        self.wait(f"document.body.innerText.includes('ended: {HORIZON_S} of')")
+        self.wait(f"document.body.innerText.includes('completed {HORIZON_S:g} s')")
 
 
 @contextmanager

@@ -234,17 +234,16 @@ def of_record(record: RunRecord, kind: str, diverged_at_s: float | None = None) 
     columns = _COLUMNS if record.is_short else max(record.slice_columns // 10, 1)
     for part in aligned_parts(record):
         one, known = part.aligned, part.aligned.since_delivery(resolved)
-        curves = np.column_stack([
-            one.t_ns / NS_PER_S, one.x, one.x_s, np.where(known[:, None], one.x_c, np.nan),
-            one.e_s_norm, np.where(known, one.e_c_norm, np.nan), one.threshold,
-        ])  # fmt: skip
+        x_c = np.where(known[:, None], one.x_c, np.nan)
+        norms = (one.e_s_norm, np.where(known, one.e_c_norm, np.nan), one.threshold)
+        curves = np.column_stack([one.t_ns / NS_PER_S, one.x, one.x_s, x_c, *norms])
         parts.append(curves[decimate_all(curves[:, 0], curves[:, 1:], columns)])
     curves, n = np.concatenate(parts), record.loop.n
-    t_s, x, x_s, x_c, norms = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
+    t_s, x, x_s, x_c, sizes = np.split(curves, np.cumsum([1, n, n, n]), axis=1)
     sent, is_decaying = record.events(), threshold_at(resolved, t_s[:1, 0]) is not None
     return Exploration(
-        resolved, kind, t_s[:, 0], x, x_s, x_c, norms[:, 0], norms[:, 1],
-        norms[:, 2] if is_decaying else None, np.asarray(sent["t_ns"] / NS_PER_S),
+        resolved, kind, t_s[:, 0], x, x_s, x_c, sizes[:, 0], sizes[:, 1],
+        sizes[:, 2] if is_decaying else None, np.asarray(sent["t_ns"] / NS_PER_S),
         np.isin(sent["event"], record.columns(CONTROLLER_DELIVERY, "sequence")["sequence"]),
         diverged_at_s,
     )  # fmt: skip

@@ -142,8 +142,8 @@ def _events(shown: Shown) -> _Part:
     crosses = Marks(x=t_s[~delivered], y=since_s[~delivered], label="lost", colour=LOST)
     items = [dots, replace(crosses, marker="x", stroke=1.6)]
     if (other := shown.reference) is not None:
-        before = Marks(x=other.event_s, y=np.diff(other.event_s, prepend=0.0), label=KEPT,
-                       colour=FORCED, opacity=0.45)  # fmt: skip
+        between_s = np.diff(other.event_s, prepend=0.0)
+        before = Marks(x=other.event_s, y=between_s, label=KEPT, colour=FORCED, opacity=0.45)
         items.insert(0, before)
     return "transmissions: time since the last one [s]", items, Axis(ends=(0.0, None))
 

@@ -238,7 +238,8 @@ class _Page:
         first = session.mistakes[0].text if session.mistakes else ""
         more = f" (and {len(session.mistakes) - 1} more)" if len(session.mistakes) > 1 else ""
         note = first + more or session.note
-        return f"{note}. The figure shows the settings before" if note and shown is None else note
+        is_old = note and shown is None and self._stage.has_figure
+        return f"{note}. The figure shows the settings before" if is_old else note
 
     def _shown(self) -> Shown | None:
         """Return what the figure shows; None without a run."""

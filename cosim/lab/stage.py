@@ -38,6 +38,11 @@ class Stage:
         self._client = client
         self._shown: Json = {}
 
+    @property
+    def has_figure(self) -> bool:
+        """Whether a figure is shown."""
+        return "figure" in self._shown
+
     async def show(self, **parts: object) -> None:
         """Show parts, by name; what the browser has already is not sent. Wait until it is drawn."""
         new = {key: part for key, part in parts.items() if self._shown.get(key, ...) != part}

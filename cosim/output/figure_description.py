@@ -300,10 +300,7 @@ def finite(values: Reals, *, positive: bool = False) -> Reals:
 
 
 def log_ends(values: Reals, measured: Reals, decades: int) -> tuple[float, float] | None:
-    """Return the ends of a logarithmic axis for some values; None without positive ones.
-
-    They are at most ``decades`` below and above the decade of the largest measured value.
-    """
+    """Return the ends of a logarithmic axis, within ``decades`` of the largest measured value."""
     measured = finite(measured, positive=True)
     if not np.isfinite(measured).any():
         return None
