@@ -9,12 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims import observed_conditions
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import (
     AssumptionMonitor,
     ConditionReader,
     read_conditions,
+)
+from cosim.analysis.claims.observed_conditions import (
+    BEYOND_CERTIFICATE,
+    CAUSES,
+    CLOCK_CAUSES,
+    AssumptionViolation,
+    ObservedConditions,
+    combined,
 )
 from cosim.analysis.claims.run_evidence import certificates_together
 from cosim.analysis.summary_model import ClaimVerdict
@@ -68,7 +75,7 @@ def batches(record: RunRecord, seed: int) -> Batches:
             yield None
 
 
-def reported(record: RunRecord, seed: int = 0) -> list[observed_conditions.AssumptionViolation]:
+def reported(record: RunRecord, seed: int = 0) -> list[AssumptionViolation]:
     """The violations that a monitor reports if it receives the run in batches."""
     monitor, found = AssumptionMonitor(record.scenario), []
     for batch in batches(record, seed):
@@ -132,7 +139,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
     def check(resolved: Scenario, seed: int) -> None:
         record = damaged(simulate(resolved, hostile(seed)), seed)
         reader = ConditionReader(resolved)
-        parts: list[observed_conditions.ObservedConditions] = []
+        parts: list[ObservedConditions] = []
         for batch in batches(record, seed):
             if batch is None:
                 parts.append(reader.observed())
@@ -140,7 +147,7 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
                 reader.take(*batch)
         whole = read_conditions(record)
         parts.append(reader.end())
-        in_parts = observed_conditions.combined(parts)
+        in_parts = combined(parts)
         for name in SERIES:
             np.testing.assert_array_equal(getattr(in_parts, name), getattr(whole, name))
         assert parts[-1].start_s == whole.start_s
@@ -150,9 +157,9 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
         causes.update(cause for _, cause in violations)
 
     check()
-    assert causes == {*observed_conditions.CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {
+    assert causes == {*CAUSES, "dropouts", "atmost 2 in 6", "recover 2"} - {
         "restart",
-        *observed_conditions.CLOCK_CAUSES,
+        *CLOCK_CAUSES,
     }
 
 
@@ -280,7 +287,7 @@ def test_a_run_is_certified_until_it_is_later_than_any_certificate_covers(
     assert series.before(since_s).value.max(initial=0.01) == getattr(covered, f"{time}_s")
     (found,) = {one.why for one in claims.judge() if one.source == "certificate"}
     assert found.startswith(why)
-    assert found.endswith(observed_conditions.BEYOND_CERTIFICATE)
+    assert found.endswith(BEYOND_CERTIFICATE)
     # The next lateness has none.
     (most,) = series.peaks().value[series.peaks().t_s == since_s]
     later = covered._replace(**{f"{time}_s": most})
