@@ -69,12 +69,8 @@ def print_certificates(
 
 def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:
     if (bound := chosen.error_in_given_norm) is not None:
-        level = chosen.schedule.level
-        console.print(
-            f"In your norm, with the chosen one in the trigger: ‖e_c‖ ≤ {bound:.4g} {level} "
-            "for the schedule, the scenario's plant",
-            markup=False, highlight=False,
-        )  # fmt: skip
+        of = f"‖e_c‖ ≤ {bound:.4g} {chosen.schedule.level} for the schedule, the scenario's plant"
+        console.print(f"In your norm, with the chosen one in the trigger: {of}", markup=False)
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
     console.print(
         f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",
