@@ -12,6 +12,8 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from types import ModuleType
 
+from noack.core.process_limits import be_idle
+
 _KEPT_BYTES = str(32 * 2**20)
 _ENVIRONMENT = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -104,9 +106,3 @@ def at_idle_priority(*call: object) -> object:
     """
     with ThreadPoolExecutor(1, initializer=be_idle) as thread:
         return thread.submit(called, *call).result()  # type: ignore[arg-type]
-
-
-def be_idle() -> None:
-    """Let this thread use a core that nothing else needs."""
-    if sys.platform == "linux":
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

@@ -86,3 +86,9 @@ def python_command(*arguments: object) -> list[str]:
     other users.
     """
     return [sys.executable, "-P", *map(str, arguments)]
+
+
+def be_idle() -> None:
+    """Let this thread use a core that nothing else needs."""
+    if sys.platform == "linux":
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

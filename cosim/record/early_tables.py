@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.live.process_pool import be_idle
 from cosim.record.record_source import BATCH_ROWS, Rows, joined
 from cosim.record.run_record import scenarios_of, vector_names
 from cosim.record.spool_conversion import spool_parts
 from cosim.record.table_files import table_writer
+from noack.core.process_limits import be_idle
 from noack.protocol.record_tables import LOOP
 from noack.protocol.topology import RECORDER
 from noack.runtime.spool import EARLY, EARLY_ENDED, SPOOL
