@@ -1,24 +1,37 @@
-"""Programs through the emulator: iperf3, the tries of a client, a slow line between two hosts."""
+"""Programs through the emulator: iperf3, QUIC, DNS; and a slow line between two hosts."""
 
 import asyncio
+import datetime
 import errno
 import json
 import os
 import shlex
 import shutil
 import socket
+import socketserver
 import subprocess
 import time
 from asyncio.subprocess import PIPE
 from asyncio.subprocess import Process as AsyncProcess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from itertools import groupby
+from contextlib import closing, contextmanager, suppress
+from itertools import groupby, islice
 from operator import itemgetter
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import pytest
+from aioquic.asyncio import connect, serve
+from aioquic.quic.configuration import QuicConfiguration
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
+from dnslib import RR, DNSRecord
+from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 from psutil import NoSuchProcess, Process
 
 from benchmarks.programs import TwoHosts, two_hosts
@@ -33,12 +46,14 @@ from tests.attacks.kinds import enter_namespace
 from tests.netem.conftest import FORWARDED, Emulate, Emulator
 from tests.oracles.link import Link
 
+T = TypeVar("T")
+
 HOST = "127.0.0.1"
 _ATTEMPTS = 20
 
 
-async def open_iperf_server() -> tuple[AsyncProcess, int]:
-    """Start an iperf3 server on a port that is free for TCP and UDP; return it and the port."""
+async def open_server(begin: Callable[[int], Awaitable[T]]) -> tuple[T, int]:
+    """Start a server on a port that is free for TCP and UDP; return the server and the port."""
     for _ in range(_ATTEMPTS):
         with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
             tcp.bind((HOST, 0))
@@ -47,8 +62,10 @@ async def open_iperf_server() -> tuple[AsyncProcess, int]:
                 udp.bind((HOST, port))
             except OSError:
                 continue
-        with suppress(OSError):
-            return await iperf_server(port), port
+        try:
+            return await begin(port), port
+        except OSError:
+            continue
     raise AssertionError("no free port")
 
 
@@ -138,7 +155,7 @@ async def iperf_client(port: int, *options: str) -> dict[str, Any]:
 
 
 async def measure(emulate: Emulate, *options: str) -> tuple[dict[str, Any], Emulator]:
-    server, port = await open_iperf_server()
+    server, port = await open_server(iperf_server)
     try:
         while True:
             emulator = emulate(f"{HOST}:{port}", "--both", WORDS)
@@ -175,6 +192,86 @@ def test_iperf3_reports_the_losses_and_the_order_of_the_emulator(
     assert min(udp["lost_packets"], udp["out_of_order"]) > 0
 
 
+QUIC_WORDS = "delay 5ms 2ms loss 5% reorder 5% duplicate 2% corrupt 1% mansd 3 seed 1"
+CONTENT_BYTES = 300_000
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    """A self-signed certificate for localhost and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
+    now = datetime.datetime.now(datetime.UTC)
+    signed = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    files = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    files[0].write_bytes(signed.public_bytes(Encoding.PEM))
+    files[1].write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    return files
+
+
+def test_content_arrives_unchanged_in_both_directions(
+    emulate: Emulate, certificate: tuple[Path, Path]
+) -> None:
+    content = np.random.default_rng(0).bytes(CONTENT_BYTES)
+    received: list[bytes] = []
+
+    async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        received.append(await reader.read())
+        writer.write(received[-1][::-1])
+        writer.write_eof()
+
+    async def ask(host: str, port: int) -> bytes:
+        trusting = QuicConfiguration(is_client=True, server_name="localhost")
+        trusting.load_verify_locations(str(certificate[0]))
+        async with connect(host, port, configuration=trusting) as client:
+            reader, writer = await client.create_stream()
+            writer.write(content)
+            writer.write_eof()
+            return await reader.read()
+
+    async def go() -> tuple[bytes, dict[str, dict[str, object]]]:
+        own = QuicConfiguration(is_client=False)
+        own.load_cert_chain(*certificate)
+        tasks: list[asyncio.Future[None]] = []
+        server, port = await open_server(
+            lambda port: serve(
+                HOST, port, configuration=own,
+                stream_handler=lambda *ends: tasks.append(asyncio.ensure_future(echo(*ends))),
+            )
+        )  # fmt: skip
+        emulator = emulate(f"{HOST}:{port}", "--both", QUIC_WORDS)
+        try:
+            answer = await asyncio.wait_for(ask(emulator.host, emulator.port), PATIENCE_S)
+        finally:
+            server.close()
+        return answer, emulator.finish()
+
+    answer, link = asyncio.run(go())
+    assert received == [content]
+    assert answer == content[::-1]
+    for of in (link["forward"], link["reverse"]):
+        assert of["received_bytes"] > CONTENT_BYTES
+        assert of["fates"]["dropped"] * of["fates"]["corrupted"] * of["duplicated"] > 0
+        assert of["delivered_out_of_order"] > 0
+        assert of["longest_loss_burst"] <= 3
+
+
+TIMEOUT_S = 0.03
+"""Timeout of a try. A later answer costs another try but carries the number of its own try."""
+QUESTIONS = 4
+
+
 CASES = [
     ("loss worst mansd 2", "loss worst mansd 2", 3 * 3),
     ("loss worst mansd 1", "loss worst mansd 3", 2 * 4),
@@ -184,21 +281,95 @@ CASES = [
 """Words of the two directions, and the sufficient number of tries."""
 
 
-@pytest.mark.parametrize(("forward", "reverse", "most"), CASES)
-def test_the_bound_on_tries_holds_from_any_question_on(
-    forward: str, reverse: str, most: int
-) -> None:
-    """docs/netem-programs.md proves it; a try is answered if the links pass both of its ways."""
+class Zone(BaseResolver):
+    """The zone of a server; the address of each name contains the name's number."""
+
+    def resolve(self, request: DNSRecord, handler: DNSHandler) -> DNSRecord:
+        reply = request.reply()
+        number = str(request.q.qname).partition(".")[0]
+        reply.add_answer(*RR.fromZone(f"{request.q.qname} 60 A 192.0.2.{number}"))
+        return reply
+
+
+@contextmanager
+def dns_server() -> Iterator[str]:
+    silent = DNSLogger(logf=lambda _: None)
+    # dnslib's own server answers in threads, and so in any order.
+    server = DNSServer(
+        Zone(), address="127.0.0.1", port=0, logger=silent, server=socketserver.UDPServer
+    )
+    server.start_thread()
+    try:
+        yield "{}:{}".format(*server.server.server_address)
+    finally:
+        server.stop()
+        server.thread.join()
+        server.server.server_close()
+
+
+class Client:
+    """Repeats a question until it is answered; each try has its own identifier."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.socket(type=socket.SOCK_DGRAM)
+        self._socket.settimeout(TIMEOUT_S)
+        self._socket.connect((host, port))
+        self.tries = 0
+
+    def ask(self, number: int) -> tuple[int, int]:
+        """Return the first try of the question, and that which was answered first."""
+        first = self.tries
+        while True:
+            question = DNSRecord.question(f"{number}.example")
+            question.header.id = self.tries
+            self.tries += 1
+            self._socket.send(question.pack())
+            with suppress(TimeoutError):
+                while True:
+                    answer = DNSRecord.parse(self._socket.recv(512))
+                    if answer.header.id >= first:
+                        assert str(answer.a.rdata) == f"192.0.2.{number}"
+                        return first, int(answer.header.id)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def answered(forward: str, reverse: str) -> Iterator[bool]:
+    """Yield for each try whether it gets an answer, as the links decide without sockets."""
     there, back = (
         Link(settings_of(shlex.split(words)), 0, LINK_NAME, direction)
         for words, direction in ((forward, "forward"), (reverse, "reverse"))
     )
+    while True:
+        yield passes(there) and passes(back)
 
-    def passes(link: Link) -> bool:
-        return link.decide(0, 30, 0).fate in FORWARDED
 
-    answered = [passes(there) and passes(back) for _ in range(3000)]
-    bursts = [len(list(burst)) for got, burst in groupby(answered) if not got]
+def passes(link: Link) -> bool:
+    return link.decide(0, 30, 0).fate in FORWARDED
+
+
+def test_the_tries_of_a_client_reach_the_bound(emulate: Emulate) -> None:
+    """docs/netem-programs.md proves it. The client keeps its socket: a new one is a new flow."""
+    forward, reverse, most = CASES[0]
+    with dns_server() as server:
+        emulator = emulate(server, forward, "--reverse", reverse)
+        with closing(Client(emulator.host, emulator.port)) as client:
+            asked = [client.ask(number) for number in range(QUESTIONS)]
+        link = emulator.finish()
+    assert link["forward"]["received"] == client.tries
+    got = list(islice(answered(forward, reverse), client.tries))
+    assert [last for _, last in asked] == [got.index(True, first) for first, _ in asked]
+    needed = [last - first + 1 for first, last in asked]
+    assert max(needed) == needed[0] == most
+
+
+@pytest.mark.parametrize(("forward", "reverse", "most"), CASES)
+def test_the_bound_on_tries_holds_from_any_question_on(
+    forward: str, reverse: str, most: int
+) -> None:
+    expected = list(islice(answered(forward, reverse), 3000))
+    bursts = [len(list(burst)) for got, burst in groupby(expected) if not got]
     assert max(bursts) == most - 1
 
 
