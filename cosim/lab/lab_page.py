@@ -149,11 +149,11 @@ class _Page:
                 ui.element("section").props("id=lab-verdict aria-label=verdict")
                 with ui.element("a").props("id=lab-report hidden target=_blank"):
                     ui.label("report of this run (all figures and tables)")
-                for name in ("note role=status", "pending role=status", "compare", "facts"):
-                    ui.element("div").props(f"id=lab-{name}")
                 for source in (self._live, self._recorded):
                     with ui.element("div").classes(f"lab-of-{source.name} w-full"):
                         source.build_details()
+                for name in ("note role=status", "pending role=status", "compare", "facts"):
+                    ui.element("div").props(f"id=lab-{name}")
 
     async def begin(self) -> None:
         """Draw for the first time."""
