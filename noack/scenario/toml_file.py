@@ -403,7 +403,7 @@ def _own_check(key: str, value: object, message: str) -> str:
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
         shown = "" if isinstance(value, Mapping) else f" = {show_value(value)}"
-        return f"{key}{shown}: {message}"
+        return f"{key}{shown}: {message}" if key else message
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
         if isinstance(value, list) and part.isdecimal() and int(part) < len(value):
