@@ -197,7 +197,9 @@ $(VENV)/.dependencies: requirements.lock | $(VENV)/bin/python
 # It builds if a source has changed, else it does nothing. Exit status 3: there is no C compiler.
 .PHONY: core
 core: $(VENV)/.dependencies
-	@$(BIN)/python native/build.py || { [ $$? = 3 ] && echo "installing ziglang ..." && \
+	@$(BIN)/python native/build.py 2> $(VENV)/build.log || { status=$$?; \
+		[ $$status = 3 ] || { cat $(VENV)/build.log >&2; exit $$status; }; \
+		echo "no C compiler here: installing ziglang, which has one ..."; \
 		$(PIP) -r requirements-compiler.lock && $(BIN)/python native/build.py; }
 
 $(VENV)/.installed: $(VENV)/.dependencies pyproject.toml | core
