@@ -83,10 +83,12 @@ class Page:
 
     def press(self, key: str, code: int) -> None:
         """Press a key, given by its name and its Windows code."""
-        for kind in ("rawKeyDown", "keyUp"):
+        text = {"text": "\r"} if key == "Enter" else {}  # without it a plain button is not pressed
+        for kind in ("keyDown", "keyUp"):
             self.call(
-                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
-            )
+                "Input.dispatchKeyEvent",
+                type=kind, key=key, code=key, windowsVirtualKeyCode=code, **text,
+            )  # fmt: skip
 
     def js(self, expression: str) -> Any:
         found = self.call(
