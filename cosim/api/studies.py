@@ -57,7 +57,7 @@ def certify(scenario: Source, *, weight: str = "given", late: int | None = None)
     >>> found.schedule.constants is None  # there is one
     False
     >>> print(f"no two events closer than {1e3 * found.schedule.inter_event_s:.0f} ms")
-    no two events closer than 8 ms
+    no two events closer than 10 ms
 
     If the plant is not linear, the model is certified as the plant, and ``nonlinear`` says so.
 

@@ -256,7 +256,7 @@ def test_a_violation_is_reported_once_and_recorded(outage: RunRecord, late: Run)
         late.recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
     line = (
-        f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.05502 s"
+        f"later than allowed from 0.506 s on: {cause}; there are certificates for up to 0.06439 s"
     )
     assert late.warnings == [[]] * 5 + [[line]] * 6
     notices = late.finished().notices
