@@ -93,9 +93,18 @@ class EndHelpers:
         written = self.submit(called, "cosim.record.early_tables", "write_early", run_dir).result()
         self.early = cast("Mapping[str, int]", written)
 
+    def _tell_writer(self) -> bool:
+        """Tell who writes tables that the run has ended; return whether it can know."""
+        if self._ended is None:  # nobody writes tables, or not yet
+            return False
+        with suppress(OSError):  # its folder does not exist yet
+            self._ended.touch()
+            return True
+        return False
+
     @property
     def _is_writing(self) -> bool:
-        """Whether a process writes the rest of the tables, no longer at idle priority."""
+        """Whether a process that was told writes the rest, no longer at idle priority."""
         if self._ended is None or self._writer is None:
             return False
         return self._writer.is_alive() and not self._ended.exists()
@@ -116,11 +125,10 @@ class EndHelpers:
         """
         self._due.clear()
         until_s = time.monotonic() + _GRACE_S
-        with suppress(OSError):  # nobody writes tables, or not yet
-            if self._ended is not None:
-                self._ended.touch()
+        told = False
         while any(thread.is_alive() for thread in self._threads):
-            if time.monotonic() > until_s and not self._is_writing:
+            told = told or self._tell_writer()
+            if time.monotonic() > until_s and not (told and self._is_writing):
                 break
             time.sleep(_POLL_S)
         if any(thread.is_alive() for thread in self._threads):

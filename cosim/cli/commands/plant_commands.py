@@ -30,7 +30,7 @@ PlantArgument = Annotated[
 ]
 
 
-@cli.command(cli.FILES, 12)
+@cli.command(cli.FILES, 12, takes="about a second")
 def linearise(
     plant: PlantArgument,
     settings: cli.SetOption = None,
@@ -67,7 +67,7 @@ def linearise(
     _show(found, out, json=json)
 
 
-@cli.command(cli.FILES, 14)
+@cli.command(cli.FILES, 14, takes="about a second")
 def gain(
     plant: PlantArgument,
     settings: cli.SetOption = None,
@@ -102,7 +102,7 @@ def gain(
     _show(found, out, json=json)
 
 
-@cli.command(cli.FILES, 16)
+@cli.command(cli.FILES, 16, takes="some 10 s")
 def new(
     file: Annotated[Path, Argument(metavar="FILE.toml", help="The scenario file to write.")],
     settings: cli.SetOption = None,
@@ -129,6 +129,8 @@ def new(
         raise CallerError(f"{file}: the name of a scenario file ends in .toml")
     if file.exists():
         raise CallerError(f"{file}: exists; give another name, or remove it first")
+    if not file.parent.is_dir():
+        raise CallerError(f"{file}: there is no folder {file.parent}")
     with cli.status("linearising") as status:
         found = new_scenario.new(
             plant,
@@ -167,13 +169,16 @@ def _numbers(
 def _show(
     found: "linear_model.LinearModel | linear_model.LoopGain", out: Path | None, *, json: bool
 ) -> None:
-    """Print a result, and write its document."""
+    """Print a result, and write its document, not over that of another plant."""
     if out is not None:
+        if out.suffix != ".json":
+            raise CallerError(f"--out {out}: the name of a model ends in .json")
+        label = found.to_json()["plant"]
+        if out.exists() and (other := linear_model.read_document(out)["plant"]) != label:
+            raise CallerError(f"--out {out}: has the model of {other}; give another name")
         try:
-            if out.suffix != ".json":
-                raise ValueError("the name of a model ends in .json")
             with new_file(out, make_folder=False) as file:
                 file.write(json_format.dumps(found.to_json(), indent=2).encode())
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise MachineError(f"--out {out}: cannot be written: {why(error)}") from None
     cli.print_lines(json, found.to_json(), repr(found))

@@ -378,7 +378,7 @@ def capacity(
         out: Folder of the study; runs/capacity/NAME by default, or NAME-thorough.
 
     Examples:
-        noack capacity shared_bottleneck   periodic, ZOH-ET and MB-ET: below a minute on two cores
+        noack capacity shared_bottleneck   periodic, ZOH-ET and MB-ET
         noack capacity shared_bottleneck --thorough   finite intervals, in an hour or less
         noack capacity shared_bottleneck --set 'loops=[{ name = "p" }]'   loops of one kind
         noack capacity shared_bottleneck --loops 11,22 --draws 8 --confirm model=11

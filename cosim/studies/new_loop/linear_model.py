@@ -373,8 +373,10 @@ def read_document(path: Path) -> dict[str, UserCode]:
     except ValueError:
         document = None
     wanted = {"plant": str, "settings": dict, "at": list, "input": list}
-    if not isinstance(document, dict) or not all(
-        isinstance(document.get(key), kind) for key, kind in wanted.items()
+    if (
+        not isinstance(document, dict)
+        or not all(isinstance(document.get(key), kind) for key, kind in wanted.items())
+        or document["plant"].endswith(".json")
     ):
         raise CallerError(f"{path}: not written by `noack linearise` or `noack gain`")
     return document
@@ -385,7 +387,10 @@ def model_or_gain(plant: str, settings: ReadTable) -> LinearModel | LoopGain:
     model = linearise(plant, settings=settings)
     if not plant.endswith(".json") or "gain" not in (document := read_document(Path(plant))):
         return model
-    rows = [vector("gain", row, len(model.A), "states") for row in document["gain"]]
+    given = document["gain"]
+    if not isinstance(given, list) or not all(isinstance(row, list) for row in given):
+        raise CallerError(f"{plant}: gain: should be a list of rows")
+    rows = [vector("gain", row, len(model.A), "states") for row in given]
     if len(rows) != model.plant.m:
         raise CallerError(f"{plant}: gain: {len(rows)} rows; the plant has {model.plant.m} inputs")
     K = np.array(rows)

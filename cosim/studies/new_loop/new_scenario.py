@@ -62,6 +62,8 @@ _START = 0.1
 _SMALLER, _FEWEST = 0.5, 6
 _RETURNED = 0.1
 _LONGEST_RUN_S = 20.0
+_LONGEST_S, _FASTEST = 1e7, 1000.0
+"""What a scenario may have."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,8 @@ def _initial_state(model: LinearModel, given: object) -> Vector:
     """Return x(0): as given, the plant's own, or 0.1 for each state that is no other's rate."""
     n, unit = model.plant.n, np.eye(model.plant.n)
     if given is not None or model.plant.initial_state is not None:
-        return vector("x0", given or model.plant.initial_state, n, "states")
+        given = model.plant.initial_state if given is None else given
+        return vector("x0", given, n, "states")
     is_rate = [any((model.A[i] == unit[j]).all() for i in range(n) if i != j) for j in range(n)]
     return np.where(is_rate, 0.0, _START) if not all(is_rate) else np.full(n, _START)
 
@@ -211,7 +214,7 @@ class _Builder:
         model, reference = self._model, self._model.plant
         start = trial.x0 if trial.weight is None else trial.weight @ trial.x0
         beta, alpha = rounded(BETA_SHARE * norm(start) or BETA_SHARE), trial.alpha_per_s
-        horizon_s = rounded(math.log(1 / SETTLED) / alpha)
+        horizon_s = min(rounded(math.log(1 / SETTLED) / alpha), _LONGEST_S)
         weight = None
         if trial.weight is not None:
             weight = [[rounded(entry, 6) for entry in row] for row in trial.weight]
@@ -219,7 +222,7 @@ class _Builder:
             "name": "".join(c if c.isascii() and c.isalnum() else "_" for c in self._path.stem),
             "description": f"{reference.label} over a network that loses half of the updates.",
             "horizon_s": horizon_s,
-            "speed": max(1.0, float(round(horizon_s / _LONGEST_RUN_S))),
+            "speed": min(max(1.0, float(round(horizon_s / _LONGEST_RUN_S))), _FASTEST),
             "model": {
                 "A": model.A.tolist(),
                 "B": model.B.tolist(),

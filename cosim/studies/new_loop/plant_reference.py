@@ -94,14 +94,16 @@ def plant_reference(
     """
     if (table := _system_table(label)) is None:
         return _of_scenario(label, settings)
-    content: Table = {"plant": {"system": table}}
+    kind, content = table["kind"], dict[str, object](plant={"system": table})
     for key, value in settings.items():
         if key.startswith("plant."):
             scenario_file.put(content, key, value, f"--set {key}")
     plant = content["plant"]
     assert isinstance(plant, dict)
+    if not isinstance(plant["system"], dict) or plant["system"].get("kind") != kind:
+        raise CallerError(f"--set plant.system: the plant is {label}; set its values, one by one")
     system = _settings(plant["system"], label)
-    rates = {key: float(plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
+    rates = {key: _rate(key, plant[key]) for key in ("rate_hz", "measure_every") if key in plant}
     if isinstance(system, GymnasiumSettings):
         return _of_environment(label, settings, system)
     if isinstance(system, FmuSettings):
@@ -134,6 +136,12 @@ def _system_table(label: str) -> Table | None:
             raise CallerError(f"{label}: names no plant by itself; {_FORMS}")
         return {"kind": label}
     return {"kind": "python", "name": label} if colon else None
+
+
+def _rate(key: str, value: object) -> float:
+    if not isinstance(value, int | float) or not value > 0:
+        raise CallerError(f"--set plant.{key}: {value!r}; give a positive number")
+    return float(value)
 
 
 def _classes(path: Path) -> str:

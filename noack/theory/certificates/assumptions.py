@@ -282,6 +282,8 @@ def certificate_assumptions(
         why = f"α = {alpha:g} /s, {_decays(decay[of])}"
         if slower and not holds:
             why += f"; certified instead: bounds with decay rate {slower:.3g} /s"
+        elif constants is not None and not holds:
+            why += "; certified instead: constant bounds"
         if math.isinf(decay[of]):
             holds, why = False, "a hold does not decay: the certified bounds are constant"
         checked.append(_checked(f"α is below the decay rate of {of}", source, holds, why))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
-from threading import Event
+from threading import Event, current_thread
 from typing import Any, NoReturn
 from unittest.mock import patch
 
@@ -252,17 +252,21 @@ def test_a_prepared_end_is_that_of_a_run_without_preparation(
     assert finalize(ending, report=False, view=not is_killed).summary == expected
 
 
+@pytest.mark.parametrize("part", ["_prepare_loops", "_write_early"])
 def test_the_end_does_not_wait_for_a_preparation_that_gets_no_time(
-    many_loops: Path, monkeypatch: pytest.MonkeyPatch
+    many_loops: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
+    """Nor for who writes tables, if it has not even made the folder in which it would be told."""
     begun = Event()
 
     def endless(helpers: EndHelpers, *_: object) -> None:
+        if part == "_write_early":
+            helpers._ended, helpers._writer = many_loops / "none" / "ended", current_thread()
         waiting = helpers.submit(time.sleep, 1e6)
         begun.set()
         waiting.result()
 
-    monkeypatch.setattr(EndHelpers, "_prepare_loops", endless)
+    monkeypatch.setattr(EndHelpers, part, endless)
     monkeypatch.setattr(end_helpers, "_GRACE_S", 0.0)
     helpers = EndHelpers(load(many_loops / SCENARIO_FILE))
     helpers.prepare(many_loops)
