@@ -123,8 +123,8 @@ def verdict_of(run: Exploration, guarantee: Guarantee | None) -> tuple[VerdictLi
         status, reason = ExitStatus.FAILED, f"diverged at {number(run.diverged_at_s, 4)} s"
     elif run.cut:
         status, reason = ExitStatus.INTERRUPTED, run.cut
-    largest, last = float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
-    state = state_text(largest, last, None) if run.diverged_at_s is None else ""
+    first, largest, last = run.x_norm[0], float(np.nanmax(run.x_norm)), float(run.x_norm[-1])
+    state = state_text(float(first), largest, last, None) if run.diverged_at_s is None else ""
     events = len(run.event_s)
     return (
         ending_line(ExitPart(status=status, reason=reason), reached_s, horizon_s, state),

@@ -61,6 +61,8 @@ _NAMED = 3
 """Largest number of claims of a verdict that are named."""
 _SETTLED = 0.1
 """A loop is stable if ‖x‖ falls to this share of its largest value."""
+_ROSE = 1.001
+"""Where this multiple of the first ‖x‖ is exceeded, it is said."""
 _MOST_LOOPS, _MOST_REASONS, _MOST_VIOLATIONS = 12, 3, 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
 
@@ -117,12 +119,18 @@ def state_of(largest: float | None, final: float | None, diverged_at_s: float | 
 
 
 def state_text(
-    largest: float | None, final: float | None, diverged_at_s: float | None, norm: str = "‖x‖"
+    first: float | None,
+    largest: float | None,
+    final: float | None,
+    diverged_at_s: float | None,
+    norm: str = "‖x‖",
 ) -> str:
-    """Return a loop's state as that word, with the largest and the last ``norm``."""
+    """Return a loop's state as that word, with the first or largest and the last ``norm``."""
     word = state_of(largest, final, diverged_at_s)
-    if not word or diverged_at_s is not None:
+    if largest is None or diverged_at_s is not None:
         return word
+    if word == "stable" and first is not None and largest > _ROSE * first:
+        return f"{word}, {norm} rose from {first:.3g} to {largest:.3g}, then fell to {final:.3g}"
     if word == "stable":
         return f"{word}, {norm} fell from {largest:.3g} to {final:.3g}"
     return f"{word}, {norm} was at most {largest:.3g}, at the end {final:.3g}"
@@ -131,7 +139,7 @@ def state_text(
 def _states(loops: Sequence[LoopSummary]) -> str:
     states = [(one.sup_state_norm, one.final_state_norm, one.diverged_at_s) for one in loops]
     if len(states) == 1:
-        return state_text(*states[0], state_norm(loops[0]))
+        return state_text(loops[0].initial_state_norm, *states[0], state_norm(loops[0]))
     counts = Counter(filter(None, (state_of(*state) for state in states)))
     (first, *others) = counts.most_common() or [("", 0)]
     words = [f"{first[1]} of {len(loops)} loops {first[0]}"] if first[1] else []

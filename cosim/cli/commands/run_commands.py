@@ -127,7 +127,9 @@ def _print_run(
     state = (
         ""
         if found.diverged_at_s
-        else run_verdict.state_text(found.sup_state_norm, found.final_state_norm, None)
+        else run_verdict.state_text(
+            found.initial_state_norm, found.sup_state_norm, found.final_state_norm, None
+        )
     )
     ending = run_verdict.ending_line(ended, found.reached_s, found.horizon_s, state)
     for line in (ending, run_verdict.transmission_line(found.events, found.deliveries)):

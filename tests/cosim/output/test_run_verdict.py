@@ -93,18 +93,23 @@ def test_the_second_line_states_whether_the_guarantee_was_kept(
 
 
 @pytest.mark.parametrize(
-    ("largest", "final", "diverged_at_s", "text"),
+    ("first", "largest", "final", "diverged_at_s", "text"),
     [
-        (2.0, 0.1999, None, "stable, ‖x‖ fell from 2 to 0.2"),
-        (2.0, 0.2001, None, "bounded, ‖x‖ was at most 2, at the end 0.2"),
-        (2.0, 9.0, 1.0, "diverged"),
-        (None, None, None, ""),
+        (2.0, 2.0, 0.1999, None, "stable, ‖x‖ fell from 2 to 0.2"),
+        (1.0, 2.0, 0.1999, None, "stable, ‖x‖ rose from 1 to 2, then fell to 0.2"),
+        (1.0, 2.0, 0.2001, None, "bounded, ‖x‖ was at most 2, at the end 0.2"),
+        (1.0, 2.0, 9.0, 1.0, "diverged"),
+        (None, None, None, None, ""),
     ],
 )
 def test_the_state_is_stable_bounded_or_diverged(
-    largest: float | None, final: float | None, diverged_at_s: float | None, text: str
+    first: float | None,
+    largest: float | None,
+    final: float | None,
+    diverged_at_s: float | None,
+    text: str,
 ) -> None:
-    assert state_text(largest, final, diverged_at_s) == text
+    assert state_text(first, largest, final, diverged_at_s) == text
 
 
 def test_the_table_of_times_marks_what_was_later_than_allowed(outcome: Outcome) -> None:
