@@ -111,21 +111,27 @@ class Page:
         self.js(f"{found}.at(-1).click()")
 
     def press_button(self, text: str) -> None:
-        """Click on a button with the mouse, once it can be clicked."""
+        """Click on a button with the mouse, once it can be clicked; again if it moved meanwhile."""
         found = (
-            f"[...document.querySelectorAll('button')].find(e => !e.disabled && "
+            f"[...document.querySelectorAll('button')].find(e => !e.disabled && e.offsetParent && "
             f"e.innerText.trim().toLowerCase().endsWith({json.dumps(text)}))"
         )
-        self.wait(f"!!{found}")
-        self.js(f"{found}.scrollIntoView({{ block: 'center' }})")
-        x, y = self.js(
-            f"(r => [r.x + r.width / 2, r.y + r.height / 2])({found}.getBoundingClientRect())"
-        )
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
-                clickCount=1,
-            )  # fmt: skip
+        self.js("window.pressed = false")
+        deadline_s = time.monotonic() + live.PATIENCE_S
+        while not self.js("window.pressed"):
+            assert time.monotonic() < deadline_s, text
+            self.wait(f"!!{found}")
+            x, y = self.js(
+                "(e => { e.addEventListener('click', () => { window.pressed = true; }, "
+                "{ once: true }); e.scrollIntoView({ block: 'center' }); "
+                "const r = e.getBoundingClientRect(); "
+                f"return [r.x + r.width / 2, r.y + r.height / 2]; }})({found})"
+            )
+            for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+                self.call(
+                    "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1,
+                    clickCount=1,
+                )  # fmt: skip
 
     def unfold(self, title: str) -> None:
         """Open a part of the settings."""

@@ -247,6 +247,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
 def test_a_click_reaches_the_run_while_the_viewer_draws(browser: Browser, address: str) -> None:
     page = Page(browser, address.partition("?")[0] + "?scenario=lane_following&horizon_s=600")
     page.click("live", "button")
+    page.wait(f"{VERDICT}.includes('five processes on this machine')")
     page.press_button("run live")
     page.wait(f"{TEXT}.includes('of 600 s')")
     log = "document.querySelector('.lab-log').innerText"

@@ -262,7 +262,7 @@ MISTAKES: dict[str, str] = {
     "new a.toml --plant cart_pole --x0 1": "x0: 1 numbers; the plant has 4 states",
     "new a.toml --plant cart_pole --set network.nothing=1": "network.nothing",
     "new a.toml --plant pole.py:Weighed": r"needs an equilibrium; at the point ẋ is \(0, -9.81\)",
-    "new gone/a.toml --plant unstable_pendulum": "cannot be written",
+    "new gone/a.toml --plant unstable_pendulum": "there is no folder gone",
 }
 
 
