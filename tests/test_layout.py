@@ -51,7 +51,7 @@ LINES = {
     "controller_node": 390,
     "benchmarks": 4610,
     "native": 9580,
-    "tests": 44650,
+    "tests": 44645,
 }
 """Largest number of lines of Python of each folder; of ``native``, of C.
 

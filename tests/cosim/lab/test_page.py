@@ -246,11 +246,7 @@ def test_a_live_run_ends_with_a_verdict_and_is_the_selected_recorded_run(
 
 def test_a_click_reaches_the_run_while_the_viewer_draws(browser: Browser, address: str) -> None:
     page = Page(browser, address.partition("?")[0] + "?scenario=lane_following&horizon_s=600")
-    deadline_s = time.monotonic() + live.PATIENCE_S
-    while not page.js(f"{VERDICT}.includes('five processes on this machine')"):
-        assert time.monotonic() < deadline_s
-        page.click("live", "button")  # again: on a busy machine the page may not listen yet
-        time.sleep(1.0)
+    page.click("live", "button")
     page.press_button("run live")
     page.wait(f"{TEXT}.includes('of 600 s')")
     log = "document.querySelector('.lab-log').innerText"
