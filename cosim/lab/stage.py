@@ -124,7 +124,5 @@ def _ends(panel: Panel) -> tuple[float, float]:
     room = _MARGIN * (high - low) or 0.5
     if axis.about is not None:
         low, high = near_ends((low, high), about)
-    fixed = axis.ends
-    return low - room if fixed[0] is None else fixed[0], high + room if fixed[1] is None else fixed[
-        1
-    ]
+    first, last = axis.ends
+    return low - room if first is None else first, high + room if last is None else last
