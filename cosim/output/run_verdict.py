@@ -127,7 +127,7 @@ def state_text(
 ) -> str:
     """Return a loop's state as that word, with the first or largest and the last ``norm``."""
     word = state_of(largest, final, diverged_at_s)
-    if largest is None or diverged_at_s is not None:
+    if largest is None or final is None or diverged_at_s is not None:
         return word
     if word == "stable" and first is not None and largest > _ROSE * first:
         return f"{word}, {norm} rose from {first:.3g} to {largest:.3g}, then fell to {final:.3g}"
