@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -415,6 +416,31 @@ _PATIENCE_S = 120.0
 _MOVE_S = 0.05
 _KEYS = [("ArrowLeft", 37)] * 20 + [("ArrowRight", 39)] * 20
 _SLIDER = "document.getElementById('lab-set-network.loss.probability')"
+_BUSY = 4
+_STROKES, _STROKE_S = 40, 0.15
+_DRAGGED = "document.getElementById('lab-set-trigger.beta')"
+_BOX = f"""(slider => {{
+  slider.scrollIntoView({{ block: "center" }});
+  const r = slider.getBoundingClientRect();
+  return [r.x, r.y + r.height / 2, r.width];
+}})({_DRAGGED})"""
+_NOTE_STROKES = """
+window.STROKES = [];
+let movedAt = 0;
+addEventListener("pointermove", event => { movedAt = event.timeStamp; }, true);
+const show = LabFigure.prototype.show;
+LabFigure.prototype.show = function (content) {
+  show.call(this, content);
+  const at = movedAt;
+  movedAt = 0;
+  if (at) requestAnimationFrame(() => {  // a message follows when the frame has been painted
+    const painted = new MessageChannel();
+    painted.port1.onmessage = () => STROKES.push(performance.now() - at);
+    painted.port2.postMessage(0);
+  });
+};
+0
+"""
 
 
 class _Page:
@@ -449,9 +475,7 @@ class _Page:
             for key, code in itertools.cycle(_KEYS):
                 if ended.wait(_MOVE_S):
                     return
-                for kind in ("rawKeyDown", "keyUp"):
-                    self._browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key,
-                                       windowsVirtualKeyCode=code)  # fmt: skip
+                self._press(key, code)
 
         mover = threading.Thread(target=move)
         mover.start()
@@ -460,6 +484,27 @@ class _Page:
         finally:
             ended.set()
             mover.join()
+
+    def strokes_ms(self) -> list[float]:
+        """Drag the slider; return the times from each move to its curve on the screen."""
+        self.js(_NOTE_STROKES)
+        x, y, width = self.js(_BOX)
+        self._mouse("mousePressed", x + width / 2, y)
+        time.sleep(1)  # the curve of this place is drawn
+        for i in range(1, _STROKES + 1):
+            self._mouse("mouseMoved", x + (0.5 + 0.005 * i) * width, y)
+            time.sleep(_STROKE_S)
+        return [float(stroke_ms) for stroke_ms in self.js("STROKES")]
+
+    def _mouse(self, kind: str, x: float, y: float) -> None:
+        self._browser.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
+        )
+
+    def _press(self, key: str, code: int) -> None:
+        for kind in ("rawKeyDown", "keyUp"):
+            self._browser.call("Input.dispatchKeyEvent", type=kind, key=key, code=key,
+                               windowsVirtualKeyCode=code)  # fmt: skip
 
     def run_live(self) -> None:
         """Run live by the page, until it says that the run ended."""
@@ -505,6 +550,36 @@ def summary_of(side: str, folder: Path) -> dict[str, Any]:
         page.run_live()
     found: dict[str, Any] = json.loads((folder / "runs/latest/summary.json").read_bytes())
     return found
+
+
+@contextmanager
+def _busy(processes: int) -> Iterator[None]:
+    """Keep the processor busy meanwhile."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+@benchmark("stroke", "From a moved slider of the lab page to its curve on the screen")
+def stroke(options: argparse.Namespace) -> Iterator[Row]:
+    """Measure the median time from a move of a dragged slider until its curve is painted.
+
+    A frame of the browser is 17 ms. It draws by the processor, without a graphics card.
+    """
+    for name, processes, goal_ms in (("idle", 0, 60), (f"{_BUSY} busy processes", _BUSY, 120)):
+        say(name)
+        with (
+            tempfile.TemporaryDirectory(prefix="noack-bench-") as folder,
+            _opened(Path(folder), ()) as page,
+            _busy(processes),
+        ):
+            median_ms = statistics.median(page.strokes_ms())
+        yield Row(f"moved slider to painted curve, {name}", median_ms, "ms",
+                  goal=Goal("<=", goal_ms))  # fmt: skip
 
 
 @benchmark("lab", "A live run while the lab page is open")

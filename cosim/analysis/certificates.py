@@ -362,8 +362,9 @@ def constant_rows(
     yield "decay rate, 1/s", constant("rate_per_s"), number(theorem_rate, 4)
     yield "undelivered updates", constant("missing_events"), NONE
     unit = next((f"/{one.unit}" for one in certificates if one.unit), "")
-    yield f"Δ, bound of ‖e_c‖{unit}", constant("delta"), delta_2
-    yield f"bound of ‖e_s‖{unit}", constant("overshoot"), "1"
+    w = "W " if any(one.weighted for one in certificates) else ""
+    yield f"Δ, bound of ‖{w}e_c‖{unit}", constant("delta"), delta_2
+    yield f"bound of ‖{w}e_s‖{unit}", constant("overshoot"), "1"
     yield "bound of ‖u − Kx‖", constant("input_error"), NONE
     yield "· none undelivered", constant("received_input_error"), NONE
     yield "X, bound of ‖x‖", constant("state"), state_2
@@ -375,5 +376,5 @@ def constant_rows(
                 yield f"+ without decay: {label}", after(name, "persistent_constants"), NONE
     if any(c.floor_constants for c in certificates):
         yield "floor reached at, s", row(lambda c: c.floor_from_s), NONE
-        yield "bound of ‖e_c‖/ε from then on", after("delta", "floor_constants"), NONE
+        yield f"bound of ‖{w}e_c‖/ε from then on", after("delta", "floor_constants"), NONE
         yield "bound of ‖x‖ from then on", after("state", "floor_constants"), NONE

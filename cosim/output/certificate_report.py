@@ -69,8 +69,11 @@ def print_certificates(
 
 def _print_weight(console: Console, chosen: Certificates, weight: Matrix) -> None:
     if (bound := chosen.error_in_given_norm) is not None:
-        of = f"‖e_c‖ ≤ {bound:.4g} {chosen.schedule.level} for the schedule, the scenario's plant"
-        console.print(f"In your norm, with the chosen one in the trigger: {of}", markup=False)
+        console.print(
+            "With W below in the trigger, the error in the scenario's own norm is bounded, too "
+            f"(schedule, plant): ‖e_c‖ ≤ {bound:.4g} {chosen.schedule.level}",
+            markup=False,
+        )
     rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in weight)
     console.print(
         f"for the scenario file, below [trigger]:\nweight = [\n{rows},\n]",
