@@ -56,10 +56,11 @@ def print_certificates(
     if found.weight is not None and exists:
         _print_weight(console, found, found.weight)
     if not exists and chosen is None:
+        share = "trigger.sigma, " if hasattr(found.scenario.trigger, "sigma") else ""
         console.print(
             "[yellow]no certificate for the schedule[/], nor in another norm: raise "
-            "plant.rate_hz and controller.rate_hz, or lower network.mansd, the network's delay or "
-            "certificate.late_periods; noack adversary shows what losses can do to the loop"
+            f"plant.rate_hz and controller.rate_hz, or lower {share}network.mansd, the network's "
+            "delay or certificate.late_periods; noack adversary shows what losses can do to the loop"
         )
     if chosen is not None and chosen.weight is not None:
         console.print("[bold]With another norm, also in the trigger, there are certificates:[/]")

@@ -295,7 +295,9 @@ def _placed(model: LinearModel, poles: Complex) -> Matrix:
     try:
         placed = place_poles(basis.T @ model.A @ basis, basis.T @ model.B, poles)
     except ValueError as error:  # not in conjugate pairs, or one too often
-        raise CallerError(f"poles: {error}") from None
+        raise CallerError(
+            f"poles: {error} (none may occur more often than there are independent inputs)"
+        ) from None
     return np.asarray(-placed.gain_matrix @ basis.T, dtype=np.float64)
 
 
