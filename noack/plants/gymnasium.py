@@ -102,6 +102,12 @@ class GymnasiumSettings(FileSettings, PlantSettings):
         return GymnasiumSystem(self, start)
 
 
+def own_step_s(environment: UserCode) -> float | None:
+    """Return the time of a step that an environment itself has, s; None if it has none."""
+    own = (getattr(environment, name, None) for name in ("dt", "tau"))
+    return next((float(step) for step in own if step), None)
+
+
 class Environment:
     """An environment and the maps between its state and x, its action and u.
 
@@ -160,8 +166,7 @@ class Environment:
     @property
     def step_s(self) -> float:
         """The time of a step, s; CallerError if the environment has none."""
-        own = (getattr(self._own, name, None) for name in ("dt", "tau"))
-        step_s = self._settings.step_s or next((float(step) for step in own if step), None)
+        step_s = self._settings.step_s or own_step_s(self._own)
         if step_s is None:
             self.wrong("it has no time of a step; give plant.system.step_s")
         return step_s
