@@ -254,10 +254,11 @@ class GymnasiumSystem:
             )
         environment.require_step(start.step_ns)
         environment.start(start.x0)
-        self.x, self.z = environment.x(), np.zeros(0)
+        self.x, self.z, self._step_ns = environment.x(), np.zeros(0), start.step_ns
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """Apply an action for a step."""
+        assert dt_ns == self._step_ns
         try:
             self._environment.step(u)
             self.x = self._environment.x()
