@@ -15,7 +15,7 @@ else:
 
     def __getattr__(name: str) -> object:
         """Look up a name of the library (PEP 562)."""
-        if name not in __all__:
+        if name not in __all__ and name != "LossyChannel":  # which needs an extra: no star takes it
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from cosim import api  # upward, and it takes time: for programs only
 
@@ -23,7 +23,7 @@ else:
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return sorted({*globals(), *__all__, "LossyChannel"})
 
 
 __all__ = [

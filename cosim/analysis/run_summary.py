@@ -41,8 +41,9 @@ from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, NoackError
 from noack.core.linear_systems import Matrix, Vector
 from noack.impairments.loss_prediction import expected_loss
+from noack.plants.gymnasium import GymnasiumSettings
 from noack.plants.plant_settings import PlantSystem
-from noack.plants.systems.linearisation import linearise
+from noack.plants.systems.linearisation import STEP_NS, linearise
 from noack.protocol.machine_interface import FAILED, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -318,7 +319,11 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
             if (exact := plant.system.linearisation()) is not None:
                 A, B = exact
             else:
-                found = linearise(system_at, n, m, settling_s=plant.system.settling_s)
+                is_fixed = isinstance(plant.system, GymnasiumSettings)
+                step_ns = resolved.timing.plant_period_ns if is_fixed else STEP_NS
+                found = linearise(
+                    system_at, n, m, settling_s=plant.system.settling_s, step_ns=step_ns
+                )
                 A, B = found.A, found.B
     except NoackError:  # a user's plant: its code fails, or it does not accept this x(0)
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)

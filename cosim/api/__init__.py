@@ -4,7 +4,10 @@
 function imports these modules when it is first called.
 """
 
+from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from cosim.analysis.certificates import Certificates as Certificates
 from cosim.api.explorer import Explorer as Explorer
@@ -28,8 +31,12 @@ from cosim.api.studies import save_tables as save_tables
 from cosim.studies.new_loop.linear_model import gain as gain
 from cosim.studies.new_loop.linear_model import linearise as linearise
 from cosim.studies.new_loop.new_scenario import new as new
+from noack.core.errors import CallerError as _CallerError
 from noack.core.errors import NoackError as NoackError
 from noack.scenario.scenario import Scenario as Scenario
+
+if TYPE_CHECKING:  # its base class is of an extra
+    from cosim.api.lossy_channel import LossyChannel as LossyChannel
 
 __version__ = version("noack")
 
@@ -37,3 +44,16 @@ __version__ = version("noack")
 for _public in list(globals().values()):
     if getattr(_public, "__module__", "").startswith("cosim."):
         _public.__module__ = "noack"
+
+
+def __getattr__(name: str) -> object:
+    """Return the one name that needs an extra (PEP 562)."""
+    if name != "LossyChannel":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if find_spec("gymnasium") is None:
+        raise _CallerError(
+            "noack.LossyChannel needs a package that is not installed; "
+            "pip install 'noack[gymnasium]'"
+        )
+    found: object = import_module("cosim.api.lossy_channel").LossyChannel
+    return found

@@ -38,6 +38,7 @@ T = TypeVar("T")
 EXTRAS = {
     "fmi": ("fmpy", 'plants of kind "fmu"'),
     "gymnasium": ("gymnasium", 'plants of kind "gymnasium"'),
+    "mujoco": ("mujoco", 'environments of MuJoCo as plants of kind "gymnasium"'),
     "vehicle": ("vehiclemodels", 'plants of kind "vehicle"'),
     "cluster": ("distributed", "`noack campaign --scheduler`"),
     "mcap": ("mcap", "`noack export --format mcap`"),

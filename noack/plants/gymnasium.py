@@ -1,71 +1,240 @@
 """A Gymnasium environment: its state is set, actions are applied, its state is read.
 
-The environment is used without its wrappers. Observations, rewards and the ends of episodes have no
-effect.
+The environment is used without its wrappers. Rewards and the ends of episodes have no effect.
+MuJoCo's environments are among them: their state is qpos, then qvel.
 """
 
 from importlib import import_module
-from typing import ClassVar, Literal
+from importlib.util import find_spec
+from operator import attrgetter
+from typing import Annotated, ClassVar, Literal, NoReturn
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Vector
-from noack.plants.plant_settings import PlantSettings, PlantStart, SystemFailedError
-from noack.settings.section import Positive
-from noack.settings.user_files import UserCode, real_vector
+from noack.plants.plant_settings import Names, PlantSettings, PlantStart, SystemFailedError
+from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.section import Positive, Row, Rows, require_length, require_shape
+from noack.settings.user_files import FileSettings, UserCode, real_vector, unchanged
+
+Indices = Annotated[
+    tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, max_length=MAX_DIMENSION)
+]
+_OBSERVATION = "observation"
+_MUJOCO = ("data.qpos", "data.qvel")
+_ALIKE = 1e-6
+"""Largest relative difference between x(0) of the scenario and of the observation, and between the
+quotient of two steps and a whole number."""
 
 
-class GymnasiumSettings(PlantSettings):
-    """A Gymnasium environment with a state that can be set, and continuous actions.
+class GymnasiumSettings(FileSettings, PlantSettings):
+    """A Gymnasium environment, also one of MuJoCo, with continuous actions.
 
-    x is its attribute ``state``, u its action.
+    With its state s: x = s[entries] − operating_state; its action is operating_action +
+    actuation u.
     """
 
     needs: ClassVar = ("gymnasium", "gymnasium")
 
     kind: Literal["gymnasium"]
     id: str
-    """The environment's id, e.g. "Pendulum-v1"."""
+    """The environment's id, e.g. "Pendulum-v1", or "module:Id-v0" of a module to import."""
+    file: str | None = None
+    """A model in MJCF for an environment that takes ``xml_file``, as MuJoCo's do; a relative name
+    is relative to the scenario file."""
     parameters: dict[str, bool | int | FiniteFloat | str] = Field({})
     """Passed to the environment as keyword arguments."""
     step_s: Positive | None = None
     """Time of a step; by default the environment's attribute dt or tau. plant.rate_hz must be its
     inverse."""
+    state: Annotated[Names, Field(min_length=1)] | None = None
+    """Attributes with numbers or vectors that make up s, e.g. ["pos", "body.speed"]; by default
+    ``state``, for MuJoCo data.qpos and data.qvel. With ["observation"], s is the last observation,
+    which cannot be set: the first one, after reset(seed=0), must be that of x(0)."""
+    entries: Indices | None = None
+    """Entries of s, counted from 0, that make up x, in x's order; by default all."""
+    operating_state: Row | None = None
+    """Values of these entries at x = 0; by default 0."""
+    actuation: Rows | None = None
+    """Matrix from u to the action, a row per entry of the action; by default the identity."""
+    operating_action: Row | None = None
+    """The action at u = 0; by default 0."""
 
-    def environment(self) -> UserCode:
-        """Return the environment.
+    def check(self, n: int, m: int) -> None:
+        """Require maps for n states and m inputs.
+
+        Raises:
+            ValueError: the numbers differ.
+        """
+        why = f"the model has {n} states and {m} inputs"
+        require_length(self.entries, "plant.system.entries", n, why)
+        require_length(self.operating_state, "plant.system.operating_state", n, why)
+        if self.entries is not None and len({*self.entries}) < n:
+            raise ValueError("plant.system.entries: an entry is there twice")
+        if self.actuation is not None:
+            rows, of = len(self.actuation), "plant.system.actuation"
+            require_shape(self.actuation, of, (rows, m), why)
+            why = f"{of} has {rows} rows"
+            require_length(self.operating_action, "plant.system.operating_action", rows, why)
+
+    def require_installed(self) -> None:
+        super().require_installed()
+        entry = import_module("gymnasium").registry.get(self.id)
+        is_mujoco = entry is not None and "gymnasium.envs.mujoco" in str(entry.entry_point)
+        if is_mujoco and find_spec("mujoco") is None:
+            raise CallerError(
+                f'plant.system.id: "{self.id}" needs a package that is not installed; '
+                "pip install 'noack[mujoco]'"
+            )
+
+    def environment(self) -> "Environment":
+        """Return the environment, after reset(seed=0); MuJoCo's is at its initial state.
 
         Raises:
             CallerError: there is no such environment, or it cannot be a plant.
         """
         self.require_installed()
-        gymnasium = import_module("gymnasium")
-        place = f'plant.system.id = "{self.id}"'
-        try:
-            made = gymnasium.make(self.id, **self.parameters).unwrapped
-            made.reset(seed=0)
-        except Exception as error:  # an environment can raise any error
-            raise CallerError(f"{place}: {type(error).__name__}: {one_line(error)}") from None
-        if not isinstance(made.action_space, gymnasium.spaces.Box):
-            raise CallerError(f"{place}: its actions are {made.action_space}, not continuous (Box)")
-        if np.ndim(getattr(made, "state", 0.0)) != 1:
-            raise CallerError(f"{place}: its state cannot be set: it has no vector `state`")
-        return made
-
-    def step_of(self, environment: UserCode) -> float:
-        """Return the time of a step, s; raise CallerError if the environment has none."""
-        own = (getattr(environment, name, None) for name in ("dt", "tau"))
-        step_s = self.step_s or next((float(step) for step in own if step), None)
-        if step_s is None:
-            raise CallerError(
-                f'plant.system.id = "{self.id}": it has no time of a step; give plant.system.step_s'
-            )
-        return step_s
+        return Environment(self)
 
     def system(self, start: PlantStart) -> "GymnasiumSystem":
         return GymnasiumSystem(self, start)
+
+
+def own_step_s(environment: UserCode) -> float | None:
+    """Return the time of a step that an environment itself has, s; None if it has none."""
+    own = (getattr(environment, name, None) for name in ("dt", "tau"))
+    return next((float(step) for step in own if step), None)
+
+
+class Environment:
+    """An environment and the maps between its state and x, its action and u.
+
+    ``n`` and ``m`` are the numbers of states and inputs.
+
+    Raises:
+        CallerError: there is no such environment, or it does not fit its settings.
+    """
+
+    def __init__(self, settings: GymnasiumSettings) -> None:
+        self._settings = settings
+        self.place = f'plant.system.id = "{settings.id}"'
+        """What messages begin with."""
+        given = dict(settings.parameters)
+        if settings.file is not None:
+            given["xml_file"] = str(unchanged(settings, "plant.system"))
+        gymnasium = import_module("gymnasium")
+        try:
+            self._own: UserCode = gymnasium.make(settings.id, **given).unwrapped
+            self._observation, _ = self._own.reset(seed=0)
+        except Exception as error:  # an environment can raise any error
+            self.wrong(f"{type(error).__name__}: {one_line(error)}")
+        space = self._own.action_space
+        if not isinstance(space, gymnasium.spaces.Box):
+            self.wrong(
+                f"its actions are {space}, not continuous (Box), which u needs; take an "
+                "environment with continuous actions"
+            )
+        is_mujoco = not hasattr(self._own, "state") and hasattr(self._own, "init_qpos")
+        self._names = settings.state or (_MUJOCO if is_mujoco else ("state",))
+        if self._names == _MUJOCO:
+            # Otherwise MuJoCo starts again from its initial state when a motion diverges.
+            bits = import_module("mujoco").mjtDisableBit
+            self._own.model.opt.disableflags |= int(getattr(bits, "mjDSBL_AUTORESET", 0))
+            self._own.set_state(self._own.init_qpos, self._own.init_qvel)
+        size, actions = len(self._state()), int(np.prod(space.shape))
+        self._entries = np.arange(size) if settings.entries is None else np.array(settings.entries)
+        if (last := int(self._entries.max())) >= size:
+            self.wrong(f"plant.system.entries has {last}; its state has entries 0 to {size - 1}")
+        self._actuation = np.eye(actions)
+        if settings.actuation is not None:
+            self._actuation = np.array(settings.actuation)
+        self._rest = np.array(settings.operating_action or np.zeros(actions))
+        if not len(self._actuation) == len(self._rest) == actions:
+            self.wrong(
+                f"it has {actions} actions; plant.system.actuation needs as many rows, and "
+                "operating_action as many entries"
+            )
+        self.n, self.m = len(self._entries), self._actuation.shape[1]
+        self._offset = np.array(settings.operating_state or np.zeros(self.n))
+
+    def wrong(self, message: str) -> NoReturn:
+        """Refuse the environment by a CallerError."""
+        raise CallerError(f"{self.place}: {message}")
+
+    @property
+    def step_s(self) -> float:
+        """The time of a step, s; CallerError if the environment has none."""
+        step_s = self._settings.step_s or own_step_s(self._own)
+        if step_s is None:
+            self.wrong("it has no time of a step; give plant.system.step_s")
+        return step_s
+
+    def require_step(self, step_ns: int) -> None:
+        """Require that the plant steps at the environment's rate; say what would be right."""
+        own_s = self.step_s
+        if abs(own_s * 1e9 - step_ns) <= 1:
+            return
+        wanted = f"its step is {own_s:g} s; set plant.rate_hz = {1 / own_s:.9g}"
+        longer, shorter = step_ns * 1e-9 / own_s, own_s / (step_ns * 1e-9)
+        if longer > 1 and abs(longer - round(longer)) < _ALIKE:
+            wanted += f" and plant.measure_every = {round(longer)} to measure as often as now"
+        elif shorter > 1 and abs(shorter - round(shorter)) < _ALIKE:
+            wanted += f"; it cannot make {round(shorter)} steps of the plant out of its one"
+        self.wrong(wanted)
+
+    def x(self) -> Vector:
+        """Return x, (n,)."""
+        state: Vector = self._state()[self._entries] - self._offset
+        return state
+
+    def start(self, x0: Vector) -> None:
+        """Set x to x(0), (n,).
+
+        Raises:
+            CallerError: an attribute cannot be set, or the observation is another.
+        """
+        state = self._state()
+        if _OBSERVATION in self._names:
+            if not np.all(np.abs(self.x() - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
+                here = self.x().tolist()
+                self.wrong(f"an observation cannot be set; set plant.initial_state = {here}")
+            return
+        state[self._entries] = x0 + self._offset
+        name = ""
+        try:
+            if self._names == _MUJOCO:
+                self._own.set_state(*np.split(state, [self._own.model.nq]))
+                return
+            for name in self._names:
+                path, _, last = name.rpartition(".")
+                owner = attrgetter(path)(self._own) if path else self._own
+                shape = np.shape(getattr(owner, last))
+                part, state = np.split(state, [int(np.prod(shape))])
+                setattr(owner, last, part.reshape(shape) if shape else float(part[0]))
+        except Exception as error:  # as above
+            self.wrong(f"`{name}` cannot be set: {type(error).__name__}: {one_line(error)}")
+
+    def step(self, u: Vector) -> None:
+        """Apply an action for a step."""
+        action = self._rest + self._actuation @ u
+        self._observation = self._own.step(action.reshape(self._own.action_space.shape))[0]
+
+    def _state(self) -> Vector:
+        """Return the environment's state."""
+        parts = []
+        for name in self._names:
+            try:
+                is_seen = name == _OBSERVATION
+                part = np.ravel(self._observation if is_seen else attrgetter(name)(self._own))
+                parts.append(real_vector(name, part, part.size))
+            except (AttributeError, TypeError, ValueError):
+                self.wrong(
+                    f"it has no `{name}` of numbers; plant.system.state names the attributes that "
+                    'hold its state, or is ["observation"]'
+                )
+        return np.concatenate(parts)
 
 
 class GymnasiumSystem:
@@ -76,29 +245,24 @@ class GymnasiumSystem:
     """
 
     def __init__(self, settings: GymnasiumSettings, start: PlantStart) -> None:
-        self._place = f'plant.system.id = "{settings.id}"'
-        self._environment = settings.environment()
+        self._environment = environment = settings.environment()
         n, m = len(start.x0), start.B.shape[1]
-        space, own = self._environment.action_space, len(self._environment.state)
-        if (own, int(np.prod(space.shape))) != (n, m):
-            raise CallerError(
-                f"{self._place}: it has {own} states and {int(np.prod(space.shape))} actions; "
-                f"the model has {n} and {m}"
+        if (environment.n, environment.m) != (n, m):
+            environment.wrong(
+                f"it has {environment.n} states and {environment.m} actions; the model has {n} "
+                f"and {m}; plant.system.entries and actuation choose among them"
             )
-        step_s = settings.step_of(self._environment)
-        if abs(step_s * 1e9 - start.step_ns) > 1:
-            raise CallerError(
-                f"{self._place}: its step is {step_s:g} s; set plant.rate_hz = {1 / step_s:.9g}"
-            )
-        self._environment.state = start.x0.copy()
-        self.x, self.z = start.x0.copy(), np.zeros(0)
+        environment.require_step(start.step_ns)
+        environment.start(start.x0)
+        self.x, self.z, self._step_ns = environment.x(), np.zeros(0), start.step_ns
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         """Apply an action for a step."""
+        assert dt_ns == self._step_ns
         try:
-            self._environment.step(u.reshape(self._environment.action_space.shape).copy())
-            self.x = real_vector("state", self._environment.state, len(self.x))
-        except Exception as error:  # an environment can raise any error
+            self._environment.step(u)
+            self.x = self._environment.x()
+        except Exception as error:  # as above
             raise SystemFailedError(
-                f"{self._place}: {type(error).__name__}: {one_line(error)}"
+                f"{self._environment.place}: {type(error).__name__}: {one_line(error)}"
             ) from None

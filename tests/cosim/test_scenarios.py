@@ -31,6 +31,7 @@ from noack.scenario.resolution import LoopMatrices, loop_of, resolve
 from noack.scenario.scenario import Scenario
 from noack.scenario.scenario_file import load
 from noack.theory.certificates.conditions import allowed_conditions
+from tests.extras import skip_without_plant
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHARED = ("different_loops", "shared_bottleneck", "shared_channel")  # several loops on one network
@@ -52,6 +53,7 @@ def run_of(name: str) -> RunRecord:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_scenario_meets_its_assumptions_and_settles(name: str) -> None:
+    skip_without_plant(SCENARIOS / f"{name}.toml")
     record = run_of(name)
     summary = summarise(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 0

@@ -22,6 +22,8 @@ from noack.settings.user_files import UserCode
 
 TOLERANCE = 1e-6
 """Relative size below which an entry of the controllability matrix is 0."""
+_ROUNDING = 1e-14
+"""Rounding of a projection, relative to what is projected."""
 _REST = 1e-6
 """A drift below this share of the largest entry of A and B is rounding."""
 _ROUGH, _ROUGH_LEAST = 0.5, 1e-3
@@ -329,6 +331,7 @@ def controllable_states(A: Matrix, B: Matrix) -> Matrix:
     while new.shape[1] and basis.shape[1] < len(A):
         projection = np.eye(len(A)) - basis @ basis.T
         noise = TOLERANCE * norm(np.linalg.norm(np.abs(projection) @ terms, axis=1))
+        noise += _ROUNDING * norm(np.linalg.norm(terms, axis=1))
         directions, sizes, _ = np.linalg.svd(projection @ new, full_matrices=False)
         last = directions[:, sizes > noise]
         basis = np.linalg.qr(np.hstack([basis, last]))[0]

@@ -50,6 +50,7 @@ from noack.theory.certificates.certified_bounds import ScenarioCertificate, enve
 from noack.theory.certificates.conditions import nominal_conditions
 from noack.theory.certificates.scenario_certificates import own_plant
 
+_WITH_FILE = (FmuSettings, GymnasiumSettings, PythonPlantSettings)
 _FLOOR_SHARE = 0.05
 _FASTEST_ALPHA_PER_S = 1.0
 _RATES_HZ = (1.0, 2.0, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0, 200.0, 250.0, 500.0)
@@ -258,7 +259,7 @@ class _Builder:
         """Return the table plant.system, with a file's name relative to the scenario's folder."""
         system, model = self._model.plant.system, self._model
         table = system.content()
-        if isinstance(system, FmuSettings | PythonPlantSettings) and system.file is not None:
+        if isinstance(system, _WITH_FILE) and system.file is not None:
             table["file"] = os.path.relpath(system.file, self._path.absolute().parent)
             table.pop("sha256", None)
         if isinstance(system, FmuSettings):

@@ -159,7 +159,7 @@ def _settings(table: object, label: str) -> PlantSettings:
         table = variables_of(Path(str(table["file"]))) | table
     system = toml_file.validated(PLANTS[str(table["kind"])], table, f"{label}: plant.system")
     system.require_installed()
-    if isinstance(system, FmuSettings | PythonPlantSettings):
+    if isinstance(system, FmuSettings | GymnasiumSettings | PythonPlantSettings):
         return located(system, Path.cwd(), "plant.system")
     return system
 
@@ -193,9 +193,10 @@ def _of_scenario(label: str, settings: ReadTable) -> PlantReference:
 
 def _of_environment(label: str, settings: ReadTable, system: GymnasiumSettings) -> PlantReference:
     environment = system.environment()
-    n, m = len(environment.state), int(np.prod(environment.action_space.shape))
-    rate_hz = float(f"{1 / system.step_of(environment):.12g}")
-    return PlantReference(label, settings, system, n, m, (None, None), {"rate_hz": rate_hz})
+    rates = {"rate_hz": float(f"{1 / environment.step_s:.12g}")}
+    return PlantReference(
+        label, settings, system, environment.n, environment.m, (None, None), rates
+    )
 
 
 def _plain(names: Sequence[str]) -> tuple[str, ...]:

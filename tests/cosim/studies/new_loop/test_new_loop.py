@@ -210,6 +210,15 @@ def test_uncontrollable_states_are_found_in_any_coordinates() -> None:
     B = rotation @ np.array([[1.0], [1.0], [0.0], [0.0]])
     assert controllable_states(A, B).shape == (4, 2)
     assert controllable_states(np.diag([1.0, 1.0]), np.ones((2, 1))).shape == (2, 1)
+    # Two masses that no input moves, beside two that rounding couples: the same in any order.
+    arms = np.zeros((8, 8))
+    arms[:4, 4:] = np.eye(4)
+    arms[:2, 4:6] += [[0, 1.4e-13], [1.4e-13, 0]]
+    arms[4:6, 4:6] = [[-0.998848, 4.02603e-4], [4.02603e-4, -0.999821]]
+    moved = np.zeros((8, 2))
+    moved[:2] = [[1.67e-8, -2.7e-11], [-2.7e-11, 1.68e-8]]
+    moved[4:6] = [[199.77, -0.0805], [-0.0805, 199.964]]
+    assert controllable_states(arms, moved).shape == (8, 4)
     stiff = noack.linearise("dc_motor")  # 1e6 between its eigenvalues
     assert stiff.rank == 3
     chain = np.diag(np.ones(5), 1)

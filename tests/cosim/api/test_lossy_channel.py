@@ -1,0 +1,177 @@
+"""noack.LossyChannel: the emulator's losses around an environment, the guarantee, the hold."""
+
+import subprocess
+import sys
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+import noack
+from noack.core.errors import CallerError
+
+gymnasium = pytest.importorskip("gymnasium", reason="the extra `gymnasium` is not installed")
+check_env = pytest.importorskip("gymnasium.utils.env_checker").check_env
+STEP_S = 0.02
+LOSSLESS: dict[str, Any] = {"mansd": 3, "loss": {"model": "lossless"}}
+HALF: dict[str, Any] = {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.5}}
+MOST: dict[str, Any] = {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.9}}
+
+
+class Clock(gymnasium.Env):  # type: ignore[misc, name-defined]
+    """Observes how many steps it has made, and the action that it got; in an array of its own."""
+
+    action_space = gymnasium.spaces.Box(-1e6, 1e6, (1,), np.float64)
+    observation_space = gymnasium.spaces.Box(-1e6, 1e6, (2,), np.float64)
+    dt = STEP_S
+
+    def __init__(self) -> None:
+        self.seen = np.zeros(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.seen[:] = 0.0
+        return self.seen, {"own": 1}
+
+    def step(self, action: Any) -> Any:
+        self.seen[:] = self.seen[0] + 1, action[0]
+        return self.seen, 0.0, False, False, {"own": 1}
+
+
+def episode(env: Any, steps: int, seed: int | None = 1) -> tuple[np.ndarray, list[Any]]:
+    """Observations and infos; the action of step k is k + 1."""
+    first, info = env.reset(seed=seed)
+    seen, infos = [first], [info]
+    for k in range(steps):
+        observation, *_, info = env.step(np.array([k + 1.0]))
+        seen.append(observation)
+        infos.append(info)
+    return np.array(seen), infos
+
+
+def losses(infos: list[Any], direction: str) -> list[int]:
+    return [info["network"][direction]["consecutive_losses"] for info in infos]
+
+
+def test_the_losses_are_those_of_a_run_packet_by_packet() -> None:
+    """A sensor that sends at each step; the first packet of a flow passes."""
+    settings = {"network": MOST, "horizon_s": 40.0}
+    run = noack.simulate(noack.load("lane_periodic", settings))
+    packets = run.table("netem_packet")
+    expected = np.array(packets["consecutive_losses"])
+    assert len(expected) > 50
+    env = noack.LossyChannel(Clock(), noack.load("lane_periodic", settings))
+    _, infos = episode(env, len(expected) - 1, seed=run.scenario.seeds.loss)
+    np.testing.assert_array_equal(losses(infos, "observation"), expected)
+
+
+def test_without_loss_and_delay_nothing_changes() -> None:
+    env = noack.LossyChannel(Clock(), {**LOSSLESS, "actuation": LOSSLESS})
+    seen, infos = episode(env, 5)
+    np.testing.assert_array_equal(seen, [[k, k] for k in range(6)])
+    assert all(info["network"]["observation"]["arrived"] and info["own"] for info in infos)
+
+
+@pytest.mark.parametrize(("delay_s", "late"), [
+    (0.001, 1), (0.0199, 1), (0.02, 1), (0.0201, 2), (0.05, 3), (0.06, 3),
+])  # fmt: skip
+def test_a_delay_takes_the_next_whole_number_of_steps(delay_s: float, late: int) -> None:
+    delayed = {**LOSSLESS, "impairments": [{"kind": "delay", "delay_s": delay_s}]}
+    env = noack.LossyChannel(Clock(), {**delayed, "actuation": delayed})
+    seen, infos = episode(env, 10)
+    k = np.arange(11)
+    np.testing.assert_array_equal(seen[:, 0], np.maximum(k - late, 0))
+    # Step j, counted from 1, gets action j − late, which was sent as j − late.
+    applied = np.maximum(np.maximum(k - late, 0) - late, 0)
+    np.testing.assert_array_equal(seen[:, 1], applied)
+    last = infos[-1]["network"]
+    assert last["observation"]["age_steps"] == last["action"]["age_steps"] == late
+    assert last["action"]["arrived"]
+
+
+@pytest.mark.parametrize("more", [
+    {},
+    {"impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]},
+    {"impairments": [{"kind": "corrupt", "probability": 0.3},
+                     {"kind": "duplicate", "probability": 0.3}]},
+])  # fmt: skip
+def test_a_packet_of_m_successive_ones_arrives_in_each_direction(more: dict[str, Any]) -> None:
+    """Over long runs; the newest packet that has arrived is in force, an older one never again."""
+    lossy = {**MOST, **more}
+    late = 3 if more.get("impairments", [{}])[0].get("kind") == "delay" else 0
+    env = noack.LossyChannel(Clock(), {**lossy, "actuation": lossy})
+    longest = {"observation": 0, "action": 0}
+    for seed in range(5):
+        seen, infos = episode(env, 4000, seed=seed)
+        for direction in longest:
+            longest[direction] = max(longest[direction], *losses(infos, direction))
+            ages = [info["network"][direction]["age_steps"] for info in infos[1:]]
+            assert max(ages[late + 4 :]) <= 3 + late
+        steps = seen[:, 0]
+        assert all(after >= before for before, after in pairwise(steps))
+        assert all(after >= before for before, after in pairwise(seen[:, 1]))
+    assert longest == {"observation": 3, "action": 3}
+
+
+def test_a_seed_gives_the_same_bits_and_each_episode_has_other_losses() -> None:
+    lossy = {**HALF, "impairments": [{"kind": "delay", "delay_s": 0.03, "jitter_s": 0.03}]}
+    env, other = (noack.LossyChannel(Clock(), {**lossy, "actuation": HALF}) for _ in range(2))
+    first, infos = episode(env, 300, seed=4)
+    second, more = episode(env, 300, seed=None)
+    again, same = episode(other, 300, seed=4)
+    assert first.tobytes() == again.tobytes()
+    assert infos == same
+    assert first.tobytes() != second.tobytes()
+    assert episode(other, 300, seed=None)[0].tobytes() == second.tobytes()
+    assert losses(infos, "observation") != losses(more, "observation")
+    assert losses(infos, "observation") != losses(infos, "action")
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")  # of the environments' own spaces
+def test_it_passes_the_check_of_gymnasium(name: str) -> None:
+    env = noack.LossyChannel(gymnasium.make(name), {**HALF, "actuation": HALF}, step_s=STEP_S)
+    check_env(env, skip_render_check=True)
+    again = gymnasium.make(env.spec)  # it records how it was made
+    assert isinstance(again, noack.LossyChannel)
+
+
+def test_actions_cross_the_network_only_if_it_says_so() -> None:
+    seen, infos = episode(noack.LossyChannel(Clock(), MOST), 50)
+    held = seen[np.array([info["network"]["observation"]["arrived"] for info in infos])]
+    np.testing.assert_array_equal(held[:, 0], held[:, 1])
+    assert "action" not in infos[-1]["network"]
+
+
+class NoStep(Clock):
+    dt = None  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(("env", "network", "given", "why"), [
+    (Clock, {"mansd": 3}, {}, r"^scenario: network.loss: missing"),
+    (Clock, {**HALF, "mansd": -1}, {}, r"^scenario: network.mansd"),
+    (Clock, "no_such_scenario", {}, "no such file, nor a shipped scenario"),
+    (Clock, "shared_channel", {}, "the scenario has loops; the channel needs one without"),
+    (Clock, {**HALF, "protocol": "ack"}, {}, 'set protocol = "none"'),
+    (Clock, 0.5, {}, "give a table as"),
+    (NoStep, HALF, {}, "has no time of a step; give step_s, in seconds"),
+    (Clock, HALF, {"step_s": 0.0}, "has no time of a step"),
+])  # fmt: skip
+def test_a_mistake_is_one_line(env: Any, network: Any, given: Any, why: str) -> None:
+    with pytest.raises(CallerError, match=why) as caught:
+        noack.LossyChannel(env(), network, **given)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_gymnasium_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cosim.api.find_spec", lambda name: None)
+    monkeypatch.delitem(noack.__dict__, "LossyChannel", raising=False)
+    with pytest.raises(CallerError, match=r"pip install 'noack\[gymnasium\]'"):
+        _ = noack.LossyChannel
+
+
+def test_noack_does_not_import_gymnasium() -> None:
+    program = "import sys; from noack import *; import noack; noack.load; noack.simulate; " \
+        "sys.exit('gymnasium' in sys.modules)"  # fmt: skip
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
