@@ -7,6 +7,7 @@ independent: each has its own settings, random streams and guarantee. Payloads a
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from netem.link_state import LinkState
 from noack.core.core_library import CData, core, dtype_of, ffi, pointer_to
+from noack.core.errors import CallerError
 from noack.impairments.link_settings import NEVER_NS, LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -61,6 +63,15 @@ class Datagram(NamedTuple):
 
     flow: int
     data: bytes
+
+
+class Leaving(NamedTuple):
+    """A packet that leaves a channel; its payload is kept by the caller."""
+
+    flow: int
+    number: int
+    bit: int
+    """The payload's bit that was flipped; −1 if it is intact."""
 
 
 class Channel:
@@ -123,6 +134,38 @@ class Channel:
         else:
             assert question == core.NOACK_ROWS_FULL
             self._taken = self.take_rows()
+
+    def send(
+        self, flow: int, number: int, size_bytes: int, now_ns: int
+    ) -> tuple[list[Leaving], int]:
+        """Take a packet of a flow; return what leaves at once, and the number of its copies.
+
+        What is due must have left (:meth:`release`). Of a lost packet there are 0 copies.
+        """
+        message = {"sequence": number}
+        datagram = ffi.new("noack_datagram *", {"message": message, "flow": flow, "bit": -1})
+        datagram.size_bytes, datagram.arrival_ns = size_bytes, now_ns
+        put = self.core.put
+        left = self._left(lambda: core.noack_channel_handle(self.core, datagram, now_ns))
+        return left, self.core.put - put
+
+    @property
+    def due_ns(self) -> int:
+        """When the next packet leaves; :data:`NO_TIME_NS`: there is none."""
+        return int(core.noack_channel_due_ns(self.core))
+
+    def release(self, now_ns: int) -> list[Leaving]:
+        """Let what is due leave; return it in its order."""
+        left: list[Leaving] = []
+        while (due_ns := self.due_ns) <= now_ns:
+            left += self._left(partial(core.noack_channel_release, self.core, due_ns))
+        return left
+
+    def _left(self, step: Callable[[], int]) -> list[Leaving]:
+        while (question := step()) != core.NOACK_DONE:
+            self.answer(question)
+        some = (self.core.leaving[place] for place in range(self.core.leaving_count))
+        return [Leaving(one.flow, one.message.sequence, one.bit) for one in some]
 
     def take_rows(self) -> list[tuple[str, Rows]]:
         """Return all rows since the last call, in batches of a table in their order."""
@@ -210,6 +253,20 @@ def channel_of(
     return Channel(
         links, loops=loops, first_number=start.first_number, schedule=schedule, network=network
     )
+
+
+def alone(network: Scenario) -> Scenario:
+    """Return a scenario whose network is used outside a run of noack.
+
+    Raises:
+        CallerError: the network changes, has several loops, or acknowledges.
+    """
+    for name, given in (("changes", network.changes), ("loops", network.loops)):
+        if given:
+            raise CallerError(f"network: the scenario has {name}; the channel needs one without")
+    if network.network.protocol != "none":
+        raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
+    return network
 
 
 def at_start(settings: LinkSettings, name: str, start: Start) -> tuple[LinkSettings, list[str]]:

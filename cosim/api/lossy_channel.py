@@ -4,9 +4,8 @@ The channel is that of a simulated run (:mod:`netem.channel`): the core decides 
 the rules, random streams and guarantee of the emulator, in virtual time.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from functools import partial
 from os import PathLike
 from typing import Generic, SupportsFloat, TypeVar
 
@@ -17,13 +16,12 @@ from gymnasium.spaces.utils import flatdim
 
 from cosim.api.scenarios import Source, load
 from cosim.shipped_files import find_shipped
-from netem.channel import Channel, link_name
+from netem.channel import Channel, Leaving, alone, link_name
 from netem.link_state import LinkState
 from noack.core.clock import NS_PER_S
-from noack.core.core_library import core, ffi
 from noack.core.errors import CallerError
 from noack.plants.gymnasium import own_step_s
-from noack.protocol.record_tables import NETEM_PACKET, Fate
+from noack.protocol.record_tables import NETEM_PACKET
 from noack.protocol.wire_format import datagram_bytes
 from noack.scenario import toml_file
 from noack.scenario.scenario import Scenario
@@ -31,7 +29,6 @@ from noack.settings.section import ReadTable
 from noack.settings.user_files import UserCode
 
 Value = TypeVar("Value")
-_LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 
 
 class _Receiver(Generic[Value]):
@@ -110,7 +107,7 @@ class LossyChannel(
             self, network=network, step_s=step_s, first_action=first_action, seed=seed
         )
         super().__init__(env)
-        scenario = _scenario(network)
+        scenario = alone(_loaded(network))
         own_s = own_step_s(env.unwrapped) if step_s is None else step_s
         if own_s is None or not round(own_s * NS_PER_S) > 0:
             raise CallerError(f"LossyChannel: {env} has no time of a step; give step_s, in seconds")
@@ -162,47 +159,25 @@ class LossyChannel(
 
     def _send(self, direction: int, receiver: _Receiver[Value], value: Value) -> None:
         """Send a packet now, after what is due has arrived."""
-        channel, now_ns = self._channel.core, self._now_ns
         receiver.steps[receiver.sent] = self._step, deepcopy(value)
-        datagram = ffi.new("noack_datagram *", {"message": {"sequence": receiver.sent}, "bit": -1})
-        datagram.flow, datagram.size_bytes = direction, receiver.size_bytes
-        datagram.arrival_ns = now_ns
+        self._take(self._channel.release(self._now_ns))
+        left, copies = self._channel.send(
+            direction, receiver.sent, receiver.size_bytes, self._now_ns
+        )
+        if not copies:
+            del receiver.steps[receiver.sent]
         receiver.sent += 1
-        self._release()
-        self._do(partial(core.noack_channel_handle, channel, datagram, now_ns))
-        self._release()
+        self._take(left)
+        self._take(self._channel.release(self._now_ns))
         for table, rows in self._channel.take_rows():
             for row in rows if table == NETEM_PACKET else ():
                 receiver.losses = int(row["consecutive_losses"])
-                if row["fate"] in _LOST:
-                    receiver.steps.pop(receiver.sent - 1, None)
 
-    def _release(self) -> None:
-        """Let what is due arrive."""
-        channel = self._channel.core
-        while (due_ns := int(core.noack_channel_due_ns(channel))) <= self._now_ns:
-            self._do(partial(core.noack_channel_release, channel, due_ns))
-
-    def _do(self, step: Callable[[], int]) -> None:
-        """Make a step of the channel; what leaves it intact arrives."""
-        channel = self._channel.core
-        while (question := step()) != core.NOACK_DONE:
-            self._channel.answer(question)
-        for place in range(channel.leaving_count):
-            one = channel.leaving[place]
+    def _take(self, left: Iterable[Leaving]) -> None:
+        """Let what leaves the channel arrive."""
+        for one in left:
             if one.bit < 0:  # a receiver rejects a damaged datagram
-                self._receivers[one.flow].take(one.message.sequence)
-
-
-def _scenario(network: Source | ReadTable) -> Scenario:
-    """Return a scenario with this network."""
-    scenario = _loaded(network)
-    for name, given in (("changes", scenario.changes), ("loops", scenario.loops)):
-        if given:
-            raise CallerError(f"network: the scenario has {name}; the channel needs one without")
-    if scenario.network.protocol != "none":
-        raise CallerError('network: nothing is acknowledged here; set protocol = "none"')
-    return scenario
+                self._receivers[one.flow].take(one.number)
 
 
 def _loaded(network: Source | ReadTable) -> Scenario:
