@@ -29,38 +29,47 @@ def serve(ready: Path) -> None:
             data, client = endpoint.recvfrom(65536)
             flow, _, number = data.decode().partition(" ")
             if number == "?":
-                endpoint.sendto(hex(received.get(flow, 0)).encode(), client)
+                endpoint.sendto(f"{flow} {received.get(flow, 0):x}".encode(), client)
             elif number:
                 received[flow] = received.get(flow, 0) | 1 << int(number)
                 endpoint.sendto(data, client)
 
 
-def ask(flow: str, port: int) -> list[int]:
-    """Return the numbers of a flow that the server has received."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
-        endpoint.settimeout(PATIENCE_S)
+class Client:
+    """The client's end; one socket has all questions: a late answer to a closed one is an error."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._questions = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._questions.connect((os.environ["NOACK_OUTSIDE"], port))
+        self._questions.settimeout(PATIENCE_S)
+        self._questions.send(b"x" * 4000)  # fragments
+
+    def ask(self, flow: str) -> list[int]:
+        """Return the numbers of a flow that the server has received."""
         while True:
-            endpoint.sendto(f"{flow} ?".encode(), (os.environ["NOACK_OUTSIDE"], port))
+            self._questions.send(f"{flow} ?".encode())
             with suppress(TimeoutError):
-                answer = int(endpoint.recv(1000), 16)
-                return [k for k in range(answer.bit_length()) if answer >> k & 1]
+                answered, numbers = self._questions.recv(1000).decode().split()
+                if answered == flow:
+                    found = int(numbers, 16)
+                    return [k for k in range(found.bit_length()) if found >> k & 1]
 
-
-def exchange(
-    flow: str, count: int, port: int, interrupt: Callable[[int, str], None]
-) -> dict[str, object]:
-    """Send numbered datagrams; return the client's port, and what came there and back."""
-    back: list[int] = []
-    with socket.socket(FAMILIES[flow], socket.SOCK_DGRAM) as endpoint:
-        endpoint.connect((os.environ[OUTSIDE[flow]], port))
-        for number in range(count):
-            endpoint.send(f"{flow} {number}".encode())
-            interrupt(number, str(endpoint.getsockname()[1]))
-        there = ask(flow, port)  # what was sent back before the answer has arrived
-        with suppress(BlockingIOError):
-            while True:
-                back.append(int(endpoint.recv(1000, socket.MSG_DONTWAIT).split()[1]))
-        return {"port": endpoint.getsockname()[1], "there": there, "back": back}
+    def exchange(
+        self, flow: str, count: int, interrupt: Callable[[int, str], None]
+    ) -> dict[str, object]:
+        """Send numbered datagrams; return the client's port, and what came there and back."""
+        back: list[int] = []
+        with socket.socket(FAMILIES[flow], socket.SOCK_DGRAM) as endpoint:
+            endpoint.connect((os.environ[OUTSIDE[flow]], self._port))
+            for number in range(count):
+                endpoint.send(f"{flow} {number}".encode())
+                interrupt(number, str(endpoint.getsockname()[1]))
+            there = self.ask(flow)  # what was sent back before the answer has arrived
+            with suppress(BlockingIOError):
+                while True:
+                    back.append(int(endpoint.recv(1000, socket.MSG_DONTWAIT).split()[1]))
+            return {"port": endpoint.getsockname()[1], "there": there, "back": back}
 
 
 def change_after(last: int, words: str, name: str) -> Callable[[int, str], None]:
@@ -91,9 +100,8 @@ def main() -> None:
     port = int(ready.read_text())
     interrupt = change_after(int(change[0]), *change[1:]) if change else lambda _number, _port: None
     flows = ["ipv4"] if change or "NOACK_OUTSIDE6" not in os.environ else ["ipv4", "ipv6"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
-        endpoint.sendto(b"x" * 4000, (os.environ["NOACK_OUTSIDE"], port))  # fragments
-    found = {flow: exchange(flow, int(count), port, interrupt) for flow in flows}
+    client = Client(port)
+    found = {flow: client.exchange(flow, int(count), interrupt) for flow in flows}
     Path(folder, "ends.json").write_text(json.dumps(found))
 
 
