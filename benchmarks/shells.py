@@ -40,8 +40,9 @@ def _bare(command: str, forwarder: Path) -> str:
         process = stack.enter_context(subprocess.Popen(words, pass_fds=link.devices))
         stack.callback(process.kill)
         with link.inside():
-            inner = subprocess.Popen(["sh", "-c", command], stdout=subprocess.PIPE, text=True,
-                                     env=os.environ | {"TO": link.spec.to[0]})  # fmt: skip
+            variables = os.environ | {"TO": link.spec.to[0]}
+            words = ["sh", "-c", command]
+            inner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=variables)
         return inner.communicate()[0]
 
 

@@ -132,7 +132,11 @@ int read_packets(noack_relay *relay, int64_t socket, int most) {
 int write_packets(int fd, const struct mmsghdr *headers, int count) {
     for (int k = 0; k < count; k++) {
         const struct msghdr *message = &headers[k].msg_hdr;
-        if (writev(fd, message->msg_iov, (int)message->msg_iovlen) < 0)
+        const struct iovec *first = message->msg_iov;
+        ssize_t written = message->msg_iovlen == 1
+                              ? write(fd, first->iov_base, first->iov_len)
+                              : writev(fd, first, (int)message->msg_iovlen);
+        if (written < 0)
             return k > 0 ? k : -1;
     }
     return count;
