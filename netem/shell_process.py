@@ -100,9 +100,13 @@ def guard(parent: int, command: list[str]) -> int:
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGCHLD})
     before = {one: signal.signal(one, signal.SIG_IGN) for one in (signal.SIGINT, signal.SIGQUIT)}
     adopt_orphans()
+    group = os.getpgrp()
+    os.setpgid(0, 0)  # what kills the whole group does not kill this process
     call("prctl", _DEATH_SIGNAL, signal.SIGTERM, 0, 0, 0)
     child = os.fork()
     if child == 0:
+        with suppress(OSError):  # the group has ended
+            os.setpgid(0, group)
         call("prctl", _DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
         for one, handler in before.items():
             signal.signal(one, handler if handler is signal.SIG_IGN else signal.SIG_DFL)

@@ -204,7 +204,7 @@ def test_a_system_that_does_not_permit_it_is_one_line_with_the_remedy() -> None:
     assert "`sysctl -w user.max_user_namespaces=10000`" in done.stderr
 
 
-@pytest.mark.parametrize("killed", ["relay", "guard", "group", "terminated"])
+@pytest.mark.parametrize("killed", ["relay", "guard", "group", "all", "terminated"])
 def test_no_process_is_left(killed: str) -> None:
     """All of them have the pipe: its end is the end of the last one."""
     script = "(setsid sleep 1000 &) ; sleep 1000 & echo $PPID; wait"
@@ -218,10 +218,12 @@ def test_no_process_is_left(killed: str) -> None:
             process.kill()
         elif killed == "guard":
             os.kill(guard, signal.SIGKILL)
+        elif killed == "all":
+            os.killpg(process.pid, signal.SIGKILL)
         elif killed == "group":
             os.killpg(process.pid, signal.SIGINT)
         else:
             process.terminate()
         assert process.stdout.read() == ""
-    expected = {"relay": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
+    expected = {"relay": -9, "all": -9, "guard": 128 + 9, "group": 130, "terminated": 143}
     assert process.returncode == expected[killed]
