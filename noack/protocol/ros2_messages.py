@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Msg, Typestore
 
 JOINT_STATE, LOG = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
-DISTRIBUTION = "jazzy"
-"""The distribution of ROS 2 whose definitions are used; these types are the same since humble."""
+DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
+"""Where the router of rmw_zenoh listens by default, as zenoh writes it."""
 TOPICS = {
     PLANT_STEP: ("state", "input"), CONTROLLER_DELIVERY: ("update",),
     SENSOR_MEASUREMENT: ("event",),
