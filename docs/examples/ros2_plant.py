@@ -11,13 +11,16 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from scipy.linalg import expm
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk.session import ZenohSession
 
 port = int(sys.argv[1]) if len(sys.argv) > 1 else 7447
 A, B, X0 = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.9]]), np.array([1.0, 0.0])
 kind = "sensor_msgs/msg/JointState"
 store = get_typestore(Stores.ROS2_JAZZY)
 parts = ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", kind)
-definitions = {part: store.generate_msgdef(part, ros_version=2)[0].split("=" * 80)[0] for part in parts}
+definitions = {
+    part: store.generate_msgdef(part, ros_version=2)[0].partition("=" * 80)[0] for part in parts
+}
 x, t_ns = X0.copy(), 0
 
 
@@ -39,8 +42,6 @@ def on_input(message: object) -> None:
 
 network = {"router_port": port, "type_hash": store.hash_rihs01(kind)}
 for part in parts[:-1]:
-    from zenoh_ros2_sdk.session import ZenohSession
-
     ZenohSession.get_instance("127.0.0.1", port).register_message_type(definitions[part], part)
 publisher = ROS2Publisher("/noack/plant/state", kind, definitions[kind], **network)
 subscriber = ROS2Subscriber("/noack/plant/input", kind, on_input, definitions[kind], **network)

@@ -26,9 +26,10 @@ JOINT_STATE, LOG = "sensor_msgs/msg/JointState", "rcl_interfaces/msg/Log"
 DEFAULT_ROUTER = "tcp/127.0.0.1:7447"
 """Where the router of rmw_zenoh listens by default, as zenoh writes it."""
 TOPICS = {
-    PLANT_STEP: ("state", "input"), CONTROLLER_DELIVERY: ("update",),
+    PLANT_STEP: ("state", "input"),
+    CONTROLLER_DELIVERY: ("update",),
     SENSOR_MEASUREMENT: ("event",),
-}  # fmt: skip
+}
 """The topics of the rows of a table, below the loop's namespace."""
 
 
@@ -90,9 +91,12 @@ def joint_state(entries: Entries, frame: str) -> bytes:
     types, none = _store().types, np.zeros(0)
     header = types["std_msgs/msg/Header"](stamp=_time(entries.stamp_ns), frame_id=frame)
     message = types[JOINT_STATE](
-        header=header, name=[*entries.names], position=np.asarray(entries.values, np.float64),
-        velocity=none, effort=none,
-    )  # fmt: skip
+        header=header,
+        name=[*entries.names],
+        position=np.asarray(entries.values, np.float64),
+        velocity=none,
+        effort=none,
+    )
     return bytes(_store().serialize_cdr(message, JOINT_STATE))
 
 

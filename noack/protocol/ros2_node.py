@@ -79,10 +79,12 @@ class Publisher:
         self._sent += 1
         attachment = _ATTACHMENT.pack(self._sent, time.time_ns(), _GID_BYTES) + self._gid
         self._session.put(
-            self._key, ros2.joint_state(entries, frame), attachment=attachment,
+            self._key,
+            ros2.joint_state(entries, frame),
+            attachment=attachment,
             congestion_control=CongestionControl.DROP,
             priority=Priority.REAL_TIME if urgent else Priority.BACKGROUND,
-        )  # fmt: skip
+        )
 
 
 class Node:
@@ -135,10 +137,18 @@ class Node:
 
     def _end(self, kind: str, topic: str) -> str:
         mangled = "/" + topic.strip("/")
-        token = "/".join((
-            self._entity(kind), "%", "%", self._name, mangled.replace("/", "%"), _type_name(),
-            ros2.type_hash(JOINT_STATE), _QOS,
-        ))  # fmt: skip
+        token = "/".join(
+            (
+                self._entity(kind),
+                "%",
+                "%",
+                self._name,
+                mangled.replace("/", "%"),
+                _type_name(),
+                ros2.type_hash(JOINT_STATE),
+                _QOS,
+            )
+        )
         self._declare(token)
         return token
 

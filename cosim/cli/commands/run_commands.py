@@ -18,11 +18,11 @@ from cosim.cli.execute_run import (
 from cosim.lazy_modules import lazy_modules
 from noack.core.errors import CallerError
 from noack.core.number_format import number
-from noack.protocol.ros2_messages import DEFAULT_ROUTER
 
 with lazy_modules():
     from cosim.analysis import summary_model
-    from cosim.live import progress, remote_access, ros2_bridge, simulated_run
+    from cosim.live import progress, remote_access, simulated_run
+    from cosim.live.bridge import ros2_bridge
     from cosim.output import result_tables, run_tables, run_verdict
     from cosim.simulation import continuous
     from noack.runtime import control_messages, run_registry
@@ -88,7 +88,7 @@ def bridge(
     context: typer.Context,
     given: cli.ScenarioOptions,
     *,
-    router: Annotated[str, Option(metavar="ENDPOINT")] = DEFAULT_ROUTER,
+    router: Annotated[str, Option(metavar="ENDPOINT")] = "tcp/127.0.0.1:7447",
     listen: Annotated[bool, Option("--listen")] = False,
     domain: Annotated[int, Option(min=0, max=232)] = 0,
     options: LiveOptions,

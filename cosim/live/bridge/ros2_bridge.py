@@ -134,7 +134,7 @@ def bridge_process(router: str, domain: int, *, listen: bool) -> Iterator[Watche
         CallerError: it cannot join the graph of ROS 2; its process has printed why.
     """
     ros2.require_installed("noack bridge")
-    words = python_command("-m", "cosim.live.ros2_bridge", router, domain, int(listen))
+    words = python_command("-m", "cosim.live.bridge.ros2_bridge", router, domain, int(listen))
     pipe = subprocess.PIPE
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdin is not None
