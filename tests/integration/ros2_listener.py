@@ -6,6 +6,7 @@ import threading
 
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Subscriber
+from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.session import ZenohSession
 
 KIND = "sensor_msgs/msg/JointState"
@@ -31,10 +32,19 @@ ROS2Subscriber(
     "/noack/state", KIND, on_state, definition(KIND), router_port=port,
     type_hash=store.hash_rihs01(KIND),
 )  # fmt: skip
+attachments: list[tuple[int, int]] = []
+
+
+def on_sample(sample) -> None:  # type: ignore[no-untyped-def]
+    attached = Attachment.from_bytes(sample.attachment.to_bytes())
+    attachments.append((attached.sequence_id, len(attached.gid)))
+
+
+raw = session.session.declare_subscriber("0/noack/state/**", on_sample)
 tokens = []
 while not last.wait(0.5):
     tokens += [
         str(r.ok.key_expr) for r in session.liveliness.get("@ros2_lv/**", timeout=2.0) if r.ok
     ]
-print(json.dumps({"messages": found, "tokens": tokens}), flush=True)
+print(json.dumps({"messages": found, "tokens": tokens, "attachments": attachments}), flush=True)
 threading.Event().wait()

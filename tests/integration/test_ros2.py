@@ -116,4 +116,7 @@ def test_an_independent_client_receives_a_live_run(port: int, tmp_path: Path) ->
     assert found["messages"][-1][0] == 3 * 10**9
     for t_ns, first, last in found["messages"]:
         assert recorded[t_ns] == (first, last)
+    sent = [number for number, _ in found["attachments"]]
+    assert sent == sorted(set(sent))
+    assert {gid_bytes for _, gid_bytes in found["attachments"]} == {16}
     assert any("/MP/%/%/noack/%noack%state/" in token for token in found["tokens"])
